@@ -27,6 +27,7 @@ from gcd_model import (
 from gcd_node.errors import DepthError
 from gcd_node.preprocess import to_clip_tensor
 from gcd_node.sources.depth import DepthSource
+from gcd_node.stream_context import StreamContext
 from gcd_node.window import PartialWindow, PlacedFrame
 
 _Key: TypeAlias = tuple[int, int]  # epoch and stamp: a builder never gives the same twice
@@ -42,6 +43,17 @@ class EncodeTerms:
     mount: CameraMount | None
     lens: Intrinsics | None = None
     depth: DepthSource | None = None
+
+
+def encode_terms(context: StreamContext) -> EncodeTerms:
+    """Of a stream."""
+    return EncodeTerms(
+        digest=context.digest,
+        strength=context.config.model.cond_aug,
+        mount=context.mount,
+        lens=context.intrinsics if context.traits.live else None,
+        depth=context.depth,
+    )
 
 
 class EncodedFrames:

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeVar
 
 import torch
 
@@ -24,24 +23,25 @@ from gcd_model import (
     Trajectory,
     View,
 )
-from gcd_node.encoded_frames import EncodedFrames, EncodeTerms, window_seed
+from gcd_node.encoded_frames import EncodedFrames, encode_terms, window_seed
 from gcd_node.errors import DepthError
 from gcd_node.health import Level
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import (
+    Failure,
     FailureCounter,
     ModelSlot,
     OomLevel,
+    Pulse,
     model_errors,
     oom_levels,
     render_grey,
+    tried,
 )
 from gcd_node.status import Announcer, Condition
 from gcd_node.stream_context import StreamContext, drawing_options, sampler_in_use
 from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualView, VirtualViews
 from gcd_node.window import FrameWindow, PartialWindow
-
-Made = TypeVar("Made")
 
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
@@ -74,7 +74,7 @@ class WindowReport:
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Job:
     """One window and everything that was decided for it when it was taken. paths: of its views. started_ns: when that
-    was, on the monotonic clock."""
+    was, on the monotonic clock. memory: the model's, which began anew so many times."""
 
     window: FrameWindow
     settings: Settings
@@ -82,13 +82,13 @@ class Job:
     views: list[VirtualView]
     paths: list[Trajectory]
     started_ns: int
+    memory: int
 
 
-_Failure = NonFiniteError | DeviceMemoryError
-Seen = SourceFeatures | Sequence[SeenFrame] | _Failure
+Seen = SourceFeatures | Sequence[SeenFrame] | Failure
 """What is known of a window, frame by frame if the model works so; or what that failed with."""
 _Known = SourceFeatures | Sequence[PlacedFrame]
-Placed = _Known | _Failure
+Placed = _Known | Failure
 """The same, and of its views."""
 
 
@@ -101,26 +101,27 @@ class Renderer:
         announcer: Announcer,
         model: ModelSlot,
         context_at: Callable[[int], StreamContext],
-        beat: Callable[[], None],
-        cancel: threading.Event,
         on_window: Callable[[WindowReport], None] | None = None,
     ) -> None:
-        """context_at: what is known of the source in an epoch; -1 for now. beat: called at every step. cancel: set to
-        abandon.
+        """context_at: what is known of the source in an epoch; -1 for now.
 
         Raises:
             OptionError, PoseError: see VirtualView.
         """
-        self.counts = WorkCounts()
+        self.counts, self.cancel = WorkCounts(), threading.Event()
+        """cancel: set to abandon what is in work."""
         self._model, self._context_at, self._on_window = model, context_at, on_window
-        self._live, self._health, self._beat, self._cancel = live, announcer.health, beat, cancel
+        self._live, self._health = live, announcer.health
         self._out = EndOfStream(live, announcer.sink, lambda: context_at(-1))
         self._views = VirtualViews(model.traits)
         self._views.sync(live.settings(), context_at(-1).mount)
         self._failures = FailureCounter(announcer)
-        self._encoded = EncodedFrames(beat, self._count_bad_depth, self._tell_odometry)
+        self.pulse = Pulse(announcer.health, lambda: self._failures.level)
+        self._encoded = EncodedFrames(self.pulse.beat, self._count_bad_depth, self._tell_odometry)
         self._seeing, self._placing = threading.Lock(), threading.Lock()
-        """Held by whoever encodes or makes the model forget, and by whoever places. One at a time, never both."""
+        """Held by whoever encodes or makes the model forget, and by whoever places; both, in this order, by whoever
+        exchanges the model."""
+        self._memory = 0
         hold_s = _HOLD_S if model.streams else 0.0
         self._bad_depth, self._bad_odometry, self._lost_motion = (
             Condition(code, announcer, hold_s=hold_s) for code in _INPUT_CODES
@@ -143,7 +144,7 @@ class Renderer:
         """Encode one frame of the window that fills; False if there is nothing to do. Raises DeviceMemoryError."""
         with self._seeing, model_errors():
             try:
-                terms = _terms(self._context(self._live.settings(), filling.epoch))
+                terms = encode_terms(self._context(self._live.settings(), filling.epoch))
                 return self._encoded.ahead(self._model.synthesizer, filling, terms)
             except DeviceMemoryError:
                 self._encoded.forget()
@@ -152,6 +153,7 @@ class Renderer:
     def take(self, window: FrameWindow) -> tuple[Job, Seen] | None:
         """What of a window is needed for every view. None if its depth is not to be trusted."""
         with self._seeing:
+            self.pulse.beat()
             job = self._job(window)
             try:
                 return job, self._seen(job)
@@ -159,18 +161,24 @@ class Renderer:
                 self._health.count("model")
                 return None
 
-    def place(self, job: Job, seen: Seen) -> Placed:
-        """What is known of each view before anything is painted: the model's memory goes on by a window."""
-        if isinstance(seen, SourceFeatures | _Failure):
+    def place(self, job: Job, seen: Seen) -> Placed | None:
+        """What is known of each view before anything is painted: the model's memory goes on by a window. None if that
+        began anew since the window was seen."""
+        if isinstance(seen, SourceFeatures | Failure):
             return seen
         with self._placing, model_errors():
-            return _tried(lambda: self._frames.place(seen, job.paths))
+            self.pulse.beat()
+            return tried(lambda: self._frames.place(seen, job.paths)) if job.memory == self._memory else None
 
-    def render(self, job: Job, placed: Placed) -> None:
-        """Its views, drawn and sent; one retry, with another seed or with less asked; else counted, and not published.
-        Raises ModelFailedError: the third in a row, or there is no memory; Cancelled."""
+    def render(self, job: Job, placed: Placed | None) -> None:
+        """Its views, drawn and sent; one retry, with another seed or with less asked; else counted, and not published,
+        as what belongs to a memory that is no more. Raises ModelFailedError: the third in a row, or there is no device
+        memory; Cancelled."""
         try:
-            self._render_or_count(job, placed)
+            if placed is None or job.memory != self._memory:
+                self._health.count("model")
+            else:
+                self._render_or_count(job, placed)
         except DepthError:
             self._health.count("model")
 
@@ -212,12 +220,19 @@ class Renderer:
             views=views,
             paths=paths,
             started_ns=time.monotonic_ns(),
+            memory=self._memory,
         )
+
+    def _forget(self) -> None:
+        """The model's memory begins anew: what is in work of the one before is not gone on with. With `_seeing`."""
+        self._encoded.forget()
+        self._model.forget_frames()
+        self._memory += 1
 
     def _seen(self, job: Job) -> Seen:
         """Or what it failed with. Raises DepthError."""
         with model_errors():
-            return _tried(lambda: self._see(job))
+            return tried(lambda: self._see(job))
 
     def _see(self, job: Job) -> SourceFeatures | Sequence[SeenFrame]:
         synthesizer, window, context = self._model.synthesizer, job.window, job.context
@@ -225,7 +240,7 @@ class Renderer:
             self._model.forget_frames()
             self._epoch = window.epoch
         started_s = time.monotonic()
-        features = self._encoded.features(synthesizer, window, _terms(context))
+        features = self._encoded.features(synthesizer, window, encode_terms(context))
         guessed = self._encoded.guessed
         if guessed and context.config.model.on_bad_depth == "stop":
             raise DepthError(f"the depth of {guessed} frames of this window cannot be used; it is not rendered")
@@ -235,24 +250,23 @@ class Renderer:
         self._health.stage("encode", time.monotonic() - started_s)
         return seen
 
-    def _render_or_count(self, job: Job, placed: Placed) -> None:
-        failure: _Failure | None = None
+    def _render_or_count(self, job: Job, placed: Placed | None) -> None:
+        failure: Failure | None = None
         window_id = job.window.window_id
         seeds = [window_seed(job.context.digest, window_id, attempt) for attempt in (0, 1)]
         for seed in seeds:
             if failure is not None:
                 job, placed = self._anew(job, failure)
-            failure = _tried(partial(self._publish, job, seed, placed))
+            failure = tried(partial(self._publish, job, seed, placed))
             if failure is None:
                 self._failures.success()
                 return
-            with self._seeing:
-                self._encoded.forget()
-                self._model.forget_frames()
             if isinstance(failure, NonFiniteError):
                 _LOG.warning("window %d: %s", window_id, failure)
             else:
                 self._give_up_more(job, failure)
+        with self._seeing:
+            self._forget()
         self._health.count("model")
         if isinstance(failure, NonFiniteError):
             self.counts.nan_windows += 1
@@ -266,9 +280,11 @@ class Renderer:
                 }
             )
 
-    def _anew(self, job: Job, failure: _Failure) -> tuple[Job, Placed]:
-        """The job with what may still be asked of the device, and its first steps again."""
+    def _anew(self, job: Job, failure: Failure) -> tuple[Job, Placed | None]:
+        """The job with what may still be asked of the device, and its first steps again, in a memory that begins."""
         with self._seeing:
+            self._forget()
+            job = replace(job, memory=self._memory)
             if isinstance(failure, DeviceMemoryError):
                 most = 1 if self.level.single else len(job.views)
                 context = self._context(job.settings, job.window.epoch)
@@ -286,18 +302,20 @@ class Renderer:
         )
         self._failures.out_of_memory(job.window.window_id, error, levels)
         if self.level.half and self._model.can_halve:
-            self._beat_s = None  # loading takes as long as it takes
-            self._health.model("loading")
-            self._model.halve()
+            with self._seeing, self._placing:
+                self.pulse.load()
+                self._forget()
+                self._model.halve()
 
-    def _publish(self, job: Job, seed: int, placed: Placed) -> None:
-        if isinstance(placed, _Failure):
+    def _publish(self, job: Job, seed: int, placed: Placed | None) -> None:
+        if isinstance(placed, Failure):
             raise placed
+        assert placed is not None, "only this thread makes the memory begin anew"
         level = self.level
         steps = max(1, sampler_in_use(job.context.config.model, job.context.traits).steps // level.steps_divisor)
         with model_errors():
             views = self._draw(job, seed, placed, steps if level.steps_divisor > 1 else job.context.config.model.steps)
-        if self._cancel.is_set():  # a model that ignores cancel: nothing may follow the end
+        if self.cancel.is_set():  # a model that ignores cancel: nothing may follow the end
             raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
         self._tell_source(job.context, views[0])
@@ -322,7 +340,7 @@ class Renderer:
     def _draw(self, job: Job, seed: int, placed: _Known, steps: int | None) -> list[View]:
         started_s = time.monotonic()
         options = self._options(job.settings, seed, steps=steps)
-        self._beat()
+        self.pulse.beat()
         if not isinstance(placed, SourceFeatures):
             views = self._frames.paint(placed, job.paths, options)
         elif self.level.one_by_one:
@@ -330,7 +348,7 @@ class Renderer:
         else:
             views = self._model.synthesizer.render(placed, job.paths, options)
         self._health.stage("render", time.monotonic() - started_s)
-        self._beat()
+        self.pulse.beat()
         return views
 
     def _options(self, settings: Settings, seed: int, *, steps: int | None) -> RenderOptions:
@@ -343,11 +361,11 @@ class Renderer:
             seed=seed,
             whole_levels=samples == 1 and self._model.traits.device.startswith("cuda"),
             progress=self._step_done,
-            cancel=self._cancel,
+            cancel=self.cancel,
         )
 
     def _step_done(self, _done: int, _steps: int) -> None:
-        self._beat()
+        self.pulse.beat()
 
     # What windows show, and cost.
 
@@ -379,21 +397,3 @@ class Renderer:
             self._health.measure("gpu_mem_mb", torch.cuda.memory_allocated() / 1e6)
         if self._on_window is not None:
             self._on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))
-
-
-def _tried(step: Callable[[], Made]) -> Made | _Failure:
-    """What a step came to, or failed with: without its traceback, which keeps the model's work in memory."""
-    try:
-        return step()
-    except (NonFiniteError, DeviceMemoryError) as error:
-        return error.with_traceback(None)
-
-
-def _terms(context: StreamContext) -> EncodeTerms:
-    return EncodeTerms(
-        digest=context.digest,
-        strength=context.config.model.cond_aug,
-        mount=context.mount,
-        lens=context.intrinsics if context.traits.live else None,
-        depth=context.depth,
-    )

@@ -34,8 +34,7 @@ from gcd_client.protocol import (
     view_topic,
 )
 from gcd_model import Intrinsics, Traits, Trajectory, View
-from gcd_node.calibration import HALF_PIXEL
-from gcd_node.frame import Frame, Image
+from gcd_node.frame import HALF_PIXEL, Frame, Image
 from gcd_node.image_io import to_u8
 from gcd_node.stream_context import StreamContext, family_name, source_pose
 from gcd_node.window import FrameWindow

@@ -3,13 +3,14 @@ device has no memory left (docs/node.md, F11), and when it counts as failed."""
 
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from msgspec.structs import replace
@@ -23,6 +24,7 @@ from gcd_model import (
     DeviceMemoryError,
     FrameSynthesizer,
     ModelError,
+    NonFiniteError,
     OptionError,
     RenderOptions,
     Trajectory,
@@ -30,8 +32,10 @@ from gcd_model import (
 )
 from gcd_node.config import ModelSection
 from gcd_node.errors import ModelFailedError, NodeError
-from gcd_node.health import Level
+from gcd_node.health import Health, Level, ModelState
 from gcd_node.status import Announcer
+
+Made = TypeVar("Made")
 
 _LOG = logging.getLogger(__name__)
 _TRIES, _SPAN_S = 3, 60.0
@@ -47,6 +51,18 @@ def model_errors() -> Generator[None]:
         raise
     except Exception as error:
         raise ModelFailedError(f"the model broke: {type(error).__name__}: {error}") from error
+
+
+Failure = NonFiniteError | DeviceMemoryError
+"""What a step of the model may come to instead; it may be tried again."""
+
+
+def tried(step: Callable[[], Made]) -> Made | Failure:
+    """What a step came to, or failed with: without its traceback, which keeps the model's work in memory."""
+    try:
+        return step()
+    except (NonFiniteError, DeviceMemoryError) as error:
+        return error.with_traceback(None)
 
 
 LoadModel = Callable[[ModelSection], ViewSynthesizer]
@@ -117,13 +133,15 @@ def render_grey(
 
 
 @contextmanager
-def interruptible(cancel: threading.Event) -> Generator[None]:
-    """Within the block, once `cancel` is set, the next layer of any network that this thread calls raises Cancelled:
-    in an encoder, a denoising step or a decoder alike. Changes no result; costs a microsecond a layer."""
-    thread = threading.get_ident()
+def interruptible(cancel: threading.Event, threads: Container[int]) -> Generator[None]:
+    """Within the block, once `cancel` is set, the next layer of any network that one of these threads calls raises
+    Cancelled: in an encoder, a denoising step or a decoder alike. Changes no result; costs a microsecond a layer.
+
+    threads: their identities. One hook for all: PyTorch's list of them must not change while a network works.
+    """
 
     def look(module: nn.Module, _: Any) -> None:
-        if cancel.is_set() and threading.get_ident() == thread:
+        if cancel.is_set() and threading.get_ident() in threads:
             raise Cancelled(f"cancelled before a layer ({type(module).__name__})")
 
     hook = register_module_forward_pre_hook(look)
@@ -131,6 +149,42 @@ def interruptible(cancel: threading.Event) -> Generator[None]:
         yield
     finally:
         hook.remove()
+
+
+class Pulse:
+    """When each of the model's threads began the step that it is at; tells the node's health whether any is at one."""
+
+    def __init__(self, health: Health, level: "Callable[[], OomLevel]") -> None:
+        """level: how much is asked of the device now."""
+        self._health, self._level = health, level
+        self._begun_s: dict[int, float] = {}
+        self._order = threading.Lock()
+
+    @property
+    def silent_s(self) -> float:
+        """How long one of them has been at one step; 0 while all rest, or one loads a model."""
+        with self._order:
+            return max(0.0, time.monotonic() - min(self._begun_s.values(), default=math.inf))
+
+    def beat(self) -> None:
+        """This thread begins a step."""
+        self._begin(time.monotonic(), "busy" if self._level() is FULL else "degraded")
+
+    def load(self) -> None:
+        """This thread begins to load a model, which takes as long as it takes."""
+        self._begin(math.inf, "loading")
+
+    def rest(self) -> None:
+        """This thread waits for work."""
+        with self._order:
+            self._begun_s.pop(threading.get_ident(), None)
+            if not self._begun_s:
+                self._health.model("ready" if self._level() is FULL else "degraded")
+
+    def _begin(self, at_s: float, state: ModelState) -> None:
+        with self._order:
+            self._begun_s[threading.get_ident()] = at_s
+            self._health.model(state)
 
 
 class IdleTimer:

@@ -1,6 +1,6 @@
 """One clip, one view, offline: what `gcd-node synthesize` reads, plans, renders and writes.
 
-A video, folder, still, array or stereo pair becomes one clip of T frames. Its depth, where there is any, goes the way
+A video, folder, still or stereo pair becomes one clip of T frames. Its depth, where there is any, goes the way
 of its pictures: the same frames, crop and size.
 """
 
@@ -35,8 +35,9 @@ from gcd_node.image_io import (
 )
 from gcd_node.preprocess import Fit, assumed_hfov_deg, stated_mount, stated_sphere, to_clip_tensor
 from gcd_node.sources import SourcePose
-from gcd_node.sources.depth import DepthPicture, OnnxDepth, StereoDepth, clean_depth
+from gcd_node.sources.depth import DepthPicture, OnnxDepth, clean_depth
 from gcd_node.sources.files import PICTURES, ImageFolder, VideoFile, list_pictures, read_depth, read_picture
+from gcd_node.sources.stereo import StereoDepth
 
 _LOG = logging.getLogger(__name__)
 _RATE_TOLERANCE = 0.05
@@ -52,7 +53,7 @@ class ClipRequest:
     """Which frames of the input, at what size, under which frame rate, and with which depth.
 
     start, stride: in frames of the input. fps: what the network is told; else worked out.
-    height, width: else the trained size. An array keeps its own size.
+    height, width: else the trained size.
     hfov_deg: horizontal field of view of the input's pictures, if known; of a stereo pair, of the rectified ones.
     depth: of the input's frames: a folder of 16-bit pictures in millimetres, one such picture of a still, .npy of
         [T, H, W] metres, a network as .onnx, or with a calibration the right video of a stereo pair.
@@ -108,14 +109,12 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits, pose: SourcePose
 
     Raises:
         SourceError: missing, empty, damaged, undecodable. TooShortError: fewer frames than a clip needs.
-        OptionError: a size the network cannot take. UsageError: what the model or an array has no use for.
+        OptionError: a size the network cannot take. UsageError: what the model has no use for.
         DepthError: the depth does not belong to the pictures, or there is none. ConfigError: a calibration of no pair.
     """
     request = _with_lens(request, traits, pose)
     if request.calibration is not None:
         source = _from_pair(path, request, traits)
-    elif path.suffix.lower() == ".npy" and not path.is_dir():
-        source = _from_array(path, request, traits)
     else:
         source = _from_pictures(path, request, traits)
     mount, depth = stated_mount(pose, source.hfov_deg, traits), source.clip.depth
@@ -190,27 +189,6 @@ def _from_pair(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
         depth=_stacked([depth for _, depth in pairs]),
     )
     return OfflineClip(clip=clip, pictures=pictures, hfov_deg=stereo.lens.hfov_deg)
-
-
-def _from_array(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
-    if request.height is not None:
-        raise UsageError("a .npy input keeps its own size; leave out --height and --width")
-    array = read_npy(path, "float32 [T, H, W, 3] in [0, 1] as .npy")
-    if array.dtype != np.float32 or array.ndim != 4 or array.shape[3] != 3:
-        raise SourceError(f"{path} must hold float32 [T, H, W, 3] in [0, 1], got {array.dtype} {list(array.shape)}")
-    if array.size and not (np.isfinite(array).all() and array.min() >= 0.0 and array.max() <= 1.0):
-        raise SourceError(f"{path} must hold finite numbers in [0, 1]; scale them first")
-    height, width = array.shape[1:3]
-    traits.check_size(height, width)
-    chosen = np.array(_strided(iter(array), request, traits.config.frames, path))
-    depth = _stated_depth(request, (height, width), len(chosen))
-    clip = Clip(
-        video=torch.from_numpy(np.ascontiguousarray(chosen.transpose(0, 3, 1, 2))) * 2.0 - 1.0,
-        fps=_label(request, None, traits),
-        lens=None if request.hfov_deg is None else Intrinsics.from_hfov(request.hfov_deg, width, height),
-        depth=_stacked(depth) if depth else None,
-    )
-    return OfflineClip(clip=clip, pictures=np.rint(chosen * 255.0).astype(np.uint8), hfov_deg=request.hfov_deg)
 
 
 def _size(request: ClipRequest, traits: Traits) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from gcd_node.errors import (
 )
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import Level, SourceState
-from gcd_node.inference import WORK_REASONS, WindowReport, WorkCounts
+from gcd_node.inference import WORK_REASONS, Renderer, WindowReport, WorkCounts
 from gcd_node.model import ModelSlot
 from gcd_node.recorder import Recorder
 from gcd_node.sources.live import Opener, SourceWatch
@@ -91,7 +91,8 @@ class Stream:
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, config.source)
         self._preview = InputPreview(announcer.sink, lambda: self.context)
-        self.worker = ModelWorker(live, announcer, model, self.context_at, on_window)
+        renderer = Renderer(live, announcer, model, self.context_at, on_window)
+        self.worker = ModelWorker(live, announcer, model, renderer)
         self._threads = [
             threading.Thread(target=self._work, name="model", daemon=True),
             threading.Thread(target=read, args=(self._watch, self._builder, self._newest), name="reader", daemon=True),

@@ -20,9 +20,8 @@ from gcd_model import (
     Traits,
     center_crop_box,
 )
-from gcd_node.calibration import HALF_PIXEL, LensModel
 from gcd_node.errors import ConfigError
-from gcd_node.frame import Image
+from gcd_node.frame import HALF_PIXEL, Image, LensModel
 from gcd_node.sources import SourcePose
 
 Resize: TypeAlias = Literal["released", "area"]

@@ -17,10 +17,9 @@ from typing import Any, TypeAlias
 
 from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_node.auth import Client
-from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig, to_toml
 from gcd_node.errors import NodeError
-from gcd_node.frame import Frame, SourceInfo
+from gcd_node.frame import Frame, LensModel, SourceInfo
 from gcd_node.health import Level, RecordHealth
 from gcd_node.mcap_file import McapFile, RoomError, check_room, new_folder, node_facts
 from gcd_node.messages import MessageSink, PublisherStats

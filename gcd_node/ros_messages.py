@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from gcd_client.images import depth_m, encode_jpegs, images
 from gcd_client.protocol import OriginHeader, StatusTopic, ViewHeader, ViewMessage, kind_of, to_text
 from gcd_node.auth import Client
-from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig, RecordConfig
-from gcd_node.frame import Frame, SourceInfo
+from gcd_node.frame import Frame, LensModel, SourceInfo
 from gcd_node.health import Level
 from gcd_node.verbs import VERBS
 

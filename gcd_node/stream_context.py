@@ -25,10 +25,9 @@ from gcd_model import (
     Traits,
     sampler_of,
 )
-from gcd_node.calibration import LensModel, load_lens
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError
-from gcd_node.frame import SourceInfo
+from gcd_node.frame import LensModel, SourceInfo, load_lens
 from gcd_node.preprocess import (
     Fit,
     Rectifier,
@@ -331,20 +330,15 @@ def _model_in_use(section: ModelSection, traits: Traits) -> ModelSection:
 
 def _pose_in_use(pose: SourcePose | None, traits: Traits) -> SourcePose | None:
     """Where the camera stands in the words the model knows; None for a model that has no use for them."""
-    stated, mount = pose or SourcePose(), CameraMount()
-    if traits.live and stated.on_vehicle:
+    mount = stated_mount(pose, None, traits)
+    if mount is not None:
         return SourcePose(
-            height_m=mount.height_m if stated.height_m is None else stated.height_m,
-            forward_m=mount.forward_m if stated.forward_m is None else stated.forward_m,
-            left_m=mount.left_m if stated.left_m is None else stated.left_m,
-            tilt_deg=mount.tilt_deg if stated.tilt_deg is None else stated.tilt_deg,
+            height_m=mount.height_m, forward_m=mount.forward_m, left_m=mount.left_m, tilt_deg=mount.tilt_deg
         )
     if traits.config.camera == "none":
         return None
-    return SourcePose(
-        elevation_deg=ASSUMED_SOURCE.elevation_deg if stated.elevation_deg is None else stated.elevation_deg,
-        radius=ASSUMED_SOURCE.radius_m if stated.radius is None else stated.radius,
-    )
+    sphere = stated_sphere(pose) or ASSUMED_SOURCE
+    return SourcePose(elevation_deg=sphere.elevation_deg, radius=sphere.radius_m)
 
 
 def _without_negative_zero(value: object) -> object:

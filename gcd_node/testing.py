@@ -46,8 +46,6 @@ class ReplayedRun:
     ) -> None:
         """Fail unless this run is what a golden run says. With --gcd-update the golden becomes this run instead.
 
-        When it fails, pictures of the worst windows and diff.json lie beside the run, in a folder named in the message.
-
         Args:
             golden: its folder; from pytest's root folder if relative.
             min_psnr: decibels each frame of each view must reach; left out, all pixels must be identical, which only
@@ -57,7 +55,7 @@ class ReplayedRun:
             AssertionError: it differs, or there is no golden run yet. DamagedRunError: the golden is damaged.
         """
         __tracebackhide__ = True
-        from gcd_node.replay.compare import Tolerance, compare, report_text, write_report
+        from gcd_node.replay.compare import Tolerance, compare, report_text
         from gcd_node.replay.run import open_run
 
         path = self._config.rootpath / golden
@@ -72,12 +70,9 @@ class ReplayedRun:
         tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
         comparison = compare(open_run(path), self._run)
         if comparison.failures(tolerance):
-            folder = self.folder.with_name(f"{self.folder.name}-differences")
-            pictures = write_report(folder, comparison, tolerance)
-            shown = "\n".join(f"  {each}" for each in pictures) or f"  {folder}: no pictures, see diff.json"
             raise AssertionError(
                 f"{report_text(comparison, tolerance)}\nA is the golden run {path}\nB is this run {self.folder}\n"
-                f"pictures:\n{shown}\nIf this is how it should be: pytest {_UPDATE}"
+                f"If this is how it should be: pytest {_UPDATE}"
             )
 
 

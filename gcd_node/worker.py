@@ -14,10 +14,9 @@ from typing import TypeVar
 
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError
 from gcd_node.health import IDLE, Level
-from gcd_node.inference import Job, Placed, Renderer, Seen, WindowReport, WorkCounts
-from gcd_node.model import FULL, IdleTimer, ModelSlot, interruptible, model_errors
+from gcd_node.inference import Job, Placed, Renderer, Seen, WorkCounts
+from gcd_node.model import IdleTimer, ModelSlot, interruptible, model_errors
 from gcd_node.status import Announcer
-from gcd_node.stream_context import StreamContext
 from gcd_node.views import LiveConfig
 from gcd_node.window import PartialWindow, WindowSlot
 
@@ -29,27 +28,13 @@ _LOG = logging.getLogger(__name__)
 class ModelWorker:
     """Renders windows until there are no more, it is cancelled, or the model has failed."""
 
-    def __init__(
-        self,
-        live: LiveConfig,
-        announcer: Announcer,
-        model: ModelSlot,
-        context_at: Callable[[int], StreamContext],
-        on_window: Callable[[WindowReport], None] | None = None,
-    ) -> None:
-        """context_at: what is known of the source in an epoch; -1 for now.
-
-        Raises:
-            OptionError, PoseError: see VirtualView.
-        """
+    def __init__(self, live: LiveConfig, announcer: Announcer, model: ModelSlot, renderer: Renderer) -> None:
         self.warm = threading.Event()  # the first window may come
-        self._model, self._context_at = model, context_at
+        self._model, self._renderer, self._pulse = model, renderer, renderer.pulse
         self._sink, self._health = announcer.sink, announcer.health
         self._realtime = live.config.source.pace == "realtime"
         self._idle = IdleTimer(live.config.life.idle_s if self._realtime else 0.0)
-        self._cancel = threading.Event()
-        self._beats_s: dict[int, float] = {}  # by thread, while it works
-        self._renderer = Renderer(live, announcer, model, context_at, self._beat, self._cancel, on_window)
+        self._threads: set[int] = set()
         self._may_encode_ahead = True
 
     @property
@@ -60,11 +45,11 @@ class ModelWorker:
     @property
     def silent_s(self) -> float:
         """How long the model has been at one step; 0 while it waits for windows."""
-        return max((time.monotonic() - beat_s for beat_s in list(self._beats_s.values())), default=0.0)
+        return self._pulse.silent_s
 
     def cancel(self) -> None:
         """Abandon the window in work at the next layer of a network; from any thread."""
-        self._cancel.set()
+        self._renderer.cancel.set()
 
     def work(self, newest: WindowSlot) -> None:
         """Take windows and publish their views; while there is none, encode what has arrived of the next.
@@ -73,13 +58,14 @@ class ModelWorker:
             ModelFailedError: three windows in a row could not be used, or there is no memory however little is asked.
             whatever the source failed with, once its last window is done.
         """
+        self._threads.add(threading.get_ident())
         try:
-            with interruptible(self._cancel):
+            with interruptible(self._renderer.cancel, self._threads):
                 self._work(newest)
         except Cancelled:
             _LOG.info("the window in work was abandoned")
         finally:
-            self._beats_s.clear()
+            self._pulse.rest()
             self.warm.set()
 
     def announce_end(self, *, delay_ms: int | None) -> None:
@@ -89,17 +75,16 @@ class ModelWorker:
     def _work(self, newest: WindowSlot) -> None:
         if self._realtime:
             self._warm_up()
-        self._ready()
+        self._pulse.rest()
         self.warm.set()
         with self._steps(newest) as go_on:
             while (window := newest.take(lambda: self._encode_ahead(newest.filling))) is not None:
                 self._may_encode_ahead = True
                 taken = None
                 if not self._is_idle():
-                    self._beat()
                     self._health.stage("window", (time.monotonic_ns() - window.arrival_ns) / 1e9)
                     taken = self._renderer.take(window)
-                self._ready()
+                self._pulse.rest()
                 go_on(taken)
         self._renderer.announce_removed()
 
@@ -132,19 +117,20 @@ class ModelWorker:
         failures: list[Exception] = []
 
         def work() -> None:
+            self._threads.add(threading.get_ident())
             while (given := waiting.get()) is not None:
                 waiting.task_done()
                 try:
                     if not failures:
-                        with interruptible(self._cancel):
-                            step(*given)
+                        step(*given)
                 except Exception as error:  # the end of a thread: the block raises it
                     failures.append(error)
                     newest.close()
                 finally:
-                    self._ready()
+                    self._pulse.rest()
 
         def hand_over(given: Given) -> None:
+            self._pulse.rest()
             waiting.put((given,))
             waiting.join()
 
@@ -158,29 +144,16 @@ class ModelWorker:
             if failures:
                 raise failures[0]
 
-    def _place(self, taken: tuple[Job, Seen] | None) -> tuple[Job, Placed] | None:
-        if taken is None:
-            return None
-        self._beat()
-        job, seen = taken
-        return job, self._renderer.place(job, seen)
+    def _place(self, taken: tuple[Job, Seen] | None) -> tuple[Job, Placed | None] | None:
+        return None if taken is None else (taken[0], self._renderer.place(*taken))
 
-    def _render(self, placed: tuple[Job, Placed] | None) -> None:
+    def _render(self, placed: tuple[Job, Placed | None] | None) -> None:
         """The views of a window. placed: None if it is not to be rendered."""
         self._renderer.announce_removed()
         if placed is not None:
-            self._beat()
+            self._pulse.beat()
             self._renderer.render(*placed)
-        self._ready()
-
-    def _beat(self) -> None:
-        self._beats_s[threading.get_ident()] = time.monotonic()
-        self._health.model("busy" if self._renderer.level is FULL else "degraded")
-
-    def _ready(self) -> None:
-        self._beats_s.pop(threading.get_ident(), None)
-        if not self._beats_s:
-            self._health.model("ready" if self._renderer.level is FULL else "degraded")
+        self._pulse.rest()
 
     def _is_idle(self) -> bool:
         """Whether no subscriber would see this window."""
@@ -193,7 +166,7 @@ class ModelWorker:
 
     def _warm_up(self) -> None:
         """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
-        self._beat()
+        self._pulse.beat()
         self._health.model("warming")
         try:
             with model_errors():
@@ -212,4 +185,4 @@ class ModelWorker:
             self._may_encode_ahead = False
             return False
         finally:
-            self._ready()
+            self._pulse.rest()

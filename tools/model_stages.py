@@ -23,8 +23,7 @@ from gcd_model.clip import Clip, RenderOptions, View
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.diffusion import Schedule, unit_noise
-from gcd_model.engines.cpu import arrange
-from gcd_model.engines.torch import Engine, TorchEngine
+from gcd_model.engines.torch import Engine, TorchEngine, arrange
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare

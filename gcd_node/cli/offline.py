@@ -41,7 +41,7 @@ _depth = partial(Option, rich_help_panel="Depth from elsewhere, for the live mod
 
 Input = Annotated[
     Path,
-    Argument(metavar="INPUT", help="A video, a folder of pictures, a still, or .npy: float32 [T, H, W, 3] in 0..1."),
+    Argument(metavar="INPUT", help="A video, a folder of pictures, or a still."),
 ]
 AnyWeights = Annotated[
     str, Option(help="A checkpoint, a diffusers folder, an export, package:NAME, or random:FAMILY (noise).")
@@ -198,7 +198,7 @@ def _run(
     if save is not None and options.samples != 1:
         raise UsageError("--save holds one sample; leave out --samples")
     if not input_path.exists():
-        raise SourceError(f"{input_path} does not exist; give a video, a folder of pictures, a still or a .npy file")
+        raise SourceError(f"{input_path} does not exist; give a video, a folder of pictures or a still")
     with Console(stderr=True, markup=False).status("loading the weights"):
         model = load()
     traits = model.traits

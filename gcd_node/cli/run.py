@@ -195,28 +195,21 @@ def diff(
     max_class_share: Annotated[
         float, Option(metavar="SHARE", help="Of a view's class pixels in a window, how many may differ, 0 to 1.")
     ] = 0.0,
-    out: Annotated[
-        Path | None, Option("--out", metavar="DIR", help="Folder for diff.json and pictures of the worst windows.")
-    ] = None,
     as_json: Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")] = False,
 ) -> None:
     """Compare two runs window by window: identical, or how far apart, where first, and what they were made from.
 
     Ends with 0 if they are identical or near enough, with 1 if not, with 65 or 66 if one is damaged or missing.
     """
-    from gcd_node.replay.compare import REPORT, Tolerance, compare, report_text, to_plain, write_report
+    from gcd_node.replay.compare import Tolerance, compare, report_text, to_plain
     from gcd_node.replay.run import open_run
 
     tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
     runs = open_run(run_a), open_run(run_b)
     with Console(stderr=True, markup=False).status("comparing"):
         comparison = compare(*runs)
-        written = () if out is None else (out / REPORT, *write_report(out, comparison, tolerance))
-    if as_json:
-        typer.echo(msgspec.json.encode(to_plain(comparison, tolerance)).decode())
-    else:
-        for line in (report_text(comparison, tolerance), *(f"wrote {path}" for path in written)):
-            typer.echo(line)
+    plain = msgspec.json.encode(to_plain(comparison, tolerance)).decode() if as_json else None
+    typer.echo(plain or report_text(comparison, tolerance))
     if comparison.failures(tolerance):
         raise typer.Exit(1)
 

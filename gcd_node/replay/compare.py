@@ -1,27 +1,18 @@
-"""Two runs, window by window: the same pixels or how far apart, and what the two were made from; in words, as JSON, and
-in pictures of where they differ most."""
+"""Two runs, window by window: the same pixels or how far apart, and what the two were made from; in words and as
+JSON."""
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from gcd_client.images import paint
 from gcd_model import FileError, decode_toml, printable
-from gcd_node.errors import DamagedRunError, OutputError, UsageError
-from gcd_node.frame import Image
-from gcd_node.image_io import enlarged, make_folder, sheet, strip, write_png
+from gcd_node.errors import DamagedRunError, UsageError
 from gcd_node.replay.run import MANIFEST, Manifest, Pixels, RunFolder, ViewPixels, WindowEntry, read_windows
-
-REPORT = "diff.json"
-WORST = 4
-"""As many pictures are made."""
 
 _MAP_NAMES = {"cls": "class map", "vis": "visibility", "depth": "depth"}
 _ABSENT = "-"  # shown for what one of the runs does not have
@@ -29,8 +20,6 @@ _TOP = 255.0
 _DEPTH_SLACK = 0.01  # ten times what f16 rounds away, a tenth of what depth networks err
 _SECTIONS = ("strict", "source", "model", "view", "window")  # what a replay uses of a launch file
 _LINES = 10
-_HIGHEST_GAIN = 64
-_PATTERN = "window-*-view-*.png"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -63,7 +52,7 @@ class Distance:
 
     psnr_db: of all T frames together, infinite if they are identical. worst_frame, worst_psnr_db: of the frame that
     differs most. largest: difference of any level, 0 to 255. shares: of the pixels of each kind of map that there is,
-    how many differ. worst_class_frame: where most of the class map's do.
+    how many differ.
     """
 
     psnr_db: float
@@ -71,7 +60,6 @@ class Distance:
     worst_psnr_db: float
     largest: int
     shares: dict[str, float]
-    worst_class_frame: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -190,14 +178,12 @@ def _distance(a: ViewPixels, b: ViewPixels) -> Distance:
     pairs = list(zip(a["win"], b["win"], strict=True))
     squares = [float(cv2.norm(one, other, cv2.NORM_L2SQR)) for one, other in pairs]
     worst = int(np.argmax(squares))
-    shares = {kind: _shares(kind, a[kind], b[kind]) for kind in _MAP_NAMES if kind in a and kind in b}
     return Distance(
         psnr_db=_psnr_db(sum(squares), a["win"].size),
         worst_frame=worst,
         worst_psnr_db=_psnr_db(squares[worst], a["win"][worst].size),
         largest=max(int(cv2.absdiff(one, other).max()) for one, other in pairs),
-        shares={kind: float(frames.mean()) for kind, frames in shares.items()},
-        worst_class_frame=int(np.argmax(shares["cls"])) if "cls" in shares else 0,
+        shares={kind: _share(kind, a[kind], b[kind]) for kind in _MAP_NAMES if kind in a and kind in b},
     )
 
 
@@ -206,13 +192,13 @@ def _psnr_db(squares: float, count: int) -> float:
     return math.inf if squares == 0 else 10 * math.log10(_TOP**2 * count / squares)
 
 
-def _shares(kind: str, a: Pixels, b: Pixels) -> NDArray[np.float64]:
-    """Of each frame's pixels, how many differ: [T]. A frame whose depth differs by less than 1 % counts one pixel."""
+def _share(kind: str, a: Pixels, b: Pixels) -> float:
+    """Of the pixels, how many differ. A frame whose depth differs by less than 1 % counts one pixel."""
     if kind != "depth":
-        return (a != b).mean(axis=(1, 2))
+        return float((a != b).mean())
     one, other = (np.ascontiguousarray(each).view("<f2").astype(np.float32) for each in (a, b))
     far = (np.abs(one - other) > _DEPTH_SLACK * np.maximum(one, other)).mean(axis=(1, 2))
-    return np.maximum(far, (a != b).any(axis=(1, 2)) / one[0].size)
+    return float(np.maximum(far, (a != b).any(axis=(1, 2)) / one[0].size).mean())
 
 
 def _different_facts(a: Manifest, b: Manifest) -> dict[str, tuple[str, str]]:
@@ -299,59 +285,3 @@ def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:
         "first_divergence": None if first is None else {"window_id": first.window_id, "view_id": first.view_id},
         "views": views,
     }
-
-
-# In pictures.
-
-
-def write_report(folder: Path, comparison: RunComparison, tolerance: Tolerance) -> tuple[Path, ...]:
-    """Write diff.json and a picture of each of the worst views; gives the paths of the pictures, worst first.
-
-    Pictures of an earlier comparison in the same folder are removed.
-    Raises:
-        OutputError: `folder` cannot be written. DamagedRunError: see read_windows().
-    """
-    make_folder(folder)
-    try:
-        for old in folder.glob(_PATTERN):
-            old.unlink()
-        (folder / REPORT).write_bytes(msgspec.json.encode(to_plain(comparison, tolerance)) + b"\n")
-    except OSError as error:
-        raise OutputError(f"cannot write to {folder}: {error.strerror}; name another folder") from error
-    views = [(view, view.distance) for view in comparison.views if view.distance is not None]
-    views = [(view, far) for view, far in views if far.largest or any(far.shares.values())]
-    views.sort(key=lambda each: (each[1].worst_psnr_db, -max(each[1].shares.values(), default=0.0), each[0].window_id))
-    worst = {
-        folder / f"window-{view.window_id:06d}-view-{view.view_id}.png": (view, far) for view, far in views[:WORST]
-    }
-    for window_id, a, b in _paired_windows(comparison.a, comparison.b) if worst else ():  # cheaper than to keep all
-        for path, (view, far) in worst.items():
-            if a is not None and b is not None and window_id == view.window_id:
-                pixels = a[1][view.view_id], b[1][view.view_id]
-                write_png(path, _side_by_side(window_id, far, *pixels, comparison))
-    return tuple(worst)
-
-
-def _side_by_side(window_id: int, distance: Distance, a: ViewPixels, b: ViewPixels, comparison: RunComparison) -> Image:
-    """A, B and their difference at the first frame, the one that differs most and the last; class maps below, at the
-    frame where most of their pixels differ.
-
-    Levels of the difference are multiplied by the heading's number; class pixels that differ are white.
-    """
-    chosen = sorted({0, distance.worst_frame, len(a["win"]) - 1})
-    gain = _HIGHEST_GAIN
-    while gain > 1 and gain * distance.largest > _TOP:
-        gain //= 2
-    rows: list[list[Image]] = []
-    for one, other in ((a["win"][i], b["win"][i]) for i in chosen):
-        rows.append([one, other, np.asarray(cv2.convertScaleAbs(cv2.absdiff(one, other), alpha=gain), np.uint8)])
-    head = f"window {window_id}, frames {' '.join(map(str, chosen))}"
-    classes = [run.manifest.classes for run in (comparison.a, comparison.b)]
-    if "cls" in a and "cls" in b:
-        at = distance.worst_class_frame
-        one, other = a["cls"][at], b["cls"][at]
-        differs = np.where(one != other, np.uint8(255), np.uint8(0))
-        rows.append([paint(one, classes[0]), paint(other, classes[1]), np.repeat(differs[..., None], 3, axis=2)])
-        head += f", classes {at}"
-    body = strip([[enlarged(picture) for picture in row] for row in rows])
-    return sheet(body, (f"A: {head}", "B", f"difference x {gain}"), classes[0])

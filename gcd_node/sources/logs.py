@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model import printable
-from gcd_node.calibration import LensModel, lens_of_message
 from gcd_node.errors import SourceError, TooShortError
-from gcd_node.frame import MAX_FPS, Frame, SourceInfo
+from gcd_node.frame import MAX_FPS, Frame, LensModel, SourceInfo, lens_of_message
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.files import Pace, Recording
 from gcd_node.sources.log_reader import (

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import cv2
 import numpy as np
 
-from gcd_node.calibration import LensModel, depthai_lens
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
-from gcd_node.frame import Frame, Image, SourceInfo
+from gcd_node.frame import Frame, Image, LensModel, SourceInfo, depthai_lens
 from gcd_node.sources import OakSource
 from gcd_node.sources.live import LiveCamera
 
@@ -276,12 +275,15 @@ def lens_in_memory(
     None if the memory holds none for it.
     """
     try:
-        matrix = memory.getCameraIntrinsics(socket, width, height)
-        coefficients, model = memory.getDistortionCoefficients(socket), memory.getDistortionModel(socket)
+        matrix, model = memory.getCameraIntrinsics(socket, width, height), memory.getDistortionModel(socket).name
     except RuntimeError as error:
         _LOG.warning("the OAK's memory has no calibration for %s: %s", socket.name, error)
         return None
-    return _known_lens(matrix, coefficients, model.name, (width, height))
+    stored = dict(memory.eepromToJson()["cameraData"])[socket.value]["distortionCoeff"]
+    if model == "Fisheye" and len(stored) < 4:  # getDistortionCoefficients would read four, and end the process
+        _LOG.warning("the OAK's memory has no coefficients for the fish-eye lens of %s", socket.name)
+        return None
+    return _known_lens(matrix, stored, model, (width, height))
 
 
 def _lens_of(picture: "dai.ImgFrame", size: tuple[int, int]) -> LensModel | None:

@@ -36,7 +36,7 @@ _KINDS: tuple[ViewKind, ...] = tuple(kind for kind in get_args(ViewKind) if kind
 _QUALITY = 85
 _RETRY_S, _REPLY_S = 2.0, 2.0
 _MOST_AT_ONCE, _SETTLE_S = 64, 0.05
-_EVENTS, _HISTORY = 50, 300
+_EVENTS = 50
 _LENGTH = struct.Struct("<I")
 _LOG = logging.getLogger(__name__)
 
@@ -154,7 +154,6 @@ def _head(view: ReceivedView) -> dict[str, Any]:
         "captured_s": [stamp_ns / 1e9 for stamp_ns in header.t_capture_ns],
         "clock": header.clock,
         "at_s": header.t_publish_ns / 1e9,
-        "published": _publishing_times(view),
         "valid_for_ms": header.valid_for_ms,
         "pose": None if header.pose is None else to_json(header.pose[-1]),
         "synthetic": header.synthetic,
@@ -163,17 +162,6 @@ def _head(view: ReceivedView) -> dict[str, Any]:
         "scale": header.scale,
         "classes": None if header.classes is None else [to_json(each) for each in header.classes],
     }
-
-
-def _publishing_times(view: ReceivedView) -> dict[str, float]:
-    """Where the age of a window at its publishing comes from, ms: it waited for the model, the model worked, and the
-    rest until it left."""
-    header = view.header
-    model_ms = (header.t_infer_end_ns - header.t_infer_start_ns) / 1e6
-    after_ms = max(0.0, (header.t_publish_ns - header.t_infer_end_ns) / 1e6)
-    waited_ms = max(0.0, header.age_ms - model_ms - after_ms)
-    times = {"age_ms": header.age_ms, "model_ms": model_ms, "after_ms": after_ms, "waited_ms": waited_ms}
-    return {name: round(ms, 1) for name, ms in times.items()}
 
 
 class Mailbox:
@@ -251,8 +239,6 @@ class NodeLink:
         self._status_s: float | None = None
         self._last: dict[str, str] = {}
         self._events: deque[tuple[str, str]] = deque(maxlen=_EVENTS)
-        self._samples: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
-        self._windows: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
         self._count = 0
         self._notes = asyncio.create_task(self._read_notes())
 
@@ -265,10 +251,8 @@ class NodeLink:
         """A browser is there: from now on it gets what the node says, and the input."""
         browser.put("welcome", text_message("welcome", {"commands": self._node.control is not None}))
         self.watch(browser, None)
-        history = text_message("history", {"samples": list(self._samples)})
-        for slot, text in [("history", history), *self._events, *self._last.items()]:
+        for slot, text in [*self._events, *self._last.items()]:
             browser.put(slot, text)
-        browser.put("windows", text_message("windows", {"windows": list(self._windows)}))
 
     def watch(self, browser: Mailbox, view: str | None) -> None:
         """A browser wants to see this view instead of the one before; None for the input alone."""
@@ -355,8 +339,6 @@ class NodeLink:
 
     def _take_picture(self, shown: Picture) -> None:
         self._newest[shown.view, shown.kind] = shown
-        if shown.kind == "win":
-            self._windows.append({"view": shown.view, **shown.head["published"], "at_s": shown.head["at_s"]})
         for browser, watched in self._watched.items():
             if shown.view in (watched, PREVIEW_ID):
                 browser.put_picture(shown)
@@ -373,9 +355,8 @@ class NodeLink:
             self._last[note.topic] = text
         if note.topic == "status":
             # The first may be one that was kept for late readers, and is as old as its stamp says.
-            kept_s = 0.0 if self._samples else max(0.0, (time.time_ns() - header.t_publish_ns) / 1e9)
+            kept_s = 0.0 if self._status_s is not None else max(0.0, (time.time_ns() - header.t_publish_ns) / 1e9)
             self._status_s = time.monotonic() - kept_s
-            self._samples.append({"at_s": origin["at_s"], "stages": _medians(note.fields)})
         for browser in self._watched:
             browser.put(slot, text)
 
@@ -388,13 +369,3 @@ def _logged_errors(name: str) -> Generator[None]:
         _LOG.warning("the page gets nothing of %s: %s", name, error)
     except Exception:  # the end of a task
         _LOG.exception("reading %s broke", name)
-
-
-def _medians(status: Mapping[str, Any]) -> dict[str, float]:
-    """What is plotted of a status: the median of each stage, ms. It was written by others: nothing is certain."""
-    stages = status.get("stages")
-    return {
-        name: stage["p50_ms"]
-        for name, stage in (stages.items() if isinstance(stages, Mapping) else ())
-        if isinstance(stage, Mapping) and isinstance(stage.get("p50_ms"), int | float)
-    }

@@ -2,7 +2,7 @@
 
     synthesizer = load_synthesizer("kubric_gradual_max90.ckpt")
     trajectory = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0))
-    view = synthesize(synthesizer, Clip(video=video, fps=12.0), trajectory)
+    [view] = synthesizer.render(synthesizer.encode(Clip(video=video, fps=12.0)), [trajectory])
 
 The node imports from here only. Source: Van Hoorick et al., "Generative Camera Dolly", ECCV 2024.
 """
@@ -12,7 +12,7 @@ from gcd_model.colours import hatched
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import ModelConfig
 from gcd_model.diffusion import Sampler, Schedule, sampler_of
-from gcd_model.engines.onnx_export import ExportPrecision, Manifest, is_export
+from gcd_model.engines.onnx_export import ExportPrecision, is_export
 from gcd_model.errors import (
     Cancelled,
     CheckpointError,
@@ -40,14 +40,15 @@ from gcd_model.geometry import (
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.eyes import SeenFrame
-from gcd_model.live.seen_world import PlacedFrame
+from gcd_model.live.memory import PlacedFrame
 from gcd_model.live.synthesizer import visibility_of
 from gcd_model.loading import EngineName, default_precision, export_weights, load_synthesizer, weights_path
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
-from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer, synthesize
+from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer
 from gcd_model.traits import ASSUMED_SOURCE, Traits
+from gcd_model.weights.card import WeightsReport
 from gcd_model.weights.families import FAMILIES, LIVE_LENS_DEG, Family
-from gcd_model.weights.load import WeightsReport, convert_weights, inspect_weights
+from gcd_model.weights.load import convert_weights, inspect_weights
 
 __all__ = [
     "ASSUMED_SOURCE",
@@ -66,7 +67,6 @@ __all__ = [
     "FileError",
     "FrameSynthesizer",
     "Intrinsics",
-    "Manifest",
     "ModelConfig",
     "ModelError",
     "NonFiniteError",
@@ -109,7 +109,6 @@ __all__ = [
     "read_small",
     "require_motion",
     "sampler_of",
-    "synthesize",
     "visibility_of",
     "weights_path",
 ]

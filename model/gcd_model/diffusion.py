@@ -13,7 +13,7 @@ from gcd_model.clip import CancelSignal, Guidance, NoiseInterval, Quality, Rende
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ModelConfig, Prediction, SamplingConfig
 from gcd_model.errors import Cancelled
-from gcd_model.unet import StageInputs, UNetPlan, VideoUNet
+from gcd_model.unet import StageInputs, UNetPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,50 +176,28 @@ class Sampler:
     guidance_interval: NoiseInterval | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Preset:
-    """What a quality makes of a checkpoint with more steps than its own. guidance_interval: as in `Sampler`."""
-
-    steps: int
-    solver: SolverName
-    guidance_interval: NoiseInterval | None = None
-
-
-FAST = Preset(steps=16, solver="dpmpp_2m")
-"""No farther from the limit of many steps than 25 Euler steps are, on mixtures whose denoiser is known exactly."""
-FASTEST = Preset(steps=10, solver="dpmpp_2m")
-"""At most three times as far, on the same. Trained small models of many steps are nearer to the limit with either than
-with 25 Euler steps; guidance is left alone, as nothing was measured of it."""
-_PRESETS: dict[Quality, Preset] = {"fast": FAST, "fastest": FASTEST}
-
-
-def own_sampler(sampling: SamplingConfig) -> Sampler:
-    """What a checkpoint was made for, and what was published: Euler steps, guidance everywhere."""
-    return Sampler(steps=sampling.steps, solver="euler", guidance=sampling.guidance)
+PRESETS: dict[Quality, tuple[SolverName, int]] = {"fast": ("dpmpp_2m", 16), "fastest": ("dpmpp_2m", 10)}
+"""Solver and steps of the cheaper qualities. "fast" is no farther from the limit of many steps than 25 Euler steps, on
+mixtures whose denoiser is known exactly; "fastest" at most three times as far. Trained small models of many steps are
+nearer to the limit with either than with 25 Euler steps; guidance is left alone, as nothing was measured of it."""
 
 
 def sampler_of(sampling: SamplingConfig, options: RenderOptions) -> Sampler:
     """What `options` come to for a checkpoint.
 
-    What they name counts; what they leave open is as their quality has it: "exact" is the checkpoint's own way, "fast"
-    and "fastest" are presets for checkpoints that take more steps than those. A checkpoint of fewer steps, such as our
-    small models, is sampled its own way in every quality.
+    What they name counts; what they leave open is as their quality has it: "exact" is the checkpoint's own way, Euler
+    steps with guidance everywhere; "fast" and "fastest" are presets for checkpoints that take more steps than those. A
+    checkpoint of fewer steps, such as our small models, is sampled its own way in every quality.
     """
-    usual = _of_quality(own_sampler(sampling), options.quality)
+    solver, steps = "euler", sampling.steps
+    preset = PRESETS.get(options.quality)
+    if preset is not None and preset[1] < steps:
+        solver, steps = preset
     return Sampler(
-        steps=options.steps or usual.steps,
-        solver=options.solver or usual.solver,
-        guidance=options.guidance or usual.guidance,
-        guidance_interval=options.guidance_interval or usual.guidance_interval,
-    )
-
-
-def _of_quality(own: Sampler, quality: Quality) -> Sampler:
-    preset = _PRESETS.get(quality)
-    if preset is None or own.steps <= preset.steps:
-        return own
-    return Sampler(
-        steps=preset.steps, solver=preset.solver, guidance=own.guidance, guidance_interval=preset.guidance_interval
+        steps=options.steps or steps,
+        solver=options.solver or solver,
+        guidance=options.guidance or sampling.guidance,
+        guidance_interval=options.guidance_interval,
     )
 
 
@@ -281,23 +259,9 @@ class Backbone(Protocol):
         """All that does not depend on the pixels. labels: float32 [S], c_noise of every step, anywhere."""
         ...
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
+    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
         """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
         ...
-
-
-class TorchBackbone:
-    """The U-Net as it is, in its own precision. Source: `Backbone`."""
-
-    def __init__(self, unet: VideoUNet) -> None:
-        self._unet = unet
-
-    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
-        on_device = labels.to(self._unet.stem.weight.device)
-        return self._unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
-
-    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
-        return self._unet(rows.to(self._unet.stem.weight), condition, inputs).float()
 
 
 Network = Callable[[Tensor, int, int], Tensor]
@@ -335,18 +299,7 @@ def planned_denoiser(backbone: Backbone, given: Conditioning, schedule: Schedule
         condition, inputs = given.latents, plan.step(step)
         if branches < given.branches:
             condition = condition.chunk(given.branches)[-1]
-            inputs = tuple(_conditional(each, given.branches) for each in inputs)
+            inputs = inputs.chunk(given.branches)[-1]  # the conditional rows come last
         return backbone.predict(rows, condition, inputs)
 
     return GuidedDenoiser(network, schedule, given.latents.device)
-
-
-def _conditional(inputs: StageInputs, branches: int) -> StageInputs:
-    """What the conditional rows alone are given; they come last."""
-    spatial, temporal = inputs.spatial_cross, inputs.temporal_cross
-    return StageInputs(
-        inputs.spatial_embedding.chunk(branches)[-1],
-        inputs.temporal_embedding.chunk(branches)[-1],
-        None if spatial is None else spatial.chunk(branches)[-1],
-        None if temporal is None else temporal.chunk(branches)[-1],
-    )

@@ -11,18 +11,16 @@ import torch
 from gcd_model.config import SMALL
 from gcd_model.engines.onnx import load_export
 from gcd_model.engines.onnx_export import ExportPrecision, Manifest, Report, export_onnx, is_export, require_onnx
-from gcd_model.engines.torch import Engine
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.live.config import LIVE_TINY
-from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.networks import LoadedWeights, Networks, random_networks, weights_digest
+from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, weights_digest
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.weights.card import FULL_PRECISION, precision
-from gcd_model.weights.examine import Options, Told
-from gcd_model.weights.families import LIVE, Family, family_named
-from gcd_model.weights.load import load_adapted, load_weights, read_adapter
+from gcd_model.weights.families import LIVE, family_named
+from gcd_model.weights.infer import Hints
+from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]
 """What can compute networks; see `Engine`."""
@@ -51,7 +49,7 @@ def load_synthesizer(
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
             stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn). The live model
             computes in bfloat16 also on a CPU that multiplies in it (Intel AMX).
-        told: family, head_width, image_heads, frames, see `Options`.
+        told: family, head_width, image_heads, frames, see `Told`.
         adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
         engine: what computes the networks: "torch" as they are, or "cuda", compiled and as CUDA graphs, for a GPU; it
             settles the decoder's precision itself, see `CudaOptions`. "onnxruntime" runs the folder of an export,
@@ -107,8 +105,7 @@ def export_weights(
 
 def placed_synthesizer(loaded: LoadedWeights, *, device: str = "auto", dtype: str | None = None) -> Synthesizer:
     """Weights that were loaded or made elsewhere, ready to run. Raises OptionError as `load_synthesizer`."""
-    place = _place(device, dtype)
-    return _synthesizer(loaded, place)
+    return _synthesizer(loaded, _place(device, dtype))
 
 
 def weights_path(source: str | Path) -> Path:
@@ -128,9 +125,15 @@ def weights_path(source: str | Path) -> Path:
 
 def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
     """Small random networks with the camera control of a family; always the same ones."""
-    Options(frames=frames)  # checks it
+    Hints(frames=frames)  # checks it
     chosen = family_named(family)
-    networks = _random_networks(chosen, frames)
+    if chosen is LIVE:
+        networks = random_networks(msgspec.structs.replace(LIVE_TINY, frames=frames or LIVE_TINY.frames), seed=0)
+    else:
+        width = 0 if chosen.camera == "none" else SMALL.unet.camera_width
+        unet, frames = msgspec.structs.replace(SMALL.unet, camera_width=width), frames or SMALL.frames
+        config = msgspec.structs.replace(SMALL, camera=chosen.camera, unet=unet, frames=frames)
+        networks = random_networks(config, seed=0)
     return LoadedWeights(
         name=f"random-{family}",
         networks=networks,
@@ -139,16 +142,6 @@ def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
         trained=False,
         sha256_12=weights_digest(networks.state_dict()),
     )
-
-
-def _random_networks(family: Family, frames: int | None) -> Networks | LiveNetworks:
-    if family is LIVE:
-        return random_networks(
-            LIVE_TINY if frames is None else msgspec.structs.replace(LIVE_TINY, frames=frames), seed=0
-        )
-    unet = SMALL.unet if family.camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
-    config = msgspec.structs.replace(SMALL, camera=family.camera, unet=unet, frames=frames or SMALL.frames)
-    return random_networks(config, seed=0)
 
 
 def _require_export_options(source: str | Path, engine: EngineName | None, given: Sequence[object]) -> None:
@@ -228,33 +221,16 @@ def _live_synthesizer(
 
 
 def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:
-    networks = _moved(loaded.diffusion, place)
-    engine = _cuda_engine(networks) if place.engine == "cuda" else None
+    """Everything to its device and precision; what has both already stays in the mapped file."""
+    networks, engine = loaded.diffusion, None
+    for name, module in networks.named_children():
+        module.to(place.device, torch.float32 if name in FULL_PRECISION else place.dtype)
+    if place.engine == "cuda":
+        from gcd_model.engines.cuda import CudaEngine  # torch.compile takes seconds to import
+
+        engine = CudaEngine(networks)
     return Synthesizer(networks, _traits(loaded, place), engine)
 
 
-def _cuda_engine(networks: Networks) -> Engine:
-    from gcd_model.engines.cuda import CudaEngine  # torch.compile takes seconds to import
-
-    return CudaEngine(networks)
-
-
-def _moved(networks: Networks, place: _Place) -> Networks:
-    """Everything to its device and precision; what has both already stays in the mapped file."""
-    for name, module in networks.named_children():
-        module.to(place.device, torch.float32 if name in FULL_PRECISION else place.dtype)
-    return networks
-
-
 def _traits(loaded: LoadedWeights, place: _Place) -> Traits:
-    return Traits(
-        name=loaded.name,
-        config=loaded.networks.config,
-        family=loaded.family,
-        move_time=loaded.move_time,
-        sha256_12=loaded.sha256_12,
-        precision=place.precision,
-        device=str(place.device),
-        trained=loaded.trained,
-        uncertainty_scale=loaded.uncertainty_scale,
-    )
+    return Traits.of(loaded.card, sha256_12=loaded.sha256_12, precision=place.precision, device=str(place.device))

@@ -13,7 +13,8 @@ from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.image_encoder import ImageEncoder
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.networks import LiveNetworks
+from gcd_model.live.depth_net import DepthNet, Familiarity
+from gcd_model.live.paint_net import PaintNet
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights.card import NO_DIFFUSION, Card, Layout
@@ -43,6 +44,17 @@ class Networks(nn.Module):
     def condition_encoder(self) -> Encoder:
         """The encoder the source frames go through."""
         return self.target_encoder if self.own_condition_encoder is None else self.own_condition_encoder
+
+
+class LiveNetworks(nn.Module):
+    """All weights of the live model."""
+
+    def __init__(self, config: LiveConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.depth = DepthNet(config.depth, len(config.classes))
+        self.paint = PaintNet(config.paint, len(config.classes))
+        self.familiarity = Familiarity(config.depth.widths[0])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

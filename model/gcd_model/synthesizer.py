@@ -1,7 +1,6 @@
 """The door: `encode` a clip once, `render` it as other cameras would have seen it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import wraps
 from typing import ParamSpec, Protocol, TypeVar, runtime_checkable
 
@@ -11,15 +10,13 @@ from torch import Tensor
 from gcd_model.clip import Augmentation, Clip, RenderOptions, View
 from gcd_model.colours import nearest_classes
 from gcd_model.conditioning import Conditioning, SourceFeatures, condition_latents, condition_tokens, micro_conditioning
-from gcd_model.config import SemanticClass
 from gcd_model.diffusion import Schedule, unit_noise
-from gcd_model.engines.cpu import arrange
-from gcd_model.engines.torch import Engine, TorchEngine
+from gcd_model.engines.torch import Engine, TorchEngine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
 from gcd_model.live.eyes import SeenFrame
-from gcd_model.live.seen_world import PlacedFrame
+from gcd_model.live.memory import PlacedFrame
 from gcd_model.networks import Networks
 from gcd_model.traits import Traits
 from gcd_model.vae import to_pixels
@@ -144,63 +141,9 @@ def _begun(source: Tensor) -> tuple[Tensor, torch.cuda.Event]:
     return held, arrived
 
 
-# --- from latents to pictures ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Pictures:
-    """One view on the CPU: pixels [S, T, 3, H, W], RGB; classes uint8 [S, T, H, W] or None.
-
-    pixels: float32 in [0, 1], or whole levels, uint8 in 0..255. finite: what was decoded held neither NaN nor Inf.
-    """
-
-    pixels: Tensor
-    classes: Tensor | None
-    finite: bool
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Coming:
-    """A decoded clip that may still be arriving. finite: bool, on the device."""
-
-    pixels: Download
-    classes: Download | None
-    finite: Tensor
-
-
-def decode(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> list[Pictures]:
-    """Decode view by view, one clip at a time; while one is decoded, the one before it arrives on the CPU.
-
-    latents: [V, S, T, C, h, w], unscaled: V views, S samples of each.
-    """
-    views = [[_decoded_clip(engine, clip, painted, as_levels=as_levels) for clip in view] for view in latents]
-    return [_arrived(clips) for clips in views]
-
-
-def _decoded_clip(engine: Engine, latents: Tensor, painted: tuple[SemanticClass, ...], *, as_levels: bool) -> _Coming:
-    """latents: [T, C, h, w]. Pixels [T, 3, H, W] and class ids [T, H, W]."""
-    decoded = engine.decode(latents)
-    pixels = to_pixels(decoded)
-    return _Coming(
-        pixels=Download(whole_levels(pixels) if as_levels else pixels),
-        classes=Download(nearest_classes(pixels, painted)) if painted else None,
-        finite=decoded.isfinite().all(),
-    )
-
-
 def whole_levels(pixels: Tensor) -> Tensor:
     """[0, 1] -> uint8 in 0..255, the nearest level."""
     return (pixels * 255).round().to(torch.uint8)
-
-
-def _arrived(clips: list[_Coming]) -> Pictures:
-    """The samples of one view."""
-    classes = [clip.classes.result() for clip in clips if clip.classes is not None]
-    return Pictures(
-        pixels=torch.stack([clip.pixels.result() for clip in clips]),
-        classes=torch.stack(classes) if classes else None,
-        finite=all(clip.finite.item() for clip in clips),
-    )
 
 
 # --- the door ------------------------------------------------------------------------------------------------------
@@ -267,21 +210,21 @@ class Synthesizer:
     ) -> list[View]:
         options = RenderOptions() if options is None else options
         self._check_lengths(features, trajectories)
-        buckets = [self._bucket(path, options) for path in trajectories]
-        job = _Job(features, tuple(trajectories), tuple(buckets), options)
-        made = self._denoise(job)
-        pictures = self._decode(job, made)
+        given = options.motion_bucket
+        buckets = [self._traits.motion_bucket(path) if given is None else given for path in trajectories]
+        made = self._denoise(features, trajectories, buckets, options)
+        pictures = self._decode(made / self._config.vae.scale, as_levels=options.whole_levels)
         latents = made.cpu()
         return [
             View(
-                samples=pictures[v].pixels,
+                samples=pixels,
                 latents=latents[v],
-                trajectory=path,
+                trajectory=trajectories[v],
                 motion_bucket=buckets[v],
-                classes=pictures[v].classes,
+                classes=classes,
                 uncertainty_scale=self._traits.uncertainty_scale,
             )
-            for v, path in enumerate(trajectories)
+            for v, (pixels, classes) in enumerate(pictures)
         ]
 
     @property
@@ -301,73 +244,76 @@ class Synthesizer:
             if length != frames:
                 raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
 
-    def _bucket(self, trajectory: Trajectory, options: RenderOptions) -> float:
-        given = options.motion_bucket
-        return self._traits.motion_bucket(trajectory) if given is None else given
-
     def _tokens(self, video: Tensor) -> Tensor | None:
         chunks = [self._engine.tokens(frames) for frames in video.split(_ENCODE_FRAMES)]
         made = [each for each in chunks if each is not None]
         return torch.cat(made) if made else None
 
-    def _denoise(self, job: "_Job") -> Tensor:
-        """Scaled latents, [V, S, T, C, h, w]."""
-        config, options = self._config, job.options
+    def _denoise(
+        self,
+        features: SourceFeatures,
+        trajectories: Sequence[Trajectory],
+        buckets: Sequence[float],
+        options: RenderOptions,
+    ) -> Tensor:
+        """Scaled latents, [V, S, T, C, h, w]; rows of the batch are ordered view by view, sample by sample."""
+        config, samples, views = self._config, options.samples, len(trajectories)
         schedule = Schedule.of(config, options)
-        given = self._condition(job, unconditional=schedule.branches == 2)
-        noise = job.noise(config.frames, shared=config.sampling.shared_noise)  # [S, T, C, h, w]
-        start = schedule.start(noise.to(self._like.device), len(job.trajectories))
-        latents = self._engine.sample(start, given, schedule, options)
+        width, strength = config.unet.vector_width, features.augmentation
+        vectors = [micro_conditioning(features.fps, bucket, strength, width) for bucket in buckets]
+        told = [self._engine.camera(path) for path in trajectories]
+        cameras = [each.repeat(samples, 1) for each in told if each is not None]
+        unconditional = schedule.branches == 2
+        given = Conditioning(
+            vector=torch.cat([vector.expand(samples * config.frames, -1) for vector in vectors]).to(self._like),
+            camera=torch.cat(cameras) if cameras else None,
+            tokens=condition_tokens(features, views * samples, unconditional=unconditional),
+            latents=condition_latents(features, views * samples, unconditional=unconditional),
+            branches=schedule.branches,
+        )
+        noise = self._noise(tuple(features.latents.shape[1:]), options)
+        latents = self._engine.sample(schedule.start(noise.to(self._like.device), views), given, schedule, options)
         if not latents.isfinite().all():
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
                 f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
             )
-        return latents.unflatten(0, (len(job.trajectories), options.samples))
+        return latents.unflatten(0, (views, samples))
 
-    def _condition(self, job: "_Job", *, unconditional: bool) -> Conditioning:
-        """Rows are ordered view by view, sample by sample."""
-        samples, width = job.options.samples, self._config.unet.vector_width
-        vectors = [
-            micro_conditioning(job.features.fps, bucket, job.features.augmentation, width) for bucket in job.buckets
-        ]
-        per_frame = samples * job.features.frames
-        told = [self._engine.camera(path) for path in job.trajectories]
-        cameras = [each.repeat(samples, 1) for each in told if each is not None]
-        views = samples * len(job.trajectories)
-        return Conditioning(
-            vector=torch.cat([vector.expand(per_frame, -1) for vector in vectors]).to(self._like),
-            camera=torch.cat(cameras) if cameras else None,
-            tokens=condition_tokens(job.features, views, unconditional=unconditional),
-            latents=condition_latents(job.features, views, unconditional=unconditional),
-            branches=2 if unconditional else 1,
-        )
-
-    def _decode(self, job: "_Job", latents: Tensor) -> list[Pictures]:
-        painted, as_levels = self._traits.painted_classes, job.options.whole_levels
-        pictures = decode(self._engine, latents / self._config.vae.scale, painted, as_levels=as_levels)
-        if not all(view.finite for view in pictures):
-            raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
-        return pictures
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """What one call of `render` was asked for."""
-
-    features: SourceFeatures
-    trajectories: tuple[Trajectory, ...]
-    buckets: tuple[float, ...]
-    options: RenderOptions
-
-    def noise(self, frames: int, *, shared: bool) -> Tensor:
-        """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view, and if `shared` frame."""
-        samples, given = self.options.samples, self.options.initial_noise
-        each = self.features.latents.shape[1:]
+    def _noise(self, each: tuple[int, ...], options: RenderOptions) -> Tensor:
+        """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view, and if shared every frame."""
+        samples, frames, given = options.samples, self._config.frames, options.initial_noise
         if given is None:
-            shape, seed = (1 if shared else frames, *each), self.options.seed
-            return torch.stack([unit_noise(shape, seed, 1 + s).expand(frames, *each) for s in range(samples)])
+            shape = (1 if self._config.sampling.shared_noise else frames, *each)
+            draws = [unit_noise(shape, options.seed, 1 + s).expand(frames, *each) for s in range(samples)]
+            return torch.stack(draws)
         given = given[None] if given.ndim == 4 else given
         if tuple(given.shape) != (samples, frames, *each):
             raise OptionError(f"initial noise must be {[samples, frames, *each]}, got {list(given.shape)}")
         return given.float()
+
+    def _decode(self, latents: Tensor, *, as_levels: bool) -> list[tuple[Tensor, Tensor | None]]:
+        """Of every view pixels [S, T, 3, H, W] and class ids, on the CPU. latents: [V, S, T, C, h, w], unscaled.
+
+        One clip at a time; while one is decoded, the one before it arrives.
+        """
+        painted, finite = self._traits.painted_classes, list[Tensor]()
+        coming: list[list[tuple[Download, Download | None]]] = []
+        for view in latents:
+            coming.append([])
+            for clip in view:
+                decoded = self._engine.decode(clip)
+                pixels = to_pixels(decoded)
+                classes = Download(nearest_classes(pixels, painted)) if painted else None
+                coming[-1].append((Download(whole_levels(pixels) if as_levels else pixels), classes))
+                finite.append(decoded.isfinite().all())
+        if not all(each.item() for each in finite):
+            raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
+        arrived = [[(pixels.result(), classes and classes.result()) for pixels, classes in view] for view in coming]
+        return [
+            (
+                torch.stack([pixels for pixels, _ in view]),
+                torch.stack([classes for _, classes in view if classes is not None]) if painted else None,
+            )
+            for view in arrived
+        ]

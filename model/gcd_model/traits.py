@@ -3,6 +3,7 @@
 import logging
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import msgspec
 import torch
@@ -26,8 +27,8 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.live.config import LiveConfig
-from gcd_model.weights.card import NO_DIFFUSION
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import NO_DIFFUSION, Card
+from gcd_model.weights.families import Family, family_named
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
@@ -57,6 +58,21 @@ class Traits:
     device: str
     trained: bool = True
     uncertainty_scale: float | None = None
+
+    @classmethod
+    def of(cls, card: Card, *, sha256_12: str, precision: str, device: str) -> Self:
+        """What a card says, and where the model runs. Raises OptionError for a family nobody knows."""
+        return cls(
+            name=card.name,
+            config=card.config,
+            family=None if card.family is None else family_named(card.family),
+            move_time=card.move_time,
+            sha256_12=sha256_12,
+            precision=precision,
+            device=device,
+            trained=card.trained,
+            uncertainty_scale=card.uncertainty_scale,
+        )
 
     @property
     def live(self) -> bool:

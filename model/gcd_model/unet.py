@@ -3,7 +3,7 @@
 Nothing that is constant over a window or a schedule is computed in `forward`: `plan` does that once.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -11,15 +11,15 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import UNetConfig
-from gcd_model.layers import Downsample, Layers, Upsample, embedding_mlp, sinusoid, zeroed
+from gcd_model.layers import Downsample, Layers, TokenAttention, Upsample, embedding_mlp, sinusoid, zeroed
 from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
 
 
 @dataclass(frozen=True, slots=True)
 class StageInputs:
-    """What one stage needs besides the pixels, for one denoising step.
+    """What a stage needs besides the pixels, for one denoising step; of a U-Net that of all stages, side by side.
 
-    embeddings: [N, C], noise level, micro-conditioning and camera, projected for this stage.
+    embeddings: [N, C], noise level, micro-conditioning and camera, projected for the stage.
     crosses: what the image token adds; spatial [N, C], temporal [B, C]; None without attention or image tower.
     """
 
@@ -28,45 +28,33 @@ class StageInputs:
     spatial_cross: Tensor | None
     temporal_cross: Tensor | None
 
-    def split(self, clips: int) -> Iterator["StageInputs"]:
-        """Each clip's own, in order."""
-        parts = (self.spatial_embedding, self.temporal_embedding, self.spatial_cross, self.temporal_cross)
-        chunks = [[None] * clips if part is None else part.chunk(clips) for part in parts]
-        return (StageInputs(*clip) for clip in zip(*chunks, strict=True))
+    def chunk(self, parts: int) -> tuple["StageInputs", ...]:
+        """Of each clip, or of each guidance branch, in order."""
+        every = (self.spatial_embedding, self.temporal_embedding, self.spatial_cross, self.temporal_cross)
+        chunks = [[None] * parts if each is None else each.chunk(parts) for each in every]
+        return tuple(StageInputs(*part) for part in zip(*chunks, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
-class StagePlan:
-    """StageInputs of all steps: embeddings [S, N, C], crosses as there (they do not depend on the step)."""
+class UNetPlan:
+    """All that the U-Net takes besides pixels, for every step of a schedule: all stages side by side.
+
+    embeddings: [S, N, sum of C]. crosses: of all attending stages, as in StageInputs; they do not depend on the step.
+    repeats: how often the rows of the embeddings repeat in the batch (2 when an unconditional branch rides along).
+    """
 
     spatial_embedding: Tensor
     temporal_embedding: Tensor
     spatial_cross: Tensor | None
     temporal_cross: Tensor | None
+    repeats: int = 1
 
-    def step(self, index: int, repeats: int) -> StageInputs:
-        """Inputs of one step; embeddings repeat when several branches share them."""
-        return StageInputs(
-            self.spatial_embedding[index].repeat(repeats, 1),
-            self.temporal_embedding[index].repeat(repeats, 1),
-            self.spatial_cross,
-            self.temporal_cross,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class UNetPlan:
-    """All that the U-Net takes besides pixels, for every step of a schedule.
-
-    repeats: how often the rows of the embeddings repeat in the batch (2 when an unconditional branch rides along).
-    """
-
-    stages: tuple[StagePlan, ...]
-    repeats: int
-
-    def step(self, index: int) -> tuple[StageInputs, ...]:
+    def step(self, index: int) -> StageInputs:
         """What `VideoUNet.forward` takes at one step."""
-        return tuple(stage.step(index, self.repeats) for stage in self.stages)
+        spatial, temporal = (
+            each[index].repeat(self.repeats, 1) for each in (self.spatial_embedding, self.temporal_embedding)
+        )
+        return StageInputs(spatial, temporal, self.spatial_cross, self.temporal_cross)
 
 
 class Stage(nn.Module):
@@ -93,22 +81,6 @@ class Stage(nn.Module):
             if attends
             else None
         )
-
-    def plan(self, embedding: Tensor, tokens: Tensor | None, frames: int) -> StagePlan:
-        """embedding: [S, N, E]. tokens: [N', D], one per frame of the whole batch."""
-        return StagePlan(
-            self.res.spatial.project(embedding),
-            self.res.temporal.project(embedding),
-            *self._crosses(tokens, frames),
-        )
-
-    def _crosses(self, tokens: Tensor | None, frames: int) -> tuple[Tensor | None, Tensor | None]:
-        if self.attention is None or tokens is None:
-            return None, None
-        spatial, temporal = self.attention.spatial.token, self.attention.temporal.token
-        assert spatial is not None, "tokens were given to a U-Net without cross-attention"
-        assert temporal is not None, "tokens were given to a U-Net without cross-attention"
-        return spatial(tokens), temporal(tokens[::frames])  # across frames only the first frame's token counts
 
     def forward(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
         """x: [N, C, h, w] -> [N, C', h, w]. frames: None for unrelated frames."""
@@ -187,7 +159,23 @@ class VideoUNet(nn.Module):
         if self.embed_camera is not None:
             assert camera is not None, "this U-Net wants a camera vector"
             embedding = embedding + self.embed_camera(camera)  # [S, N, E]
-        return UNetPlan(tuple(stage.plan(embedding, tokens, self.frames) for stage in self.all_stages()), repeats)
+        stages = list(self.all_stages())
+        spatial = torch.cat([stage.res.spatial.project(embedding) for stage in stages], dim=-1)
+        temporal = torch.cat([stage.res.temporal.project(embedding) for stage in stages], dim=-1)
+        return UNetPlan(spatial, temporal, *self._crosses(tokens), repeats)
+
+    def _crosses(self, tokens: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        if tokens is None:
+            return None, None
+        spatial, temporal = self.token_layers()
+        of_clips = tokens[:: self.frames]  # across frames only the first frame's token counts
+        return torch.cat([layer(tokens) for layer in spatial], 1), torch.cat([layer(of_clips) for layer in temporal], 1)
+
+    def token_layers(self) -> tuple[list[TokenAttention], list[TokenAttention]]:
+        """What takes the image token: within frames, and across them."""
+        attending = [stage.attention for stage in self.all_stages() if stage.attention is not None]
+        blocks = [(each.spatial.token, each.temporal.token) for each in attending]
+        return [each for each, _ in blocks if each is not None], [each for _, each in blocks if each is not None]
 
     def all_stages(self) -> Iterator[Stage]:
         """Every stage in the order of the forward pass."""
@@ -197,9 +185,7 @@ class VideoUNet(nn.Module):
         for level in self.up:
             yield from level.stages
 
-    def forward(
-        self, latents: Tensor, condition: Tensor, inputs: Sequence[StageInputs], *, image_mode: bool = False
-    ) -> Tensor:
+    def forward(self, latents: Tensor, condition: Tensor, inputs: StageInputs, *, image_mode: bool = False) -> Tensor:
         """One evaluation of the network F.
 
         Args:
@@ -210,7 +196,7 @@ class VideoUNet(nn.Module):
             [B*T, C, h, w].
         """
         frames = None if image_mode else self.frames
-        inputs_left = iter(inputs)
+        inputs_left = self._by_stage(inputs)
         x = self.stem(torch.cat([latents, condition], dim=1))
         skips = [x]
         for level in self.down:
@@ -228,6 +214,18 @@ class VideoUNet(nn.Module):
             if level.up is not None:
                 x = level.up(x)
         return self.conv_out(F.silu(self.norm_out(x)))
+
+    def _by_stage(self, inputs: StageInputs) -> Iterator[StageInputs]:
+        """Every stage's own, in the order of the forward pass."""
+        widths = [stage.res.spatial.norm2.num_channels for stage in self.all_stages()]
+        attending = [stage.attention is not None for stage in self.all_stages()]
+        spatial, temporal = (each.split(widths, 1) for each in (inputs.spatial_embedding, inputs.temporal_embedding))
+        crossed = [width for width, attends in zip(widths, attending, strict=True) if attends]
+        crosses = [
+            None if x is None else iter(x.split(crossed, 1)) for x in (inputs.spatial_cross, inputs.temporal_cross)
+        ]
+        for own, across, attends in zip(spatial, temporal, attending, strict=True):
+            yield StageInputs(own, across, *(next(each) if attends and each is not None else None for each in crosses))
 
     def start_apart(self) -> None:
         """Make all transformers across frames the identity too: for learning from single frames first, then clips."""

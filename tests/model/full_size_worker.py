@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import SVD_14
-from gcd_model.engines.cpu import arrange
+from gcd_model.engines.torch import arrange
 from gcd_model.layers import prepare
 from gcd_model.unet import VideoUNet
 

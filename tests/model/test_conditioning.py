@@ -14,7 +14,6 @@ from gcd_model.conditioning import (
     SourceFeatures,
     condition_latents,
     condition_tokens,
-    micro_conditioning,
     relative_pose_features,
     spherical_features,
 )
@@ -47,19 +46,6 @@ def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:
     free = pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
     with pytest.raises(ShapeError):
         CameraEmbedder("spherical", 5)(free)
-
-
-def _sinusoid_by_formula(value: float, width: int) -> list[float]:
-    half = width // 2
-    angles = [value * 10000 ** (-i / half) for i in range(half)]
-    return [math.cos(angle) for angle in angles] + [math.sin(angle) for angle in angles]
-
-
-def test_the_vector_holds_frame_rate_then_motion_then_augmentation_as_sinusoids() -> None:
-    vector = micro_conditioning(12.0, 127.0, 0.02, 768)
-    expected = [number for value in (12.0, 127.0, 0.02) for number in _sinusoid_by_formula(value, 256)]
-    assert vector.shape == (768,)
-    assert_close(vector, torch.tensor(expected), atol=2e-5, rtol=0)
 
 
 def _features(frames: int = 3, extra: Tensor | None = None) -> SourceFeatures:

@@ -8,8 +8,8 @@ from small_models import UNET, draw, randomise
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model.engines import cpu
-from gcd_model.engines.cpu import arrange
+from gcd_model.engines import torch as engine
+from gcd_model.engines.torch import arrange
 from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample, prepare
 from gcd_model.unet import StageInputs, VideoUNet
 
@@ -31,7 +31,7 @@ def _unet() -> VideoUNet:
     return unet
 
 
-def _inputs(unet: VideoUNet) -> tuple[StageInputs, ...]:
+def _inputs(unet: VideoUNet) -> StageInputs:
     rows = CLIPS * FRAMES
     vector, camera, tokens = (
         draw(rows, UNET.vector_width),
@@ -41,14 +41,14 @@ def _inputs(unet: VideoUNet) -> tuple[StageInputs, ...]:
     return unet.plan(draw(1, seed=1), vector, camera, tokens).step(0)
 
 
-@pytest.mark.parametrize("floats", [20_000, cpu.REUSED_FLOATS])
+@pytest.mark.parametrize("floats", [20_000, engine.REUSED_FLOATS])
 def test_the_u_net_is_the_same_however_little_memory_is_used_at_once(
     monkeypatch: pytest.MonkeyPatch, floats: int
 ) -> None:
     unet, latents, seen = _unet(), draw(CLIPS * FRAMES, 4, 8, 16, seed=4), list[int]()
     wrapped = arranged(unet)
     wrapped.stem.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
-    monkeypatch.setattr(cpu, "REUSED_FLOATS", floats)
+    monkeypatch.setattr(engine, "REUSED_FLOATS", floats)
     with torch.no_grad():
         inputs = _inputs(unet)
         whole, pieces = (each(latents, latents, inputs) for each in (unet, wrapped))
@@ -94,14 +94,14 @@ def test_a_part_is_the_same_a_few_rows_at_a_time_and_leaves_what_it_is_given(
     monkeypatch: pytest.MonkeyPatch, module: nn.Module, given: tuple[Tensor, ...], floats: int
 ) -> None:
     before, wrapped = [each.clone() for each in given], arranged(module)
-    monkeypatch.setattr(cpu, "REUSED_FLOATS", floats)
+    monkeypatch.setattr(engine, "REUSED_FLOATS", floats)
     with torch.no_grad():
         assert_close(wrapped(*given), module(*given))
     assert all(torch.equal(now, then) for now, then in zip(given, before, strict=True))
 
 
 def test_with_gradient_on_other_devices_and_in_a_compiler_a_part_is_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpu, "REUSED_FLOATS", 1)
+    monkeypatch.setattr(engine, "REUSED_FLOATS", 1)
     feed, x = arranged(FeedForward(4)), draw(6, 4)
     calls: list[int] = []
     feed.contract.register_forward_pre_hook(lambda _, given: calls.append(len(given[0])))

@@ -10,15 +10,17 @@ import pytest
 import torch
 from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
 from tape import TapeRecorder
+from torch import nn
 
 from gcd_model.clip import Clip, RenderOptions, View
 from gcd_model.config import ModelConfig
 from gcd_model.diffusion import Schedule
-from gcd_model.engines.cuda import CudaEngine, CudaOptions, cache_folder, keep_compiled, regions, twin
+from gcd_model.engines.cuda import CudaEngine, CudaOptions, cache_folder, checked_decoder, keep_compiled, regions, twin
 from gcd_model.engines.graphs import CudaGraphs, Recent, Recorder, Replay, Unrecorded
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
 from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.loading import load_synthesizer
+from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 
 PLAIN = CudaOptions(backend=None, channels_last=False, decoder="float32")
@@ -257,3 +259,33 @@ def test_want_of_memory_in_a_recording_is_told_as_such(monkeypatch: pytest.Monke
         CudaGraphs().record(work)
     assert runs == [True] * 3  # twice to warm up, once to record
     assert torch.backends.cudnn.benchmark == before
+
+
+@pytest.fixture
+def networks() -> Networks:
+    """Random networks of float32."""
+    return tiny_synthesizer().networks
+
+
+def make_faint(networks: Networks) -> None:
+    """Pictures that are nearly grey, so that bfloat16 cannot be far off."""
+    with torch.no_grad():
+        for layer in (networks.decoder.conv_out, networks.decoder.mix_frames):
+            assert isinstance(layer, nn.Conv2d | nn.Conv3d)
+            layer.weight.mul_(0.03)
+            assert layer.bias is not None
+            layer.bias.zero_()
+
+
+@pytest.mark.parametrize(("faint", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_the_engine_decodes_in_bfloat16_where_pictures_stay_alike(
+    networks: Networks, faint: bool, dtype: torch.dtype
+) -> None:
+    if faint:
+        make_faint(networks)
+    assert (checked_decoder(networks)[1] > 50) == faint
+    taken = twin(networks)
+    engine = CudaEngine(taken, CudaOptions(backend=None, channels_last=False))
+    assert taken.decoder.stem.weight.dtype == dtype
+    assert networks.decoder.stem.weight.dtype == torch.float32
+    assert engine.decode(torch.zeros(TINY.frames, 4, 2, 2)).dtype == torch.float32

@@ -6,8 +6,17 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model.errors import PoseError
-from gcd_model.geometry import RIGID_TOLERANCE, invert_rigid, look_at, relative_pose, require_rigid
+from gcd_model.errors import OptionError, PoseError
+from gcd_model.geometry import (
+    DRIVING_SOURCE_POSITION,
+    DRIVING_SOURCE_TARGET,
+    CameraMount,
+    invert_rigid,
+    look_at,
+    relative_pose,
+    require_rigid,
+)
+from gcd_model.geometry.pose import RIGID_TOLERANCE
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
 
@@ -52,11 +61,6 @@ def test_look_at_is_rigid_upright_and_centred_on_its_target(azimuth_deg: float, 
     assert_close(target_in_camera, point(0, 0, (target - position).norm().item()), rtol=0, atol=1e-12)
 
 
-def test_a_camera_at_the_origin_that_looks_along_x_has_its_right_towards_minus_y() -> None:
-    pose = look_at(point(0, 0, 0), point(1, 0, 0))
-    assert_close(pose[:3, :3], torch.stack([point(0, -1, 0), point(0, 0, -1), point(1, 0, 0)], dim=-1))
-
-
 @pytest.mark.parametrize(
     "position", [point(1, 2, 4), point(1, 2, -4), point(1, 2, 0), torch.zeros(2), torch.tensor([math.nan, 0.0, 0.0])]
 )
@@ -97,3 +101,28 @@ def test_what_is_not_rigid_is_refused_by_its_name(pose: Tensor) -> None:
     with pytest.raises(PoseError) as caught:
         require_rigid(pose, "asked pose")
     assert str(caught.value).startswith("asked pose")
+
+
+LEVEL = look_at(
+    torch.tensor(DRIVING_SOURCE_POSITION, dtype=torch.float64), torch.tensor(DRIVING_SOURCE_TARGET, dtype=torch.float64)
+)
+
+
+def test_the_default_mount_is_the_data_sets_forward_camera() -> None:
+    assert_close(CameraMount().vehicle_from_camera, LEVEL, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("tilt_deg", [-30.0, 12.0, 89.0])
+def test_a_mount_is_a_rigid_pose_that_looks_down_by_its_tilt(tilt_deg: float) -> None:
+    mount = CameraMount(height_m=2.0, forward_m=-1.0, left_m=0.25, tilt_deg=tilt_deg)
+    pose = require_rigid(mount.vehicle_from_camera, "mount")
+    assert pose[:3, 3].tolist() == [-1.0, 0.25, 2.0]
+    assert pose[2, 2].item() == pytest.approx(-math.sin(math.radians(tilt_deg)))
+    assert pose[:3, 0].tolist() == [0.0, -1.0, 0.0]  # no roll, no yaw
+    assert pose[2, 1].item() < 0  # upright
+
+
+@pytest.mark.parametrize("changes", [{"height_m": 0.0}, {"tilt_deg": 90.0}, {"hfov_deg": 180.0}, {"left_m": math.nan}])
+def test_a_mount_no_camera_has_is_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(OptionError):
+        CameraMount(**changes)

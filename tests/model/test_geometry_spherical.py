@@ -127,15 +127,6 @@ def test_of_equivalent_azimuths_the_one_nearest_zero_is_found(asked_deg: float, 
     assert fit.delta.azimuth_deg == pytest.approx(found_deg, abs=1e-9)
 
 
-@pytest.mark.parametrize("azimuth_deg", [-100.0, 0.0, 60.0])
-def test_a_view_from_straight_above_keeps_its_heading(azimuth_deg: float) -> None:
-    above = change(azimuth_deg=azimuth_deg, elevation_deg=85.0)
-    fit = nearest_delta(asked_change(above), SOURCE)
-    assert fit.delta.azimuth_deg == pytest.approx(azimuth_deg, abs=1e-9)
-    assert fit.delta.elevation_deg == pytest.approx(85.0, abs=1e-6)
-    assert fit.rotation_error_deg == pytest.approx(0.0, abs=1e-6)
-
-
 def test_no_change_leads_to_the_look_at_point_itself() -> None:
     at_centre = torch.eye(4, dtype=torch.float64)
     at_centre[2, 3] = SOURCE.radius_m

@@ -22,6 +22,7 @@ from gcd_model.geometry import (
     fitted_trajectory,
     invert_rigid,
     look_at,
+    motion_bucket,
     path_progress,
     pose_trajectory,
     relative_pose,
@@ -67,12 +68,6 @@ def test_progress_rises_from_0_and_is_exactly_1_from_move_time_on(
     assert done[0].item() == 0.0
     assert bool((done[move_time:] == 1.0).all())
     assert bool((done[: move_time + 1].diff() > 0.0).all())
-
-
-@pytest.mark.parametrize("interpolation", PACES)
-@pytest.mark.parametrize("frames", [1, 14])
-def test_a_direct_path_is_at_the_goal_from_frame_0(frames: int, interpolation: Interpolation) -> None:
-    assert path_progress(frames, 0, interpolation).tolist() == [1.0] * frames
 
 
 def test_the_recorded_sine_pace() -> None:
@@ -208,3 +203,23 @@ def test_a_fitted_path_holds_the_fitted_poses_and_reports_the_rest() -> None:
 def test_a_trajectory_checks_itself(poses: Tensor, delta: Tensor | None, flags: int, error: type[Exception]) -> None:
     with pytest.raises(error):
         Trajectory(source_from_target=poses, delta=delta, at_goal=(True,) * flags, source=None)
+
+
+def max90(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
+    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=2.0)
+    return motion_bucket(delta, max_azimuth_deg=90.0, max_elevation_deg=30.0, high=high)
+
+
+def max180(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
+    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    return motion_bucket(delta, max_azimuth_deg=180.0, max_elevation_deg=60.0, high=high)
+
+
+def test_the_motion_number_is_255_only_with_both_angles_at_their_largest() -> None:
+    assert max90(90.0, 30.0) == max180(180.0, 60.0) == 255
+    assert max90(90.0, 0.0) == max180(180.0, 0.0) == 242
+    assert max90(0.0, 30.0) == max180(0.0, 60.0) == 81
+    assert max90(0.0, 0.0) == 0
+    assert max90(180.0, 60.0) == 510  # it is not clamped
+    with pytest.raises(OptionError):
+        motion_bucket(SphericalDelta(azimuth_deg=10.0), max_azimuth_deg=0.0, max_elevation_deg=0.0)

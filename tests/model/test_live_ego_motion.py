@@ -142,7 +142,6 @@ def test_without_odometry_in_between_the_pictures_carry_on() -> None:
 def test_odometry_that_is_no_motion_is_refused(jump: Tensor) -> None:
     motions = drive([HERE] * 2, [HERE, jump.double()])
     assert motions[1].lost
-    assert motions[1].reason
     assert torch.equal(motions[1].world_from_camera, HERE)
 
 
@@ -151,8 +150,7 @@ def test_a_black_frame_is_lost_and_the_world_begins_anew() -> None:
     frames = [filmed(pose(ahead=0.2 * n)) for n in range(5)]
     black = (torch.full_like(frames[0][0], -1.0), frames[0][1])
     motions = [ego.step(*frame, STATIC, LENS) for frame in (*frames[:2], black, *frames[2:])]
-    assert [motion.lost for motion in motions] == [False, False, True, True, False, False]
-    assert motions[2].reason
+    assert [motion.lost is not None for motion in motions] == [False, False, True, True, False, False]
     assert torch.equal(motions[3].world_from_camera, HERE)
     assert_close(motions[5].world_from_camera, pose(ahead=0.4), atol=0.02, rtol=0)
 

@@ -30,6 +30,11 @@ def memory_of(*parts: Surfels, capacity: int = 10 * PIXELS, oldest_frames: float
     return memory
 
 
+def updated(memory: SurfelMemory, depth: Tensor, pose: Tensor, fresh: Surfels, known: Tensor | None = None) -> None:
+    memory.forget(depth, LENS, pose, known)
+    memory.add(fresh)
+
+
 @pytest.mark.parametrize("pitch", [0.0, 1.5])
 def test_a_surface_seen_again_is_replaced(pitch: float) -> None:
     """Also on a street 1.5 m below, where the depth changes by half from row to row."""
@@ -39,7 +44,7 @@ def test_a_surface_seen_again_is_replaced(pitch: float) -> None:
     nearer[2, 3] = 0.4
     memory = memory_of(surfels(depth, stamp=0.0))
     again = depth if pitch else flat(4.6)
-    memory.update(again, LENS, nearer, surfels(again, stamp=1.0, pose=nearer))
+    updated(memory, again, nearer, surfels(again, stamp=1.0, pose=nearer))
     old = memory.surfels.rows(memory.surfels.stamp == 0.0)
     x, y, z = (old.position - torch.tensor([0.0, 0.0, 0.4])).T
     inside = (z > 0.5) & ((LENS.fx * x / z).abs() < LENS.cx) & ((LENS.fy * y / z).abs() < LENS.cy)
@@ -50,7 +55,7 @@ def test_a_surface_seen_again_is_replaced(pitch: float) -> None:
 @pytest.mark.parametrize("behind", [9.0, 0.0, torch.inf])
 def test_what_the_camera_sees_through_is_dropped(behind: float) -> None:
     memory = memory_of(surfels(flat(5.0), stamp=0.0))
-    memory.update(flat(behind), LENS, HERE, Surfels.empty())
+    updated(memory, flat(behind), HERE, Surfels.empty())
     assert len(memory.surfels) == 0
 
 
@@ -58,19 +63,19 @@ def test_a_hole_in_the_depth_proves_nothing() -> None:
     memory = memory_of(surfels(flat(5.0), stamp=0.0))
     known = torch.ones(LENS.height, LENS.width, dtype=torch.bool)
     known[:, :10] = False
-    memory.update(flat(0.0), LENS, HERE, Surfels.empty(), known)
+    updated(memory, flat(0.0), HERE, Surfels.empty(), known)
     assert len(memory.surfels) == 10 * LENS.height
 
 
 def test_what_is_hidden_or_outside_the_picture_stays() -> None:
     first = surfels(flat(5.0), stamp=0.0)
     memory = memory_of(first)
-    memory.update(flat(3.0), LENS, HERE, Surfels.empty())
+    updated(memory, flat(3.0), HERE, Surfels.empty())
     assert_close(memory.surfels.position, first.position)
     away = HERE.clone()
     away[0, 3] = 30.0
-    memory.update(flat(9.0), LENS, away, Surfels.empty())
-    memory.update(flat(9.0), LENS, torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])), Surfels.empty())  # looks back
+    updated(memory, flat(9.0), away, Surfels.empty())
+    updated(memory, flat(9.0), torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])), Surfels.empty())  # looks back
     assert_close(memory.surfels.position, first.position)
 
 
@@ -80,7 +85,7 @@ def test_a_thing_that_passes_costs_the_wall_behind_it_nothing() -> None:
         depth = flat(8.0)
         depth[8:24, 4 * step : 4 * step + 8] = 3.0
         static = unproject(depth, torch.zeros(3, *depth.shape), depth.byte(), LENS, HERE, float(step), keep=depth > 5.0)
-        memory.update(depth, LENS, HERE, static)
+        updated(memory, depth, HERE, static)
         assert len(memory.surfels) == PIXELS
 
 
@@ -99,5 +104,5 @@ def test_what_is_too_old_goes() -> None:
 def test_painted_stays_painted_until_it_is_seen() -> None:
     memory = memory_of(surfels(flat(5.0), stamp=0.0, painted=True))
     assert bool(memory.surfels.painted.all())
-    memory.update(flat(5.0), LENS, HERE, surfels(flat(5.0), stamp=1.0))
+    updated(memory, flat(5.0), HERE, surfels(flat(5.0), stamp=1.0))
     assert not bool(memory.surfels.painted.any())

@@ -6,8 +6,8 @@ from live_room import LENS, room
 from torch.testing import assert_close
 
 from gcd_model.live.config import DepthConfig
-from gcd_model.live.depth_net import DepthNet, depth_inputs, pixel_rays, read_depth
-from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
+from gcd_model.live.depth_net import DepthNet, Reference, depth_inputs, pixel_rays, read_depth, sweep_costs
+from gcd_model.live.eyes import LONGEST, References
 
 CONFIG = DepthConfig(bins=32, nearest_m=1.0, farthest_m=10.0)
 HERE = torch.eye(4, dtype=torch.float64)

@@ -35,9 +35,8 @@ from gcd_model import (
 )
 from gcd_model.geometry import driving_trajectory
 from gcd_model.live.config import LIVE_TINY
-from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
-from gcd_model.networks import random_networks
+from gcd_model.networks import LiveNetworks, random_networks
 from gcd_model.weights.load import load_weights
 
 

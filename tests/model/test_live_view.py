@@ -9,13 +9,12 @@ from torch.testing import assert_close
 
 from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, ShapeError, load_synthesizer
 from gcd_model.live.config import LIVE_TINY, SKY_M, LiveConfig
+from gcd_model.live.depth_net import Reference
 from gcd_model.live.eyes import Eyes
-from gcd_model.live.networks import LiveNetworks
-from gcd_model.live.seen_world import SeenWorld
-from gcd_model.live.sweep import Reference
+from gcd_model.live.memory import SeenWorld
+from gcd_model.live.painter import LiveFrame, LiveView
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.live.view import LiveFrame, LiveView
-from gcd_model.networks import random_networks
+from gcd_model.networks import LiveNetworks, random_networks
 
 HERE = torch.eye(4, dtype=torch.float64)
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from small_models import TINY, draw, random_clip, relative_error, tiny_synthesizer
 
-from gcd_model.clip import Clip, RenderOptions
-from gcd_model.config import SMALL, SVD_14, ModelConfig, SamplingConfig
+from gcd_model.clip import RenderOptions
+from gcd_model.config import ModelConfig, SamplingConfig
 from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
 from gcd_model.synthesizer import Synthesizer, synthesize
@@ -91,18 +91,6 @@ def test_a_render_at_another_number_of_frames_levels_and_latent_channels_has_the
     (view,) = synthesizer.render(features, [path(synthesizer)])
     assert view.video.shape == (5, 3, 16, 32)
     assert view.latents.shape == (1, 5, 8, 8, 16)
-
-
-def test_the_two_named_configs_are_the_published_one_and_one_that_renders_on_a_cpu() -> None:
-    assert (SVD_14.frames, SVD_14.height, SVD_14.width, SVD_14.size_factor) == (14, 256, 384, 64)
-    assert SVD_14.unet.widths == (320, 640, 1280, 1280)
-    assert SVD_14.vae.widths == (128, 256, 512, 512)
-    assert SVD_14.sampling == SamplingConfig(steps=25, sigma_max=700.0, sigma_min=0.002, rho=7.0, guidance=(1.0, 1.5))
-    assert SMALL.frames == 14
-    synthesizer = tiny_synthesizer(SMALL)
-    clip = Clip(video=random_clip(SMALL).video[..., :64, :64].contiguous(), fps=12.0)
-    (view,) = synthesizer.render(synthesizer.encode(clip), [path(synthesizer)], RenderOptions(steps=1))
-    assert view.video.shape == (14, 3, 64, 64)
 
 
 @pytest.mark.parametrize(

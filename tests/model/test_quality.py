@@ -4,14 +4,18 @@ from dataclasses import replace
 from functools import lru_cache
 
 import pytest
+import torch
 from msgspec import structs
-from small_models import draw
+from small_models import TINY, draw, random_clip, tiny_synthesizer
 from torch import Tensor
 
-from gcd_model import RenderOptions, Sampler, Schedule, sampler_of
-from gcd_model.clip import QUALITIES, Quality, SolverName
+from gcd_model.clip import QUALITIES, Quality, RenderOptions, SolverName
 from gcd_model.config import PLAIN_SMALL, SVD_14, SamplingConfig
-from gcd_model.diffusion import FAST, FASTEST, edm_sigmas, sample, solver_steps
+from gcd_model.diffusion import PRESETS, Sampler, Schedule, edm_sigmas, sample, sampler_of, solver_steps
+from gcd_model.errors import OptionError
+from gcd_model.geometry import SphericalDelta
+from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.unet import StageInputs
 
 PUBLISHED = SamplingConfig()
 
@@ -79,8 +83,59 @@ def test_what_is_not_named_is_as_the_quality_has_it() -> None:
 
 
 def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are() -> None:
-    assert error(FAST.solver, FAST.steps) <= error("euler", 25)
+    assert error(*PRESETS["fast"]) <= error("euler", 25)
 
 
 def test_fastest_is_at_most_three_times_as_far() -> None:
-    assert error("euler", 25) < error(FASTEST.solver, FASTEST.steps) <= 3 * error("euler", 25)
+    assert error("euler", 25) < error(*PRESETS["fastest"]) <= 3 * error("euler", 25)
+
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def synthesizer() -> Synthesizer:
+    return tiny_synthesizer()
+
+
+def latents(synthesizer: Synthesizer, options: RenderOptions) -> Tensor:
+    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
+    return synthesize(synthesizer, random_clip(), path, replace(options, steps=STEPS)).latents
+
+
+def test_guidance_applies_within_its_interval_alone() -> None:
+    levels = Schedule.of(TINY, RenderOptions(steps=STEPS)).sigmas.tolist()
+    schedule = Schedule.of(TINY, RenderOptions(steps=STEPS, guidance_interval=(levels[2], levels[1])))
+    assert schedule.guided == (False, True, True, False)
+    assert (schedule.branches, schedule.evaluations) == (2, STEPS + 2)
+
+
+@pytest.mark.parametrize("guidance", [None, (1.0, 3.0)])
+def test_an_interval_over_all_noise_levels_changes_no_bit(
+    synthesizer: Synthesizer, guidance: tuple[float, float] | None
+) -> None:
+    everywhere = RenderOptions(guidance=guidance)
+    bounded = replace(everywhere, guidance_interval=(0.0, 1e9))
+    assert torch.equal(latents(synthesizer, everywhere), latents(synthesizer, bounded))
+
+
+def test_outside_the_interval_the_network_sees_the_conditional_rows_alone(
+    synthesizer: Synthesizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unet, seen = synthesizer.networks.unet, list[int]()
+    forward = unet.forward
+
+    def counted(rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+        seen.append(len(rows))
+        return forward(rows, condition, inputs)
+
+    monkeypatch.setattr(unet, "forward", counted)
+    levels = Schedule.of(TINY, RenderOptions(steps=STEPS)).sigmas.tolist()
+    latents(synthesizer, RenderOptions(guidance_interval=(levels[1], levels[0])))
+    assert seen == [2 * TINY.frames, 2 * TINY.frames, TINY.frames, TINY.frames]
+
+
+@pytest.mark.parametrize("interval", [(2.0, 1.0), (-1.0, 1.0), (float("nan"), 1.0)])
+def test_an_interval_that_is_none_is_refused(interval: tuple[float, float]) -> None:
+    with pytest.raises(OptionError):
+        RenderOptions(guidance_interval=interval)

@@ -17,7 +17,12 @@ from gcd_node.verbs import VERBS
 from gcd_train.cli.main import app as train_app
 
 ROOT = Path(__file__).parent.parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / name for name in ("README.md", "CONTRIBUTING.md", "launch/README.md", "tools/README.md", "client/README.md")
+]
+PAGES += sorted((ROOT / "docs").glob("*.md"))
+LINKED = [*PAGES, *sorted((ROOT / "docs" / "log").glob("*.md")), *sorted((ROOT / "model").rglob("weights/*.md"))]
+"""The log keeps commands that are gone; its links are checked."""
 SHELL = ("", "sh", "bash", "console")
 WHOLE = ("source.kind=synthetic", "model.weights=random:driving", "view.topdown.kind=fixed")
 """What a launch file cannot do without, as changes."""
@@ -81,6 +86,14 @@ def dead_links(page: Path, text: str) -> list[str]:
         if not target.exists() or (anchor and anchor not in headings(target)):
             dead.append(f"{page.name}: {link}")
     return dead
+
+
+def pages_named_in_code() -> dict[str, Path]:
+    """Every page of docs that a message, docstring or comment names, with a file that names it."""
+    suffixes = {".py", ".toml", ".sh", ".cpp", ".yaml", ".service", ".xml"}
+    folders = ("gcd_node", "client", "model", "train", "launch", "tools", "tests")
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.suffix in suffixes]
+    return {found: path for path in files for found in re.findall(r"docs/[\w/-]+\.md", path.read_text())}
 
 
 @cache

@@ -48,6 +48,12 @@ def write_pictures(folder: Path, images: dict[str, Image]) -> Path:
     return folder
 
 
+def noise(folder: Path, height: int, width: int) -> Path:
+    """Fourteen pictures, enough for a clip."""
+    drawn = np.random.default_rng(0).integers(0, 256, (14, height, width, 3), np.uint8)
+    return write_pictures(folder, {f"{i:02d}.png": image for i, image in enumerate(drawn)})
+
+
 def frames_at(stamps_ms: Iterable[float], width: int = 4, height: int = 2) -> list[Frame]:
     """Tiny frames whose pixels hold their sequence number."""
     return [

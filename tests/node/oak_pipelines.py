@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from media import HEIGHT, WIDTH
 
-from gcd_node.calibration import LensModel
-from gcd_node.frame import Image
+from gcd_node.frame import Image, LensModel
 from gcd_node.sources.oak import OakStream, load_depthai
 
 load_depthai()

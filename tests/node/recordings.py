@@ -13,9 +13,8 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from gcd_model import Traits
-from gcd_node.calibration import LensModel
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.frame import Frame, FrameSource
+from gcd_node.frame import Frame, FrameSource, LensModel
 from gcd_node.node import Node
 from gcd_node.sources import open_source
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcd_node.calibration import LensModel, depthai_lens, lens_of_message, load_lens
 from gcd_node.errors import ConfigError
+from gcd_node.frame import LensModel, depthai_lens, lens_of_message, load_lens
 
 FILE = b"""# as cameracalibrator writes it
 image_width: 640

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fakes import FakeSynthesizer, live_traits
+from media import noise
 from tiny_weights import HEIGHT, WIDTH, write_tiny
 
 from gcd_model import CameraMount
@@ -25,8 +26,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clip(tmp_path: Path) -> Path:
-    np.save(tmp_path / "clip.npy", np.random.default_rng(0).random((14, HEIGHT, WIDTH, 3), np.float32))
-    return tmp_path / "clip.npy"
+    return noise(tmp_path / "clip", HEIGHT, WIDTH)
 
 
 def synthesize(source: Path, weights: Path | str, out: Path, *options: str) -> int:
@@ -95,9 +95,8 @@ def test_a_mount_that_cannot_be_is_one_line_and_exit_64(
     model: str, options: list[str], weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     size = (128, 192) if model in ("random:kubric90", "random:driving") else (HEIGHT, WIDTH)
-    np.save(tmp_path / "clip.npy", np.zeros((14, *size, 3), np.float32))
     chosen = weights if model == "tiny" else model
-    assert synthesize(tmp_path / "clip.npy", chosen, tmp_path / "out", *options) == 64
+    assert synthesize(noise(tmp_path / "clip", *size), chosen, tmp_path / "out", *options) == 64
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
     assert not (tmp_path / "out").exists()
 

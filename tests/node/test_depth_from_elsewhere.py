@@ -1,7 +1,6 @@
-"""Depth from elsewhere in views: of a recording, of a stereo pair, of a network beside the model; and a source that is
+"""Depth from elsewhere in views: of a recording, of a network beside the model; and a source that is
 unlike the training."""
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, live_traits, made_node, traits
+from media import noise
 from msgspec.structs import replace as struct_replace
 
 from gcd_client.protocol import to_json
@@ -23,8 +23,6 @@ from gcd_node.offline import ClipRequest, OfflineClip, read_clip
 
 LIVE = live_traits()
 FRAMES = 14
-FX, BASELINE_M, DISPARITY = 300.0, 0.09, 10
-PAIR_SIZE = (384, 256)
 
 
 @pytest.fixture
@@ -81,64 +79,21 @@ def test_depth_that_does_not_belong_to_the_pictures_is_refused(
         read(video, depth=tmp_path / "d.npy")
 
 
-def camera(step_cm: float, onward: int) -> dict[str, Any]:
-    return {
-        "width": PAIR_SIZE[0],
-        "height": PAIR_SIZE[1],
-        "cameraType": 0,
-        "intrinsicMatrix": [[FX, 0.0, 191.5], [0.0, FX, 127.5], [0.0, 0.0, 1.0]],
-        "distortionCoeff": [0.0] * 14,
-        "extrinsics": {
-            "rotationMatrix": np.eye(3).tolist(),
-            "translation": {"x": step_cm, "y": 0.0, "z": 0.0},
-            "toCameraSocket": onward,
-        },
-    }
-
-
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """left.mkv, right.mkv and calib.json of a camera before a wall."""
-    folder = tmp_path_factory.mktemp("pair")
-    wall = np.random.default_rng(1).integers(0, 256, (256, 384 + DISPARITY, 3)).astype(np.float32)
-    wall = cv2.normalize(cv2.GaussianBlur(wall, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    write_video(folder / "left.mkv", [np.ascontiguousarray(wall[:, :384])] * FRAMES, 10.0)
-    write_video(folder / "right.mkv", [np.ascontiguousarray(wall[:, DISPARITY:])] * FRAMES, 10.0)
-    left, right = camera(-100 * BASELINE_M, 2), camera(0.0, -1)
-    (folder / "calib.json").write_text(json.dumps({"boardName": "made up", "cameraData": [[1, left], [2, right]]}))
-    return folder
-
-
-@pytest.mark.parametrize("rectified", [False, True])
-def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(pair: Path, rectified: bool) -> None:
-    source = read(pair / "left.mkv", depth=pair / "right.mkv", calibration=pair / "calib.json", rectified=rectified)
-    depth, lens = source.clip.depth, source.clip.lens
-    assert depth is not None
-    assert lens is not None
-    assert (lens.width, lens.height) == (WIDTH, HEIGHT)
-    assert source.hfov_deg == lens.hfov_deg
-    known = depth[depth > 0]
-    assert len(known) > 0.6 * depth.numel()
-    assert float(known.median()) == pytest.approx(FX * BASELINE_M / DISPARITY, rel=0.06)
-
-
 def synthesize(source: Path, weights: str, out: Path, *options: object) -> int:
     return run_app(["synthesize", str(source), "--weights", weights, "--out", str(out), *map(str, options)])
 
 
 @pytest.fixture
 def still_clip(tmp_path: Path) -> Path:
-    np.save(tmp_path / "clip.npy", np.random.default_rng(0).random((FRAMES, HEIGHT, WIDTH, 3), np.float32))
     depth = np.full((FRAMES, HEIGHT, WIDTH), 3.0, np.float32)
     depth[:, :, :20] = np.nan
     np.save(tmp_path / "depth.npy", depth)
-    return tmp_path / "clip.npy"
+    return noise(tmp_path / "clip", HEIGHT, WIDTH)
 
 
-def test_a_live_view_is_written_with_all_it_tells(pair: Path, tmp_path: Path) -> None:
-    calibration = ("--depth", pair / "right.mkv", "--calibration", pair / "calib.json")
-    orbit = ("--source-radius", 2.7, "--azimuth-deg", 10)
-    assert synthesize(pair / "left.mkv", "random:live", tmp_path, *calibration, *orbit) == 0
+def test_a_live_view_is_written_with_all_it_tells(still_clip: Path, tmp_path: Path) -> None:
+    orbit = ("--depth", tmp_path / "depth.npy", "--source-radius", 2.7, "--azimuth-deg", 10)
+    assert synthesize(still_clip, "random:live", tmp_path, *orbit) == 0
     seen = np.load(tmp_path / "visibility.npz")
     assert seen["visibility"].shape == (FRAMES, HEIGHT, WIDTH)
     assert seen["names"][seen["ids"] == 0].tolist() == ["painted"]
@@ -150,7 +105,7 @@ def test_a_live_view_is_written_with_all_it_tells(pair: Path, tmp_path: Path) ->
 def test_with_depth_a_published_model_tells_what_was_seen_in_the_units_of_its_radius(
     still_clip: Path, tmp_path: Path
 ) -> None:
-    orbit = ("--azimuth-deg", 5, "--steps", 1)
+    orbit = ("--azimuth-deg", 5, "--steps", 1, "--height", HEIGHT, "--width", WIDTH)
     np.save(tmp_path / "small.npy", np.load(tmp_path / "depth.npy") / 10)
     for name, (file, unit_m) in {"a": ("depth.npy", 1), "b": ("small.npy", 0.1), "c": ("small.npy", 1)}.items():
         options = (*orbit, "--depth", tmp_path / file, "--unit-m", unit_m)

@@ -1,4 +1,4 @@
-"""Depth from a network of the user's, against planes."""
+"""Depth from elsewhere: as somebody measured it, or of a network of the user's, against planes."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gcd_model import CameraMount
 from gcd_node.errors import ConfigError, DepthError
 from gcd_node.frame import Image
-from gcd_node.sources.depth import OnnxDepth
+from gcd_node.sources.depth import OnnxDepth, clean_depth
 
 MOUNT = CameraMount(height_m=1.4, tilt_deg=8.0, hfov_deg=80.0)
 
@@ -121,3 +121,28 @@ def test_what_is_no_network_or_lacks_a_scale_is_refused(tmp_path: Path) -> None:
     for file, options in bad:
         with pytest.raises(ConfigError):
             OnnxDepth(file, **options)
+
+
+def test_millimetres_become_metres_and_what_is_no_distance_a_hole_in_the_pictures_size() -> None:
+    cleaned = clean_depth(np.array([[1250, 0, 65535]], np.uint16), (1, 3))
+    assert cleaned == pytest.approx(np.array([[1.25, 0.0, 0.0]]))
+    depth = np.array([[1.5, np.nan, np.inf], [-np.inf, -2.0, 5.0]], np.float16)
+    cleaned = clean_depth(depth, (4, 6))
+    assert (cleaned.dtype, cleaned.shape, set(np.unique(cleaned))) == (np.float32, (4, 6), {0.0, 1.5, 5.0})
+
+
+@pytest.mark.parametrize(
+    "depth",
+    [
+        np.ones((4, 8), np.float32),
+        np.ones((4, 6, 3), np.float32),
+        np.ones((0, 6), np.float32),
+        np.ones((4, 6), np.uint8),
+    ],
+    ids=["wider", "colours", "empty", "u8"],
+)
+def test_depth_of_another_shape_or_type_is_refused(depth: NDArray[Any]) -> None:
+    with pytest.raises(DepthError) as raised:
+        clean_depth(depth, (4, 6))
+    assert "\n" not in str(raised.value)
+    assert raised.value.exit_code == 65

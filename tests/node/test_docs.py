@@ -3,7 +3,11 @@ is told, and the planner of the guide follows a live node."""
 
 import ast
 import itertools
+import os
 import re
+import shutil
+import subprocess
+import sys
 import time
 import tomllib
 import types
@@ -14,7 +18,18 @@ import msgspec
 import numpy as np
 import pytest
 from cameras import Bench, Camera, until
-from doc_pages import BLOCKS, PAGES, ROOT, WHOLE, Block, dead_links, name_of, wrong_commands
+from doc_pages import (
+    BLOCKS,
+    LINKED,
+    PAGES,
+    ROOT,
+    WHOLE,
+    Block,
+    dead_links,
+    name_of,
+    pages_named_in_code,
+    wrong_commands,
+)
 from fakes import FakeSynthesizer, painting_traits
 from msgspec.structs import replace
 from rig import Rig
@@ -22,15 +37,27 @@ from wire_messages import class_map, depth, visibility
 
 from gcd_client.protocol import ClassRecord
 from gcd_client.subscriber import ReceivedView
-from gcd_node.auth import AllowFile
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
 from gcd_node.sources import SourceConfig, SourcePose
 
 pytestmark = pytest.mark.timeout(120)
 
+SMALLER = {
+    "--scenes 20 --compact": "--scenes 1 --compact --frames 14 --width 96 --height 64",
+    "--clips 100": "--clips 3",
+    "--clips 40": "--clips 2",
+}
+"""What a page's commands make, and what is made here instead."""
+
 
 def test_every_link_leads_somewhere() -> None:
-    assert [dead for page in PAGES for dead in dead_links(page, page.read_text())] == []
+    assert [dead for page in LINKED for dead in dead_links(page, page.read_text())] == []
+
+
+def test_every_page_that_the_code_names_is_there() -> None:
+    named = pages_named_in_code()
+    assert "docs/node.md" in named
+    assert {page: path for page, path in named.items() if not (ROOT / page).exists()} == {}
 
 
 def test_the_index_names_every_page() -> None:
@@ -39,12 +66,9 @@ def test_the_index_names_every_page() -> None:
 
 
 def load_block(block: Block) -> None:
-    """A launch file, a part of one (what it lacks is filled in), or a list of clients. Raises what is wrong with it."""
+    """A launch file, or a part of one (what it lacks is filled in). Raises what is wrong with it."""
     table = tomllib.loads(block.text)
     if block.mark == "other":
-        return
-    if set(table) == {"client"}:
-        msgspec.toml.decode(block.text, type=AllowFile)
         return
     stated = {"source.kind": table.get("source", {}).keys() & {"kind", "path"}, "model.weights": table.get("model")}
     stated["view.topdown.kind"] = table.get("view")
@@ -77,11 +101,45 @@ def test_a_python_block_is_python(block: Block) -> None:
     assert compile(block.text, block.place, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT) is not None
 
 
-def planner(mark: str = "planner") -> dict[str, Any]:
-    """What a program of the guide defines."""
-    (block,) = [block for block in BLOCKS if block.mark == mark]
-    defined: dict[str, Any] = {"__name__": "planner"}
-    exec(compile(block.text, block.place, "exec"), defined)
+@pytest.mark.parametrize(
+    "block", [b for b in BLOCKS if (b.language, b.mark) == ("python", "run")], ids=lambda b: b.place
+)
+def test_a_python_block_marked_run_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # no node of this machine hears of it
+    exec(compile(block.text, block.place, "exec"), {})
+
+
+@pytest.fixture
+def programs(tmp_path: Path) -> dict[str, str]:
+    """An environment in which `gcd-node` and `gcd-train` are those of this checkout."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name in ("gcd-node", "gcd-train"):
+        (folder / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" -m {name.replace("-", "_")} "$@"\n')
+        (folder / name).chmod(0o755)
+    path = os.pathsep.join([str(folder), *(str(ROOT / each) for each in ("model", "client", "train")), str(ROOT)])
+    return {**os.environ, "PATH": f"{folder}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": path}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("block", [b for b in BLOCKS if (b.language, b.mark) == ("sh", "run")], ids=lambda b: b.place)
+def test_a_shell_block_marked_run_runs(block: Block, programs: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "launch").symlink_to(ROOT / "launch")
+    for name in ("drive.mp4", "my.mp4"):
+        shutil.copy(ROOT / "gcd_node" / "assets" / "drive.mp4", tmp_path / name)
+    text = block.text
+    for much, little in SMALLER.items():
+        text = text.replace(much, little)
+    done = subprocess.run(["bash", "-e", "-c", text], cwd=tmp_path, env=programs, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def planner(name: str = "planner") -> dict[str, Any]:
+    """What a program in launch/clients defines."""
+    path = ROOT / "launch" / "clients" / f"{name}.py"
+    defined: dict[str, Any] = {"__name__": name}
+    exec(compile(path.read_text(), path, "exec"), defined)
     return defined
 
 

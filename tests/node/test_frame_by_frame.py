@@ -2,6 +2,7 @@
 threads beside a live one."""
 
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,10 +11,12 @@ import pytest
 from fakes import Box, FakeSource, FakeSynthesizer, fake_config, made_node, traits
 from msgspec.structs import replace as struct_replace
 
-from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Trajectory, View
-from gcd_node.config import NodeConfig
+from gcd_model import DeviceMemoryError, NonFiniteError, RenderOptions, SourceFeatures, Trajectory, View
+from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ModelFailedError
 from gcd_node.frame import Frame
+from gcd_node.lifecycle import Parts
+from gcd_node.node import Node
 
 
 class Streaming(FakeSynthesizer):
@@ -141,3 +144,73 @@ def test_what_fails_in_the_painter_is_done_again_or_ends_the_node() -> None:
     model = Streaming(broken)
     with pytest.raises(ModelFailedError, match="broken"):
         made_node(live_config(), model, slowly(1000), Box()).run()
+
+
+class Remembering(Streaming):
+    """Frame 2 fails in the painter while frame 3 is placed and frame 4 seen. Notes frames that do not go on where the
+    one before ended, in place and paint: every `reset` begins another world."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self._world, self._fourth, self._failing = 0, threading.Event(), iter([error])
+        self._at = {"see": 0, "place": 0, "paint": 0}
+        self.strays: list[tuple[str, int]] = []
+
+    def reset(self) -> None:
+        super().reset()
+        self._world += 1
+
+    def see(self, features: SourceFeatures) -> Any:
+        if len(self.clips) == 6:
+            self._fourth.set()
+        begins, self._at["see"] = self._world != self._at["see"], self._world
+        return features, self._world, begins
+
+    def _follow(self, step: str, world: int, begins: bool) -> None:
+        if not begins and world != self._at[step]:
+            self.strays.append((step, world))
+        self._at[step] = world
+
+    def place(self, seen: Any, trajectories: Sequence[Trajectory]) -> Any:
+        self._follow("place", *seen[1:])
+        return seen
+
+    def paint(
+        self, placed: Any, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        self._follow("paint", *placed[1:])
+        if len(self.asked) == 3 and self._fourth.wait(10):
+            for error in self._failing:
+                raise error
+        return self.render(placed[0], trajectories, options)
+
+
+@pytest.mark.parametrize("error", [NonFiniteError("for once"), DeviceMemoryError("for once")])
+def test_frames_that_were_in_work_when_the_memory_began_anew_are_left_out(error: Exception) -> None:
+    model, box = Remembering(error), Box()
+    made_node(live_config(), model, slowly(12), box).run()
+    assert model.strays == []
+    seqs = [message.header.src.seq[0] for message in box.of("win")]
+    assert seqs[:4] == [0, 1, 2, 5]
+    assert seqs[-1] == 11
+
+
+def test_a_model_that_is_loaded_in_half_precision_is_loaded_once_and_is_not_hung_meanwhile() -> None:
+    loaded: list[str | None] = []
+
+    def load(section: ModelSection) -> Streaming:
+        loaded.append(section.dtype)
+        time.sleep(0.6 if section.dtype else 0.0)
+        model = Streaming(lambda _: None if section.dtype or len(model.asked) < 4 else full())
+        model.traits = replace(model.traits, device="cuda:0", precision=section.dtype or "float32")
+        return model
+
+    def full() -> None:
+        raise DeviceMemoryError("full")
+
+    config, box, source = live_config(), Box(), slowly(30)
+    config = struct_replace(config, life=struct_replace(config.life, hang_s=0.3))
+    Node(config, Parts(open_source=lambda _: source, load_model=load), box).run()
+    assert loaded == [None, "bfloat16"]
+    assert [fields["code"] for topic, fields in box.notes if topic == "event"] == ["GPU_OOM", "SRC_ENDED"]
+    assert box.of("win")[-1].header.model.precision == "bfloat16"

@@ -35,9 +35,9 @@ from gcd_client.protocol import (
     view_topic,
 )
 from gcd_node.auth import load_clients
-from gcd_node.calibration import load_lens
 from gcd_node.config import parse_config, to_toml
 from gcd_node.errors import ConfigError, NodeError, SourceError
+from gcd_node.frame import load_lens
 from gcd_node.sources.files import read_picture
 from gcd_node.verbs import VERBS, Command, RequestError, parse_command
 

@@ -88,6 +88,15 @@ def test_the_rate_is_measured_by_stamps_and_not_by_arrivals(health: Health, cloc
     assert report.stages["capture_gap"].count == 19
 
 
+def test_a_looped_recording_keeps_its_rate_over_the_seam(health: Health, clock: Clock) -> None:
+    for i in range(5):
+        clock.sleep(0.1)
+        health.frame(i * 100 * MS + (60_000 * MS if i > 2 else 0), clock.now_ns)
+    report = health.snapshot()
+    assert report.status["source"]["fps"] == pytest.approx(10.0)
+    assert report.stages["capture_gap"].p99_s == pytest.approx(0.1)
+
+
 def test_a_stalled_source_warns_and_a_lost_one_is_an_error_until_it_streams(health: Health, clock: Clock) -> None:
     work(health, clock)
     clock.sleep(0.4)

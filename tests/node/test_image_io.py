@@ -5,14 +5,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from wire_messages import CLASSES, numbers
+from wire_messages import CLASSES
 
-from gcd_client.images import paint
 from gcd_model import hatched
-from gcd_node.demo import Moment, comparison, moments
+from gcd_node.demo import moments
 from gcd_node.errors import OutputError
 from gcd_node.frame import Image
-from gcd_node.image_io import legend, to_u8, write_animation, write_png, write_video
+from gcd_node.image_io import legend, to_u8, write_png, write_video
 
 HEIGHT, WIDTH = 24, 36
 SEEN = np.full((HEIGHT, WIDTH), 2, np.uint8)
@@ -51,17 +50,6 @@ def test_what_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         write_png(tmp_path / "file" / "x.png", gradient())
 
 
-def test_a_moving_picture_plays_every_frame_at_its_rate_and_for_ever(tmp_path: Path) -> None:
-    frames = [np.full((48, 80, 3), (level, 255 - level, 0), np.uint8) for level in (0, 120, 240)]
-    write_animation(tmp_path / "new" / "a.webp", frames, 10.0, 40)
-    read, animation = cv2.imreadanimation(str(tmp_path / "new" / "a.webp"))
-    assert read
-    assert (list(animation.durations), animation.loop_count) == ([100, 100, 100], 0)
-    for frame, shown in zip(frames, animation.frames, strict=True):
-        assert shown.shape[:2] == (24, 40)
-        assert np.abs(shown[..., 2::-1].astype(int) - frame[::2, ::2]).max() < 12
-
-
 @pytest.mark.parametrize(("width", "lines"), [(80, 3), (150, 2), (1000, 1)])
 def test_a_legend_takes_as_many_lines_as_it_needs_and_drops_no_class(width: int, lines: int) -> None:
     picture = legend(CLASSES, width)
@@ -71,22 +59,6 @@ def test_a_legend_takes_as_many_lines_as_it_needs_and_drops_no_class(width: int,
 
 
 # The demo's.
-
-
-def test_the_four_pictures_stand_side_by_side_under_headings_and_over_a_legend() -> None:
-    painted = paint(numbers(1, 1, HEIGHT, WIDTH)[0], CLASSES)
-    moment: Moment = (flat(50), flat(120), flat(90), painted)
-    picture = comparison([moment, moment], CLASSES)
-    factor = 9  # the smallest whole one that makes 320 pixels of 36
-    high, wide, line = factor * HEIGHT, factor * WIDTH, 22
-    whole = 4 * wide + 12
-    assert picture.shape == (line + 2 * high + 4 + len(legend(CLASSES, whole)), whole, 3)
-    for top in (line, line + high + 4):
-        row = picture[top : top + high]
-        for column, level in enumerate((50, 120, 90)):
-            assert (row[:, column * (wide + 4) : column * (wide + 4) + wide] == level).all()
-        assert np.array_equal(row[::factor, 3 * (wide + 4) :: factor], painted)
-    assert (picture[:line] < 100).any()  # something is written there
 
 
 def test_frames_of_whole_windows_are_put_together_in_order_and_the_unseen_hatched() -> None:

@@ -134,7 +134,7 @@ def test_opening_again_and_again_leaves_no_thread_and_no_file_behind() -> None:
     assert held()[0] <= before[0] + 1
 
 
-# With a device; docs/untested.md lists the rest.
+# With a device; CONTRIBUTING.md lists the rest.
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from unittest.mock import create_autospec
 import pytest
 from media import HEIGHT, WIDTH, environment
 
-from gcd_node.calibration import LensModel
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError
+from gcd_node.frame import LensModel
 from gcd_node.sources import OakSource
 from gcd_node.sources.oak import camera_pipeline, lens_in_memory, open_oak, open_pipeline
 
@@ -177,11 +177,12 @@ def test_distortion_has_our_names(coefficients: list[float], model: str, wanted:
 
 
 def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
-    broken = memory(coefficients=RATIONAL, model="Perspective", width=1000)
     for stored in (
         dai.CalibrationHandler(dai.EepromData()),
-        broken,
+        memory(coefficients=RATIONAL, model="Perspective", width=1000),
         memory(coefficients=RATIONAL, model="RadialDivision"),
+        memory(coefficients=[], model="Fisheye"),  # DepthAI ends the process if it is asked for them
+        memory(coefficients=[0.1, 0.0, 0.0], model="Fisheye"),
     ):
         assert lens_in_memory(stored, SOCKET, 500, 500) is None
 

@@ -5,7 +5,7 @@ import pytest
 from fakes import HEIGHT, WIDTH, traits
 
 from gcd_model import OptionError
-from gcd_node.errors import SourceError, TooShortError, UsageError
+from gcd_node.errors import TooShortError, UsageError
 from gcd_node.image_io import write_png, write_video
 from gcd_node.offline import ClipRequest, OfflineClip, read_clip
 
@@ -73,38 +73,3 @@ def test_a_still_is_repeated_and_a_folder_read_in_order(tmp_path: Path) -> None:
     for index, picture in enumerate(numbered(15)):
         write_png(tmp_path / "folder" / f"{index}.png", picture)
     assert levels(read(tmp_path / "folder", start=1)) == [10 * i for i in range(1, 15)]
-
-
-def test_an_array_is_taken_as_it_is(tmp_path: Path) -> None:
-    array = np.random.default_rng(0).random((16, 32 * 3, 32 * 2, 3), np.float32)
-    np.save(tmp_path / "a.npy", array)
-    clip = read(tmp_path / "a.npy", start=2)
-    assert np.allclose(clip.clip.video.numpy(), array[2:].transpose(0, 3, 1, 2) * 2 - 1, atol=1e-7)
-    with pytest.raises(UsageError):
-        read(tmp_path / "a.npy", height=64, width=64)
-
-
-@pytest.mark.parametrize(
-    ("array", "error"),
-    [
-        (np.zeros((14, 64, 96, 3)), SourceError),
-        (np.zeros((14, 64, 96), np.float32), SourceError),
-        (np.full((14, 64, 96, 3), 2.0, np.float32), SourceError),
-        (np.full((14, 64, 96, 3), np.nan, np.float32), SourceError),
-        (np.zeros((14, 65, 96, 3), np.float32), OptionError),
-        (np.zeros((13, 64, 96, 3), np.float32), TooShortError),
-        (np.zeros((0, 64, 96, 3), np.float32), TooShortError),
-        (np.array([{"a": 1}]), SourceError),
-    ],
-)
-def test_an_array_of_another_kind_is_refused(tmp_path: Path, array: np.ndarray, error: type[Exception]) -> None:
-    np.save(tmp_path / "a.npy", array, allow_pickle=True)
-    with pytest.raises(error):
-        read(tmp_path / "a.npy")
-
-
-@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\x00"])
-def test_a_damaged_array_is_refused(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(SourceError):
-        read(tmp_path / "a.npy")

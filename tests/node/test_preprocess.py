@@ -1,12 +1,317 @@
-"""Crop, resize and intrinsics from the camera's picture to the network's."""
+"""From the camera's picture to the network's: crop and resize; undistortion and the cut to the model's field of view,
+against formulas and against the slow, exact way."""
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from fakes import HEIGHT, WIDTH, traits
+from numpy.typing import NDArray
 
 from gcd_model import Intrinsics, center_crop_box
+from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
-from gcd_node.preprocess import Fit, to_clip_tensor
+from gcd_node.frame import Image, LensModel, SourceInfo
+from gcd_node.preprocess import Fit, Rectifier, project, to_clip_tensor, widest_camera
+from gcd_node.stream_context import prepare_stream
+
+BARREL = LensModel(
+    width=1280,
+    height=720,
+    fx=820.0,
+    fy=818.0,
+    cx=652.3,
+    cy=349.1,
+    distortion="plumb_bob",
+    coefficients=(-0.31, 0.11, 0.0007, -0.0004, -0.018),
+)
+RATIONAL = LensModel(
+    width=1280,
+    height=800,
+    fx=800.0,
+    fy=800.0,
+    cx=640.0,
+    cy=405.0,
+    distortion="rational_polynomial",
+    coefficients=(2.1, -1.3, 0.0004, -0.0002, 0.6, 2.4, -1.0, 0.3),
+)
+FISH_EYE = LensModel(
+    width=1280,
+    height=960,
+    fx=560.0,
+    fy=560.0,
+    cx=640.0,
+    cy=480.0,
+    distortion="equidistant",
+    coefficients=(0.01, -0.004, 0.001, -0.0002),
+)
+IDEAL = LensModel(width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5)
+ALL_LENSES = pytest.mark.parametrize("lens", [BARREL, RATIONAL, FISH_EYE, IDEAL], ids=lambda lens: lens.distortion)
+
+
+def scene(x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+    """A picture of what stands in each direction: straight stripes at several angles, 0 to 255, [..., 3]."""
+    waves = [np.sin(40 * x), np.sin(40 * y), np.sin(28 * (x + y))]
+    return np.stack([127.5 + 100 * wave for wave in waves], axis=-1)
+
+
+def rays_of_pixels(lens: LensModel) -> NDArray[Any]:
+    """x / z and y / z of every pixel, [H, W, 2]: the lens turned around by Newton's method, on formulas of its own."""
+    u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
+    wanted = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy], axis=-1)
+    rays = wanted.copy()
+    for _ in range(30):
+        rays = rays + 0.7 * (wanted - bend(lens, rays))
+    return rays
+
+
+def rectifier_of(
+    lens: LensModel, *, width: int, height: int, hfov_deg: float | None, allow_upscale: bool = False
+) -> Rectifier:
+    return Rectifier(lens, widest_camera(lens, width, height, hfov_deg), allow_upscale=allow_upscale)
+
+
+def bend(lens: LensModel, rays: NDArray[Any]) -> NDArray[Any]:
+    """The formulas of the OpenCV manual, written out."""
+    x, y = rays[..., 0], rays[..., 1]
+    r2 = x * x + y * y
+    if lens.distortion == "equidistant":
+        r = np.sqrt(r2) + 1e-12
+        angle = np.arctan(r)
+        powers = sum(k * angle ** (2 * i + 2) for i, k in enumerate(lens.coefficients))
+        return rays * (angle * (1 + powers) / r)[..., None]
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.coefficients, *[0.0] * 8)[:8]
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    along_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    along_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([along_x, along_y], axis=-1)
+
+
+@cache
+def photograph(lens: LensModel) -> Image:
+    rays = rays_of_pixels(lens)
+    return np.rint(scene(rays[..., 0], rays[..., 1])).clip(0, 255).astype(np.uint8)
+
+
+def ideal_photograph(camera: Intrinsics) -> NDArray[Any]:
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return scene((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+
+
+def psnr(a: NDArray[Any], b: NDArray[Any]) -> float:
+    return 10 * math.log10(255**2 / float(np.mean((a.astype(float) - b) ** 2)))
+
+
+@ALL_LENSES
+def test_pixels_lie_where_the_formulas_of_the_lens_say(lens: LensModel) -> None:
+    rays = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 2))
+    wanted = bend(lens, rays) * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+    np.testing.assert_allclose(project(lens, rays), wanted, atol=1e-6)
+
+
+@ALL_LENSES
+def test_straight_lines_become_straight_and_land_where_the_published_camera_says(lens: LensModel) -> None:
+    lens = lens.resized(lens.width // 2, lens.height // 2)
+    rectifier = rectifier_of(lens, width=192, height=128, hfov_deg=53.13)
+    wanted = ideal_photograph(rectifier.camera)
+    out = rectifier.image(photograph(lens))
+    assert (out.shape, out.dtype) == ((128, 192, 3), np.uint8)
+    inside = np.abs(out.astype(float) - wanted)[2:-2, 2:-2]
+    assert inside.mean() < 2.0
+    assert np.percentile(inside, 99.9) < 12.0
+
+
+@ALL_LENSES
+def test_a_narrow_lens_gives_the_widest_view_it_fills_to_the_last_pixel(lens: LensModel) -> None:
+    camera = widest_camera(lens, 192, 128, 130.0)
+    assert 50.0 < camera.hfov_deg < 129.0
+    white = np.full((lens.height, lens.width, 3), 255, np.uint8)
+    pixels: NDArray[Any] = np.stack(np.meshgrid(np.arange(192) + 0.5, np.arange(128) + 0.5), axis=-1).reshape(-1, 2)
+    seen = project(lens, (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy))
+    assert (seen > -1.6).all()
+    assert (seen < np.array([lens.width, lens.height]) + 0.6).all()
+    wider = Intrinsics.from_hfov(camera.hfov_deg + 1.0, 192, 128)
+    corners = np.array([[x, y] for x in (0.0, 96.0, 192.0) for y in (0.0, 64.0, 128.0)])
+    edge = project(lens, (corners - (wider.cx, wider.cy)) / (wider.fx, wider.fy))
+    assert (edge < -1.5).any() or (edge > np.array([lens.width, lens.height]) + 0.5).any()
+    out = rectifier_of(lens, width=192, height=128, hfov_deg=None).image(white)
+    assert out.min() == 255
+
+
+def test_a_polynomial_that_turns_back_beyond_the_picture_is_not_followed() -> None:
+    lens = LensModel(
+        width=640, height=480, fx=300.0, fy=300.0, cx=320.0, cy=240.0, distortion="plumb_bob",
+        coefficients=(-0.5, 0.0, 0.0, 0.0, 0.0),
+    )  # fmt: skip
+    camera = widest_camera(lens, 384, 256, 120.0)
+    turning_point = math.sqrt(1 / (3 * 0.5))  # where r (1 - r^2 / 2) is largest
+    corner = math.hypot(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)
+    assert 0.9 * turning_point < corner < 1.02 * turning_point
+
+
+def test_a_calibration_that_sees_nothing_is_refused() -> None:
+    lens = LensModel(
+        width=640, height=480, fx=300.0, fy=300.0, cx=0.0, cy=0.0, distortion="plumb_bob",
+        coefficients=(-9e9, 0.0, 0.0, 0.0, 0.0),
+    )  # fmt: skip
+    with pytest.raises(ConfigError):
+        widest_camera(lens, 384, 256, 53.0)
+
+
+def detailed_texture(width: int, height: int) -> Image:
+    """Noise at every scale down to single pixels, as grass and gravel have it."""
+    rng = np.random.default_rng(3)
+    out = np.full((height, width, 3), 127.0)
+    for octave in range(8):
+        size = (max(2, width >> octave), max(2, height >> octave))
+        layer = rng.normal(0, 14, (size[1], size[0], 3))
+        out += cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.rint(out).clip(0, 255).astype(np.uint8)
+
+
+def exact(lens: LensModel, camera: Intrinsics, image: Image, times: int) -> Image:
+    """Undistorted at `times` the wanted size, then averaged; times = 1 is straight to the wanted size."""
+    fine = camera.resized(camera.width * times, camera.height * times)
+    target = np.array([[fine.fx, 0, fine.cx - 0.5], [0, fine.fy, fine.cy - 0.5], [0, 0, 1]])
+    size = (fine.width, fine.height)
+    maps = cv2.initUndistortRectifyMap(lens.matrix, np.array(lens.coefficients), np.eye(3), target, size, cv2.CV_32FC1)
+    big = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.resize(big, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def test_twice_the_size_is_near_full_resolution_and_far_better_than_straight() -> None:
+    image = detailed_texture(BARREL.width, BARREL.height)
+    rectifier = rectifier_of(BARREL, width=384, height=256, hfov_deg=60.0)
+    full = exact(BARREL, rectifier.camera, image, times=3)
+    straight = exact(BARREL, rectifier.camera, image, times=1)
+    ours = psnr(rectifier.image(image), full)
+    assert ours > 34.0
+    assert psnr(straight, full) < ours - 6.0
+
+
+def test_pictures_of_another_size_of_the_same_shape_are_taken() -> None:
+    rectifier = rectifier_of(BARREL, width=192, height=128, hfov_deg=53.13)
+    small = photograph(BARREL.resized(640, 360))
+    large = np.asarray(cv2.resize(small, (1280, 720), interpolation=cv2.INTER_CUBIC), np.uint8)
+    large, small = rectifier.image(large), rectifier.image(small)
+    assert psnr(small, large) > 30.0
+
+
+CALIBRATION = """
+image_width: 1280
+image_height: 720
+camera_name: front
+camera_matrix: {{rows: 3, cols: 3, data: [{fx}, 0, 640.0, 0, {fx}, 360.0, 0, 0, 1]}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.01, 1e-05, 0, 0]}}
+"""
+
+
+def config(source: str = "", top: str = "") -> NodeConfig:
+    text = f'{top}\n[model]\nweights = "x"\n[view.main]\n[source]\nkind = "synthetic"\n{source}'
+    return parse_config(text.encode(), "test")
+
+
+def camera_file(folder: Path, fx: float) -> str:
+    path = folder / "front.yaml"
+    path.write_text(CALIBRATION.format(fx=fx))
+    return f'calibration = "{path}"'
+
+
+def info(lens: LensModel | None = None, width: int = 1280, height: int = 720) -> SourceInfo:
+    return SourceInfo(kind="synthetic", id="x", width=width, height=height, fps_nominal=24.0, clock="replay", lens=lens)
+
+
+def test_a_calibration_file_cuts_to_the_trained_field_of_view_and_publishes_it(tmp_path: Path) -> None:
+    run = prepare_stream(config(camera_file(tmp_path, fx=800.0)), traits(), info())
+    assert run.intrinsics is not None
+    assert run.intrinsics.hfov_deg == pytest.approx(53.13)
+    assert (run.fit.resize, run.ood) == ("remap2x_area", ())
+
+
+def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one() -> None:
+    run = prepare_stream(config("hfov_deg = 90.0"), traits(), info())
+    assert run.intrinsics is not None
+    assert run.intrinsics.hfov_deg == pytest.approx(53.13, abs=0.05)
+    assert run.ood == ()
+    fit = run.fit
+    assert isinstance(fit, Fit)
+    left, top, wide, high = fit.crop_box(1280, 720)
+    assert (left, top) == ((1280 - wide) // 2, (720 - high) // 2)
+    assert (wide, high) == (640, 426)
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_a_cut_that_would_leave_too_few_pixels_is_not_made_unless_they_may_be_enlarged(allowed: bool) -> None:
+    stated = f"hfov_deg = 90.0\nallow_upscale = {str(allowed).lower()}"
+    run = prepare_stream(config(stated), traits(), info(width=WIDTH, height=HEIGHT))
+    assert run.ood == (() if allowed else ("hfov",))
+    assert run.intrinsics is not None
+    assert run.intrinsics.hfov_deg == pytest.approx(53.13 if allowed else 90.0, abs=1.0)
+
+
+def test_a_calibration_for_another_shape_is_refused_at_the_start_and_left_out_in_mid_stream(tmp_path: Path) -> None:
+    stated = config(camera_file(tmp_path, fx=800.0))
+    with pytest.raises(ConfigError):
+        prepare_stream(stated, traits(), info(width=640, height=480))
+    before = prepare_stream(stated, traits(), info())
+    run = prepare_stream(stated, traits(), info(width=640, height=480), before=before)
+    assert (run.fit.resize, run.ood) == ("released", ("hfov",))
+    kept = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
+    assert (kept.fit.resize, kept.ood) == ("remap2x_area", ())
+    own = info(lens=BARREL, width=640, height=480)
+    assert prepare_stream(
+        config(), traits(), own, before=prepare_stream(config(), traits(), info(lens=BARREL))
+    ).ood == ("hfov",)
+
+
+def test_a_lens_too_narrow_for_the_model_is_flagged_and_refused_if_strict(tmp_path: Path) -> None:
+    stated = camera_file(tmp_path, fx=2400.0)
+    run = prepare_stream(config(stated), traits(), info())
+    assert run.intrinsics is not None
+    assert (run.ood, run.fit.resize) == (("hfov",), "remap2x_area")
+    assert run.intrinsics.hfov_deg < 30.0
+    with pytest.raises(ConfigError):
+        prepare_stream(config(stated, top="strict = true"), traits(), info())
+
+
+def test_a_calibration_and_a_field_of_view_contradict_each_other(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        prepare_stream(config(camera_file(tmp_path, 800.0) + "\nhfov_deg = 60.0"), traits(), info())
+
+
+def test_a_stated_rate_that_is_a_trained_one_but_for_rounding_is_not_flagged() -> None:
+    for fps, flags in ((23.976, ()), (20.0, ("fps",))):
+        run = prepare_stream(config(top=f"window = {{fps = {fps}}}"), traits(), info())
+        assert (run.fps, run.ood) == (fps, flags)
+
+
+@ALL_LENSES
+def test_depth_goes_where_its_picture_goes_and_nothing_between_is_made_up(lens: LensModel) -> None:
+    near = np.add.outer(np.arange(lens.height) // 40, np.arange(lens.width) // 40) % 2 == 0
+    fit = rectifier_of(lens, width=WIDTH, height=HEIGHT, hfov_deg=None)
+    image = fit.image(np.repeat(np.where(near, 255, 0).astype(np.uint8)[..., None], 3, axis=2))[..., 0]
+    depth = fit.depth(np.where(near, 2.0, 7.0).astype(np.float32))
+    assert set(np.unique(depth)) <= {0.0, 2.0, 7.0}
+    clear = (image < 5) | (image > 250)
+    assert clear.mean() > 0.2
+    assert np.mean(depth[clear] == np.where(image[clear] > 128, 2.0, 7.0)) > 0.995
+
+
+def test_a_running_node_does_not_follow_a_calibration_file_that_is_edited(tmp_path: Path) -> None:
+    stated = config(camera_file(tmp_path, fx=800.0))
+    before = prepare_stream(stated, traits(), info())
+    camera_file(tmp_path, fx=2400.0)
+    after = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
+    assert after.lens == before.lens
+    assert after.intrinsics == before.intrinsics
+
+
+# Without a lens.
 
 
 def noise(width: int, height: int) -> np.ndarray:

@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 from cameras import until
 from control_fakes import Events, FakeCommands
-from fakes import Box, FakeSource, FakeSynthesizer, made_node, traits
-from rig import CAMERA, rig_config
 from wire_messages import window
 
 from gcd_client.control import ControlClient
@@ -288,20 +286,6 @@ def test_a_broken_list_leaves_in_who_was_in_and_is_reported_once(
     list_path.write_text(entry("hand", OPERATOR))
     assert listed.find(VIEWER.public) is None
     assert events.codes() == ["ALLOW_REFUSED", "ALLOW_CHANGED"]
-
-
-def test_a_refused_list_is_in_the_nodes_log_once_as_an_error(
-    list_path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    box = Box()
-    node = made_node(rig_config(tmp_path, CAMERA, "[view.main]", ""), FakeSynthesizer(traits()), FakeSource(1), box)
-    listed = AllowList(list_path, node.event)
-    list_path.write_text("[client")
-    for _ in range(3):
-        assert listed.find(VIEWER.public) is not None
-    (record,) = caplog.records
-    assert (record.levelname, "ALLOW_REFUSED" in record.getMessage()) == ("ERROR", True)
-    assert [(fields["code"], fields["level"]) for _, fields in box.notes] == [("ALLOW_REFUSED", 2)]
 
 
 def test_a_key_that_was_removed_gets_no_new_connection_and_a_role_counts_at_once(

@@ -131,7 +131,7 @@ def test_a_thread_left_behind_keeps_the_node_from_starting_only_until_it_ends(tm
 def test_a_node_that_is_told_to_stop_interrupts_nobody_elses_network() -> None:
     cancel, x = threading.Event(), torch.zeros(1)
     cancel.set()
-    with interruptible(cancel):
+    with interruptible(cancel, {threading.get_ident()}):
         with pytest.raises(Cancelled, match="Pause"):
             Pause()(x)
         other = threading.Thread(target=lambda: done.append(Pause()(x)))

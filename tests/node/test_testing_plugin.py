@@ -1,8 +1,6 @@
 """The pytest plugin in a robot team's project: golden runs made, kept, missed and renewed."""
 
-import json
 import os
-import re
 import subprocess
 import sys
 import tomllib
@@ -56,7 +54,7 @@ def test_a_golden_run_is_asked_for_made_and_then_met(project: pytest.Pytester) -
     result.assert_outcomes(passed=1)
 
 
-def test_a_run_that_differs_fails_with_causes_and_pictures_and_passes_if_near_enough(project: pytest.Pytester) -> None:
+def test_a_run_that_differs_fails_with_causes_and_passes_if_near_enough(project: pytest.Pytester) -> None:
     outcome(project, {}, "", "--gcd-update")
     result = outcome(project, {"model.steps": 3}, ", min_psnr=45.0")
     result.assert_outcomes(failed=1)
@@ -67,9 +65,6 @@ def test_a_run_that_differs_fails_with_causes_and_pictures_and_passes_if_near_en
             "*first divergence: window 0, view main: 42.11 dB*the same pictures*",
         ]
     )
-    (picture,) = re.findall(r"^E +(/\S+window-000000-view-main.png)$", result.stdout.str(), re.MULTILINE)
-    assert Path(picture).stat().st_size > 1000
-    assert not json.loads((Path(picture).parent / "diff.json").read_text())["passed"]
     outcome(project, {"model.steps": 3}, ", min_psnr=40.0").assert_outcomes(passed=1)
 
 

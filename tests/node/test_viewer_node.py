@@ -79,7 +79,6 @@ def test_an_operator_steers_the_node_and_a_late_page_knows_what_happened(tmp_pat
             assert reply["result"]["allowed"]["azimuth_deg"] == [-90.0, 90.0]
         rig.await_event("VIEW_SET")
         with open_feed(viewer) as late:
-            assert hear(late, "history")["samples"]
             assert hear(late, "event", lambda told: told["fields"]["code"] == "VIEW_SET")["fields"]["view_rev"] == 2
             assert hear(late, "meta")["fields"]["views"] == ["main"]
             say(late, type="ask", id=1, verb="describe")

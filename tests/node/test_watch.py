@@ -82,7 +82,7 @@ def watch(folder: Path, options: list[str], *messages: ViewMessage | EndMessage,
     return code
 
 
-def test_a_table_has_the_figures_of_each_topic_and_fits_into_80_columns() -> None:
+def test_a_table_has_the_figures_of_each_topic() -> None:
     table = ViewTable()
     for i in range(5):
         table.add(received(window(i), skipped=2 if i == 3 else 0), now_s=10.0 + 0.5 * i)
@@ -92,10 +92,6 @@ def test_a_table_has_the_figures_of_each_topic_and_fits_into_80_columns() -> Non
     assert top == ("view/top/win", "4", "2x4x6x3", "290", "2.00", "2", "0.0", "live, fps")
     assert [row[-1] for row in table.rows(now_s=72.2)] == ["expired, fps", "expired, fps"]
     assert table.rows(now_s=12.25, ended=True)[0][-1] == "ended, fps"
-    text = text_of(table.render(99.0), width=80)
-    assert "…" not in text
-    assert max(map(len, text.splitlines())) <= 80
-    assert all(word in text for word in ("never evidence of free space", "123456", "view/top/win", "expired"))
 
 
 def test_saved_pictures_and_video_are_the_published_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

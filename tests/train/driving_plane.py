@@ -138,13 +138,6 @@ class PlaneClips:
     def mount(self) -> CameraMount | None:
         return None if self.paths else CameraMount()
 
-    @property
-    def origin(self) -> str:
-        return "plane"
-
-    def seed(self, number: int) -> int:
-        return number
-
     def name(self, number: int) -> str:
         return f"{number:08d}"
 

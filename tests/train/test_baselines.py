@@ -1,25 +1,20 @@
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip
-from torch.testing import assert_close
 
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
 from gcd_train.data.pairs import PairedClip
 from gcd_train.evaluation.predictors import (
     CameraPair,
-    GroundHomography,
     SourceClip,
     TargetStatistics,
     fit_statistics,
     pixel_rays,
-    plane_homography,
     to_pictures,
-    to_pixels,
 )
-from gcd_train.evaluation.reprojection import DepthReprojection, splat
+from gcd_train.evaluation.reprojection import DepthReprojection, GroundHomography, splat
 
 FRAMES, HEIGHT, WIDTH = 5, 64, 96
 MARK, MARK_CLASS = -1.0, 12
@@ -86,19 +81,6 @@ def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount:
     assert (made.classes == torch.from_numpy(clip.target_classes))[seen].float().mean() > 0.97
 
 
-def test_a_homography_takes_target_pixels_to_the_source_pixels_of_the_same_ground_points() -> None:
-    pair = cameras(CameraMount(height_m=1.3, tilt_deg=2.0))
-    vehicle_from_source = pair.ground_from_source
-    vehicle_from_target = vehicle_from_source @ pair.source_from_target
-    point = torch.tensor([14.0, -2.5, 0.0, 1.0], dtype=torch.float64)
-    homography = plane_homography(pair.source_from_target, -vehicle_from_target[:, 2, :3], vehicle_from_target[:, 2, 3])
-    in_target = (torch.linalg.inv(vehicle_from_target) @ point)[:, :3]
-    in_source = (torch.linalg.inv(vehicle_from_source) @ point)[:3]
-    moved = torch.einsum("tij,tj->ti", homography, in_target / in_target[:, 2:])
-    expected = to_pixels(in_source, pair.source).expand(FRAMES, 2)
-    assert_close(to_pixels(moved, pair.source), expected, rtol=0, atol=1e-8)
-
-
 def test_the_nearer_surface_hides_the_farther_one() -> None:
     camera = cameras().source
     ray = pixel_rays(camera)[20, 30]
@@ -106,13 +88,6 @@ def test_the_nearer_surface_hides_the_farther_one() -> None:
     shown, covered = splat(torch.tensor([[0.2, 0.7, 0.9]]), points, camera)
     assert shown[0, 20, 30].item() == pytest.approx(0.7)
     assert torch.nonzero(covered).tolist() == [[20, 30]]
-
-
-def test_the_mean_target_is_by_pixel_and_frame_number() -> None:
-    clips = PlaneClips.make(3)
-    mean = fit_statistics(clips).mean
-    expected = np.stack([clip.target for clip in clips.clips]).mean(axis=0) / 255
-    assert np.abs(mean.permute(0, 2, 3, 1).numpy() - expected).max() < 1e-6
 
 
 def test_the_majority_map_takes_the_commonest_class_of_each_pixel() -> None:

@@ -18,7 +18,6 @@ from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.predictors import (
     CopySource,
-    GroundHomography,
     Prediction,
     SourceClip,
     fit_statistics,
@@ -26,6 +25,7 @@ from gcd_train.evaluation.predictors import (
     to_pictures,
     to_pixels,
 )
+from gcd_train.evaluation.reprojection import GroundHomography
 
 
 @dataclass
@@ -126,46 +126,6 @@ def test_the_target_itself_is_perfect_and_its_first_frame_is_not_looked_at() -> 
     assert [found.value(name) for name in names] == pytest.approx([1.0] * 6, abs=1e-6)
 
 
-@dataclass
-class Painted:
-    """Says the same of every clip."""
-
-    video: Tensor | None = None
-    classes: Tensor | None = None
-    name: str = "painted"
-    privileged: bool = False
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        return Prediction(video=self.video, classes=self.classes)
-
-
-CAR, PERSON = 8, 11
-
-
-def block(label: int, rows: slice, columns: slice) -> Tensor:
-    """Road everywhere but for a block of another class, uint8 [4, 32, 48]."""
-    classes = torch.ones(4, 32, 48, dtype=torch.uint8)
-    classes[:, rows, columns] = label
-    return classes
-
-
-def test_iou_of_car_and_person_is_what_one_counts_by_hand() -> None:
-    clips = PlaneClips.make(1)
-    clip = clips[0]
-    clip.target_classes[:] = block(CAR, slice(0, 8), slice(0, 12)).numpy()  # 96 pixels, 24 cells
-    clip.target_classes[:, 16:20, 0:4] = PERSON  # 16 pixels, 4 cells
-    said = block(CAR, slice(0, 8), slice(4, 16))  # 96 pixels, 64 of them right: 64 / 128
-    said[:, 16:20, 2:10] = PERSON  # 32 pixels, 8 of them right: 8 / 40
-    (found,) = evaluated([Painted(classes=said)], clips)
-    for iou in (found.class_iou(), found.class_iou(full=True)):
-        assert iou[CAR] == pytest.approx(64 / 128)
-        assert iou[PERSON] == pytest.approx(8 / 40)
-    road = (32 * 48 - 96 - 16, 32 * 48 - 96 - 32)  # true, said
-    both = 32 * 48 - 128 - 40  # neither a car nor a person for either of them
-    expected = (64 / 128 + 8 / 40 + both / (sum(road) - both)) / 3
-    assert found.value("miou_full") == pytest.approx(expected)
-
-
 def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> None:
     clips = PlaneClips.make(2)
     synthesizer = fake(clips)
@@ -244,20 +204,6 @@ def test_a_model_of_another_size_ontology_or_camera_is_refused() -> None:
         SynthesizedViews.of(fake(clips, DRIVING_CLASSES[:4]), clips)
     with pytest.raises(DataError, match="camera control 'none', the clips 'spherical'"):
         SynthesizedViews.of(fake(clips), PlaneClips.orbits(CHANGES))
-
-
-def test_several_draws_are_measured_each_and_their_spread_is_told() -> None:
-    clips = PlaneClips.make(1)
-    synthesizer = fake(clips)
-    rows = [SynthesizedViews.of(synthesizer, clips, RenderOptions(samples=each, seed=7)) for each in (1, 3)]
-    one, three = evaluated(rows, clips)
-    assert [each.samples for each in synthesizer.options] == [1, 3]
-    assert {each.seed for each in synthesizer.options} == {7}
-    assert np.isnan(one.value("diversity"))
-    assert three.value("diversity") > 0
-    drawn = rows[1].predict(PairedSet(clips=clips, identity="plane").clip("plane-00000000").seen).draws
-    each = [evaluated([Painted(video=draw.video)], clips)[0].value("psnr_db") for draw in drawn]
-    assert three.value("psnr_db") == pytest.approx(np.mean(each))
 
 
 def test_a_model_of_another_pace_than_driving_clips_is_refused() -> None:

@@ -7,17 +7,13 @@ import numpy as np
 import pytest
 from made_records import record, region
 
-from gcd_train.errors import DataError
 from gcd_train.evaluation.statistics import (
-    FIGURE_NAMES,
     FigureName,
     Selection,
     bootstrap,
     class_counts,
-    clip_sums,
     difference,
     lead,
-    scene_weights,
 )
 from gcd_train.evaluation.store import ClipRecord
 from gcd_train.evaluation.summary import evaluation
@@ -39,20 +35,6 @@ def figure(records: Sequence[ClipRecord], name: FigureName, selection: Selection
 
 
 # --- how sure -----------------------------------------------------------------------------------------------------
-
-
-def test_every_draw_takes_as_many_scenes_as_there_are_and_the_same_seed_takes_the_same() -> None:
-    weights = scene_weights(7, draws=50, seed=1)
-    np.testing.assert_array_equal(weights.sum(axis=1), np.full(50, 7.0))
-    np.testing.assert_array_equal(weights, scene_weights(7, draws=50, seed=1))
-    assert not np.array_equal(weights, scene_weights(7, draws=50, seed=2))
-
-
-def test_sums_of_scenes_add_up_to_the_sum_of_all() -> None:
-    clips = clip_sums(scenes(), Selection())
-    grouped = clips.grouped([each.scene for each in scenes()])
-    for name in FIGURE_NAMES:
-        np.testing.assert_allclose(grouped.figure(name, np.ones(4)), clips.figure(name, np.ones(8)))
 
 
 def test_interval_and_error_of_a_mean_are_those_of_a_plain_bootstrap_over_scenes() -> None:
@@ -115,14 +97,6 @@ def test_figures_are_of_the_frames_and_pixels_asked_for(selection: Selection, ex
     assert figure([clip], "last_psnr_db") == 30.0
 
 
-def test_a_clip_without_such_pixels_does_not_count_and_every_other_counts_alike() -> None:
-    clips = [
-        record(key=key, regions={"all": region((1.0,) * 4), "occluded": region(values)})
-        for key, values in (("a", (None, None, None, 10.0)), ("b", (None,) * 4), ("c", (20.0,) * 4))
-    ]
-    assert figure(clips, "psnr_db", OCCLUDED) == pytest.approx(15.0)
-
-
 def test_sharpness_and_flicker_are_ratios_of_sums_without_the_first_frame() -> None:
     clip = record(gradient=(9.0, 1.0, 2.0, 3.0), step=(9.0, 1.0, 3.0))
     for frames, expected in (("2-last", (1.0, 1.0)), ("last", (1.5, 1.5)), (3, (1.0, 0.5))):
@@ -130,26 +104,6 @@ def test_sharpness_and_flicker_are_ratios_of_sums_without_the_first_frame() -> N
         found = figure([clip], "gradient_energy", selection), figure([clip], "flicker", selection)
         assert found == pytest.approx(expected)
     assert math.isnan(figure([clip], "flicker", Selection(frames=1)))
-
-
-def test_what_is_not_measured_apart_is_nan_there() -> None:
-    clip = record(lpips=0.3, regions={"all": region((20.0,) * 4), "occluded": region((20.0,) * 4)}, grid=[(0, 0, 5)])
-    assert figure([clip], "lpips") == pytest.approx(0.3)
-    names: tuple[FigureName, ...] = ("lpips", "flicker", "miou", "accuracy")
-    assert np.isnan([figure([clip], name, OCCLUDED) for name in names]).all()
-
-
-def test_sharpness_of_a_region_weighs_frames_by_their_pixels_and_skips_those_without() -> None:
-    parts = region((20.0,) * 4, gradient=(9.0, None, 1.0, 4.0), pixels=(0.9, 0.0, 0.1, 0.3))
-    clip = record(regions={"all": region((20.0,) * 4), "occluded": parts})
-    assert figure([clip], "gradient_energy", OCCLUDED) == pytest.approx((0.1 * 1.0 + 0.3 * 4.0) / (0.4 * 2.0))
-
-
-def test_draws_are_averaged_and_their_spread_is_told() -> None:
-    draws = region((20.0,) * 4, draws=2)
-    apart = type(draws)(pixels=draws.pixels, psnr_db=((10.0,) * 4, (20.0,) * 4), ssim=draws.ssim, diversity=(0.02,) * 4)
-    clip = record(regions={"all": apart}, draws=2)
-    assert (figure([clip], "psnr_db"), figure([clip], "diversity")) == pytest.approx((15.0, 0.02))
 
 
 # --- classes ------------------------------------------------------------------------------------------------------
@@ -178,9 +132,3 @@ def test_the_ten_commonest_classes_are_those_of_all_targets_in_every_region() ->
     assert class_counts([clip]).common == tuple(range(10))
     assert figure([clip], "miou_common") == pytest.approx(1.0)
     assert figure([clip], "miou_common", OCCLUDED) == pytest.approx(0.0)  # class 0, said where 11 is
-
-
-@pytest.mark.parametrize("records", [[], [record("a"), record("b")]])
-def test_figures_of_none_or_of_several_methods_are_refused(records: list[ClipRecord]) -> None:
-    with pytest.raises(DataError):
-        evaluation(records)

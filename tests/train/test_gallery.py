@@ -32,10 +32,11 @@ from gcd_model import (
 )
 from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
+from gcd_model.geometry import Intrinsics
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window
-from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, kept_share, read_windows
+from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, read_windows
 
 T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
@@ -115,9 +116,17 @@ def test_a_folder_of_pictures_is_a_video_in_the_order_of_names(tmp_path: Path) -
         windows_of(tmp_path)
 
 
-@pytest.mark.parametrize(("hfov", "trained", "share"), [(None, 53.0, 1.0), (60.0, None, 1.0), (50.0, 85.0, 1.0)])
-def test_what_is_not_too_wide_is_kept_whole(hfov: float | None, trained: float | None, share: float) -> None:
-    assert kept_share(hfov, trained) == share
+@pytest.mark.parametrize(
+    ("hfov", "width", "kept"),
+    [(None, 64, None), (40.0, 64, 40.0), (100.0, 64, 53.13), (100.0, 128, 53.13), (40.0, 80, 32.5)],
+)
+def test_what_is_wider_than_trained_is_cut_off(
+    tmp_path: Path, hfov: float | None, width: int, kept: float | None
+) -> None:
+    path = write_video(tmp_path / "a.avi", 6, 24.0, size=(width, H))
+    window = windows_of(path, WindowChoice(hfov_deg=hfov))[0]
+    assert window.pictures.shape == (T, H, W, 3)
+    assert window.hfov_deg == (None if kept is None else pytest.approx(kept, abs=1.5))
 
 
 @pytest.mark.parametrize(
@@ -143,10 +152,12 @@ class Mirror:
 
     traits: Traits
     paths: list[Trajectory] = field(default_factory=list)
+    clips: list[Clip] = field(default_factory=list)
 
     def encode(
         self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
     ) -> SourceFeatures:
+        self.clips.append(clip)
         return SourceFeatures(tokens=None, latents=clip.video, extra=None, fps=clip.fps, augmentation=0.0)
 
     def render(
@@ -171,14 +182,19 @@ def a_window() -> Windowed:
     )
 
 
-def test_each_angle_is_a_row_below_the_input() -> None:
+def test_each_angle_is_a_row_below_the_input_and_samples_come_with_their_uncertainty() -> None:
     model = Mirror(traits())
     angles = (SphericalDelta(azimuth_deg=40.0), SphericalDelta(elevation_deg=20.0, radius_m=1.0))
-    viewed = view_window(model, a_window(), ViewRecipe(angles=angles))
-    assert [strip.name for strip in viewed.strips] == ["input", "az +40 el +0 r +0", "az +0 el +20 r +1"]
+    viewed = view_window(model, a_window(), ViewRecipe(angles=angles, samples=2))
     assert [path.goal_delta for path in model.paths] == list(angles)
     assert all(len(strip.frames) == T for strip in viewed.strips)
     assert np.array_equal(viewed.strips[1].frames[0], viewed.strips[0].frames[0])
+    names = [strip.name for strip in viewed.strips]
+    assert names[:3] == ["input", "az +40 el +0 r +0", "az +40 el +0 r +0 sample 2"]
+    assert names[4:6] == ["az +0 el +20 r +1", "az +0 el +20 r +1 sample 2"]
+    shown = re.fullmatch(r"uncertainty, white (\S+)", names[3])
+    assert shown is not None
+    assert float(shown[1]) == pytest.approx(2.0 * 0.05 * 100 / 255, abs=1e-3)  # scale x half the difference
 
 
 def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
@@ -192,20 +208,18 @@ def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
         paths(traits("driving"), replace(high, angles=()))
 
 
-def test_samples_come_with_their_uncertainty() -> None:
-    viewed = view_window(Mirror(traits()), a_window(), ViewRecipe(angles=(SphericalDelta(azimuth_deg=9.0),), samples=2))
-    names = [strip.name for strip in viewed.strips]
-    assert names[1:3] == ["az +9 el +0 r +0", "az +9 el +0 r +0 sample 2"]
-    shown = re.fullmatch(r"uncertainty, white (\S+)", names[3])
-    assert shown is not None
-    assert float(shown[1]) == pytest.approx(2.0 * 0.05 * 100 / 255, abs=1e-3)  # scale x half the difference
-
-
 def test_the_live_models_view_knows_how_the_camera_is_mounted() -> None:
     live = load_synthesizer("random:live", device="cpu").traits
     assert mounted(live, ViewRecipe(), None) is None
     assert mounted(live, ViewRecipe(tilt_deg=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
     assert mounted(traits(), ViewRecipe(height_m=2.0), None) is None
+
+
+def test_the_live_model_knows_the_lens_without_a_mount() -> None:
+    model = Mirror(load_synthesizer("random:live", device="cpu").traits)
+    view_window(model, replace(a_window(), hfov_deg=60.0), ViewRecipe())
+    view_window(model, a_window(), ViewRecipe())
+    assert [clip.lens for clip in model.clips] == [Intrinsics.from_hfov(60.0, W, H), None]
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
+from gcd_train.evaluation.baselines import HexPlane
 from gcd_train.evaluation.hexplane import (
     SPACE,
     TIME,
@@ -19,10 +20,7 @@ from gcd_train.evaluation.hexplane import (
     HexPlaneSettings,
     SceneBounds,
     resampled,
-    sampled,
-    weights,
 )
-from gcd_train.evaluation.hexplane_learning import Camera, HexPlane, PosedPicture
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)
@@ -67,15 +65,6 @@ def colours(views: list[SceneView]) -> Tensor:
     return torch.from_numpy(np.stack([each.rgb for each in views])).permute(0, 3, 1, 2).float() / 255.0
 
 
-def posed(seen: SceneView) -> PosedPicture:
-    camera = Camera(lens=seen.lens, world_from_camera=torch.from_numpy(seen.world_from_camera), time=-1.0)
-    return PosedPicture(colours=colours([seen])[0], camera=camera)
-
-
-def bounds() -> SceneBounds:
-    return SceneBounds(centre=torch.tensor([1.0, -2.0, 0.5]), half_m=4.0, begin=0.5, reach=5.0)
-
-
 def source_clip() -> SourceClip:
     """The box from a camera that stands; the view that is wanted stands too."""
     path = relative_pose(pose_of(SOURCE), pose_of(HELD_OUT)).expand(FRAMES, 4, 4)
@@ -100,15 +89,6 @@ def psnr_db(one: Tensor, other: Tensor) -> float:
     return -10.0 * math.log10(float(((one - other) ** 2).mean()))
 
 
-def test_planes_are_exact_on_what_is_linear_along_each_axis() -> None:
-    across, down = torch.linspace(-1, 1, 7).double(), torch.linspace(-1, 1, 5).double()[:, None]
-    table = 0.3 + 2.0 * across - 0.7 * down + 1.5 * across * down
-    at = torch.rand(50, 3, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 2 - 1
-    u, v = at[..., 0], at[..., 1]
-    values = sampled(table.expand(3, 1, 5, 7), at)[:, 0]
-    assert_close(values, (0.3 + 2.0 * u - 0.7 * v + 1.5 * u * v).T)
-
-
 def test_each_plane_of_space_is_multiplied_with_the_plane_that_shares_no_axis_with_it() -> None:
     assert [set(one) | set(other) for one, other in zip(SPACE, TIME, strict=True)] == [{0, 1, 2, 3}] * 3
     planes = HexPlanes(features=1, side=4, moments=4, generator=torch.Generator().manual_seed(0))
@@ -120,23 +100,6 @@ def test_each_plane_of_space_is_multiplied_with_the_plane_that_shares_no_axis_wi
     expected = [(x + 10 * y) * (100 * z + 1000 * t), (x + 10 * z) * (100 * y + 1000 * t)]
     expected += [(y + 10 * z) * (100 * x + 1000 * t)]
     assert_close(planes(torch.tensor([[x, y, z, t]]))[0], torch.tensor(expected), rtol=1e-4, atol=1e-2)
-
-
-def test_finer_planes_hold_what_the_coarser_ones_held() -> None:
-    planes = HexPlanes(features=3, side=5, moments=4, generator=torch.Generator().manual_seed(3))
-    points = torch.rand(40, 4, generator=torch.Generator().manual_seed(4)) * 2 - 1
-    before = planes(points)
-    planes.refine(9)
-    assert planes.space.shape == (3, 3, 9, 9)
-    assert planes.time.shape == (3, 3, 4, 9)
-    assert_close(planes(points), before)
-
-
-def test_what_does_not_add_to_the_light_of_a_ray_has_passed_through_all_of_it() -> None:
-    depth = torch.rand(20, 9, generator=torch.Generator().manual_seed(6)) * 2
-    share = weights(depth)
-    assert (share >= 0).all()
-    assert_close(1 - share.sum(dim=1), (-depth.sum(dim=1)).exp())
 
 
 def test_samples_gather_where_the_light_is_and_keep_the_ends() -> None:
@@ -158,27 +121,6 @@ def test_the_cube_stands_where_cameras_of_an_orbit_look() -> None:
     assert found.half_m == pytest.approx(4.5, abs=0.01)
     assert found.begin == pytest.approx(0.6, abs=0.01)
     assert found.reach == pytest.approx(2.5, abs=0.01)
-
-
-def test_all_of_space_fits_in_the_planes_and_the_cube_is_to_scale() -> None:
-    where = bounds()
-    directions = F.normalize(torch.randn(30, 3, generator=torch.Generator().manual_seed(8)), dim=-1)
-    distances = torch.tensor([0.0, 1.0, 3.9, 4.1, 10.0, 100.0, 1e6])
-    placed = where.to_planes(where.centre + distances[:, None, None] * directions)
-    assert (placed.abs() <= 1).all()
-    assert (placed.norm(dim=-1).diff(dim=0) > 0).all()
-    assert_close(placed[1], directions / 8.0)
-
-
-def test_rays_go_through_the_middles_of_their_pixels() -> None:
-    lens = replace(LENS, cx=10.0, cy=9.0)
-    pose = to_pose(Spherical(azimuth_deg=40.0, elevation_deg=10.0, radius_m=15.0))
-    rays = Camera(lens=lens, world_from_camera=pose, time=0.5).rays()
-    seen = ((rays.origins + 3.0 * rays.directions).double() - pose[:3, 3]) @ pose[:3, :3]
-    u, v = lens.fx * seen[:, 0] / seen[:, 2] + lens.cx, lens.fy * seen[:, 1] / seen[:, 2] + lens.cy
-    assert_close(u.view(16, 24), (torch.arange(24) + 0.5).expand(16, 24).double(), rtol=0, atol=1e-4)
-    assert_close(v.view(16, 24), (torch.arange(16) + 0.5)[:, None].expand(16, 24).double(), rtol=0, atol=1e-4)
-    assert_close(rays.directions.norm(dim=-1), torch.ones(len(rays.directions)))
 
 
 def made(method: HexPlane) -> Tensor:

@@ -278,13 +278,13 @@ class TestKubric4D:
     def test_physics_is_told_in_the_scenes_own_units(self) -> None:
         pytest.importorskip("mujoco", reason="needs the extra `scenes`")
         from gcd_train.scenes.drop import world
-        from gcd_train.scenes.tabletop import model
+        from gcd_train.scenes.tabletop import arm
 
         scene = replace(box_scene(0, 2), facts={"metres_a_unit": 0.1})
         told = view_metadata(scene, scene.cameras["view0"], (), InstanceTracks(2), LENS, 24.0)["scene"]
         assert told["gravity"] == pytest.approx([0, 0, -98.1])
-        assert told["step_rate"] == pytest.approx(1 / model.STEP_S)
-        assert vars(world)["_STEP_S"] == model.STEP_S
+        assert told["step_rate"] == pytest.approx(1 / arm.STEP_S)
+        assert vars(world)["_STEP_S"] == arm.STEP_S
 
     def test_segments_are_numbered_as_the_list_of_objects(self) -> None:
         table = segment_ids((4, 9))

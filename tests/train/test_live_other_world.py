@@ -10,9 +10,9 @@ import torch
 from live_clips import HEIGHT, WIDTH, write_clip
 
 from gcd_model.live.config import DepthConfig, LiveConfig, PaintConfig
-from gcd_model.live.familiarity import Familiarity, summary_of
-from gcd_model.live.networks import LiveNetworks
+from gcd_model.live.depth_net import Familiarity, summary_of
 from gcd_model.live.synthesizer import save_live
+from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.live.other_world import auc, main
 

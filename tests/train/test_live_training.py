@@ -27,8 +27,8 @@ from gcd_model.live.depth_net import (
     plane_depth,
     read_depth,
 )
-from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
+from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError, Interrupted, RecipeError
 from gcd_train.live.batches import FrameBatches, lens_rays, pictures_of, training_paths
 from gcd_train.live.calibration import calibrate

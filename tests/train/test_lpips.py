@@ -5,11 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.testing import assert_close
 
-from gcd_model.errors import ShapeError
 from gcd_train.errors import DataError
-from gcd_train.evaluation.lpips import Lpips
+from gcd_train.evaluation.metrics import Lpips
 
 VGG_PLAN = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
 VGG_COMPARED, ALEX_COMPARED = (3, 8, 15, 22, 29), (1, 4, 7, 9, 11)
@@ -99,15 +97,8 @@ def test_distances_are_those_calculated_by_hand(made: Made) -> None:
     view, target = pictures(2), 1 - pictures(2)
     by_hand = [made.by_hand(a, b) for a, b in zip(view, target, strict=True)]
     assert min(by_hand) > 0.01
-    assert lpips(view, target).tolist() == pytest.approx(by_hand, rel=1e-4)
+    assert lpips(torch.stack([target, view]), target).tolist() == [[0.0, 0.0], pytest.approx(by_hand, rel=1e-4)]
     assert lpips.network == made.name
-
-
-def test_draws_together_are_as_far_as_each_alone(alex: Made) -> None:
-    lpips = alex.lpips
-    draws, target = torch.stack([pictures(2), 0.5 * pictures(2), 1 - pictures(2)]), pictures(2).flip(0)
-    together = lpips.of_draws(draws, target)
-    assert_close(together, torch.stack([lpips(each, target) for each in draws]))
 
 
 def test_weights_are_told_apart_by_their_identity(alex: Made, tmp_path: Path) -> None:
@@ -115,15 +106,6 @@ def test_weights_are_told_apart_by_their_identity(alex: Made, tmp_path: Path) ->
     assert Lpips.open(alex.folder).identity == alex.lpips.identity
     assert alex.lpips.identity.startswith("alex-")
     assert Lpips.open(other).identity != alex.lpips.identity
-
-
-def test_pictures_too_small_for_the_network_are_refused(made: Made) -> None:
-    least = {"vgg": 16, "alex": 31}[made.name]
-    lpips = made.lpips
-    square = torch.rand(1, 3, least, least)
-    assert lpips(square, square).tolist() == [0.0]
-    with pytest.raises(ShapeError, match=f"at least {least} pixels"):
-        lpips(square[..., 1:], square[..., 1:])
 
 
 def test_a_folder_without_both_files_is_refused_and_what_it_holds_is_said(tmp_path: Path) -> None:

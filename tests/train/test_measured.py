@@ -1,26 +1,24 @@
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 import torch
 from driving_plane import PlaneClips
-from torch import Tensor
 
+from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.lpips import Lpips
-from gcd_train.evaluation.measure import measure
-from gcd_train.evaluation.metrics import NO_CLASS, masked_mean, masked_psnr, psnr, ssim_map, window_mask
-from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, to_pictures
+from gcd_train.evaluation.measure import predicted_and_measured
+from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
+from gcd_train.evaluation.predictors import CameraPair, Fixed, Prediction, SourceClip, to_pictures
 from gcd_train.evaluation.statistics import class_counts
-from gcd_train.evaluation.store import ClipRecord, Counted
+from gcd_train.evaluation.store import ClipRecord
 from gcd_train.evaluation.summary import evaluation
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
+KINDS = tuple(SemanticClass(name=f"kind {number}", colour=(number, 0, 0)) for number in range(CLASSES))
 
 
 def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
@@ -59,59 +57,7 @@ def drawn(clip: HeldOutClip, draws: int) -> Prediction:
 
 
 def record_of(clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None) -> ClipRecord:
-    return measure(clip, prediction, method="noisy", privileged=False, seconds=2.5, classes=CLASSES, lpips=lpips)
-
-
-def matrix(counted: Sequence[Counted]) -> Tensor:
-    """Of all frames together."""
-    confusion = torch.zeros(CLASSES, CLASSES, dtype=torch.int64)
-    for frame in counted:
-        for true, said, count in frame:
-            confusion[true, said] += count
-    return confusion
-
-
-def mixed(record: ClipRecord, frame: int) -> float:
-    """Squared error of a frame from that of its visible and its occluded pixels."""
-    total = 0.0
-    for region in (record.regions["visible"], record.regions["occluded"]):
-        assert region.psnr_db is not None
-        decibel = region.psnr_db[0][frame]
-        total += 0.0 if decibel is None else region.pixels[frame] * 10 ** (-decibel / 10)
-    return total
-
-
-def test_visible_and_occluded_pixels_make_up_all_of_them() -> None:
-    clip = held_out()
-    record = record_of(clip, noisy(clip, 0))
-    whole, parts = record.regions["all"], [record.regions["visible"], record.regions["occluded"]]
-    assert whole.pixels == (1.0,) * FRAMES
-    assert [a + b for a, b in zip(parts[0].pixels, parts[1].pixels, strict=True)] == [1.0] * FRAMES
-    assert whole.psnr_db is not None
-    squared = [10 ** (-(each or 0.0) / 10) for each in whole.psnr_db[0]]
-    assert [mixed(record, frame) for frame in range(FRAMES)] == pytest.approx(squared, rel=1e-5)
-    counted = [part.confusion for part in (whole, *parts)]
-    assert all(each is not None for each in counted)
-    for frame in range(FRAMES):  # lengths of gradients too are means over pixels
-        lengths = [0.0 if part.gradient is None else (part.gradient[0][frame] or 0.0) for part in (whole, *parts)]
-        shares = [part.pixels[frame] for part in parts]
-        assert shares[0] * lengths[1] + shares[1] * lengths[2] == pytest.approx(lengths[0], rel=1e-5)
-        assert lengths[0] > 0.0
-    everything, seen, unseen = (matrix(each) for each in counted if each is not None)
-    assert everything.equal(seen + unseen)
-
-
-def test_the_target_itself_is_perfect_in_every_frame_and_region() -> None:
-    clip = held_out()
-    perfect = Prediction(video=to_pictures(clip.target), classes=torch.from_numpy(clip.target_classes.copy()))
-    record = record_of(clip, perfect)
-    assert record.regions["all"].psnr_db == ((pytest.approx(100.0),) * FRAMES,)
-    assert record.regions["occluded"].ssim == ((pytest.approx(1.0),) * FRAMES,)
-    assert record.regions["all"].gradient == (record.regions["all"].gradient_target,)
-    assert record.step == (record.step_target,)
-    for counted in (record.grid_confusion, record.regions["all"].confusion):
-        assert counted is not None
-        assert all(true == said for frame in counted for true, said, _ in frame)
+    return predicted_and_measured(Fixed(name="noisy", prediction=prediction), clip, classes=KINDS, lpips=lpips)[1]
 
 
 def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
@@ -119,7 +65,7 @@ def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
     prediction = drawn(clip, 3)
     record, target = record_of(clip, prediction), to_pictures(clip.target)
     seen = torch.from_numpy(clip.visible)
-    assert (record.draws, record.frames, record.seconds) == (3, FRAMES, 2.5)
+    assert (record.draws, record.frames) == (3, FRAMES)
     for number, draw in enumerate(prediction.draws):
         found, visible = record.regions["all"], record.regions["visible"]
         assert found.psnr_db[number] == pytest.approx(psnr(draw.video, target).tolist())
@@ -127,12 +73,6 @@ def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
         assert visible.psnr_db[number][:-1] == pytest.approx(masked_psnr(draw.video, target, seen)[:-1].tolist())
         inside = masked_mean(ssim_map(draw.video, target), window_mask(seen))[:-1]
         assert visible.ssim[number][:-1] == pytest.approx(inside.tolist(), abs=1e-6)
-
-
-def test_regions_are_left_out_where_nobody_knows_them() -> None:
-    clip, unseen = held_out(), held_out(visible=False)
-    short, long = record_of(unseen, noisy(clip, 0)), record_of(clip, noisy(clip, 0))
-    assert short == msgspec.structs.replace(long, regions={"all": long.regions["all"]})
 
 
 def test_a_method_that_only_names_classes_has_no_picture_figures() -> None:
@@ -143,7 +83,6 @@ def test_a_method_that_only_names_classes_has_no_picture_figures() -> None:
     assert region.confusion is not None
     assert record.grid_confusion is not None
     assert len(record.step_target) == FRAMES - 1
-    assert len(record.step_target) == FRAMES - 1
 
 
 def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> None:
@@ -152,16 +91,9 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
     void, road = int(true[0, 0, 0]), int(true[0, -1, WIDTH // 2])
     said = true.clone()
     said[:, -2:] = void  # on the ground, the last row of the class grid
-    record = measure(
-        clip,
-        Prediction(classes=said),
-        method="noisy",
-        privileged=False,
-        seconds=0.0,
-        classes=CLASSES,
-        lpips=None,
-        void=(void,),
-    )
+    kinds = [SemanticClass(name="Void", colour=(0, 0, 0)) if i == void else kind for i, kind in enumerate(KINDS)]
+    named = Fixed(name="noisy", prediction=Prediction(classes=said))
+    record = predicted_and_measured(named, clip, classes=kinds)[1]
     for counted, rows, shape in (
         (record.regions["all"].confusion, 2, true[0].shape),
         (record.grid_confusion, 1, (HEIGHT // 2, WIDTH // 2)),

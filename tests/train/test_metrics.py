@@ -6,8 +6,22 @@ from scipy.ndimage import binary_erosion
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.testing import assert_close
 
-from gcd_model.errors import ShapeError
-from gcd_train.evaluation.metrics import diversity, frame_change, gradient_map, masked_psnr, psnr, ssim_map, window_mask
+from gcd_train.evaluation.metrics import (
+    NO_CLASS,
+    class_iou,
+    confusion_matrix,
+    diversity,
+    frame_confusions,
+    gradient_map,
+    majority_classes,
+    masked_psnr,
+    mean_iou,
+    psnr,
+    ssim_map,
+    void_ids,
+    window_mask,
+    without_classes,
+)
 
 
 def grey(*levels: float, size: int = 16) -> torch.Tensor:
@@ -38,22 +52,11 @@ def test_ssim_of_bright_flat_pictures_does_not_drown_in_rounding() -> None:
     assert ssim_map(flat, flat.clone()).mean().item() == pytest.approx(1.0, abs=1e-9)
 
 
-def test_ssim_refuses_pictures_below_its_window() -> None:
-    with pytest.raises(ShapeError):
-        ssim_map(grey(0.1, size=6), grey(0.1, size=6))
-
-
 def halves() -> torch.Tensor:
     """The left 8 of 20 columns of the first frame, nothing of the second."""
     mask = torch.zeros(2, 24, 20, dtype=torch.bool)
     mask[0, :, :8] = True
     return mask
-
-
-def test_masks_of_everything_change_nothing() -> None:
-    first, second, mask = noise(0), noise(1), torch.ones(2, 24, 20, dtype=torch.bool)
-    assert_close(masked_psnr(first, second, mask), psnr(first, second))
-    assert_close(diversity(torch.stack([first, second]), mask), diversity(torch.stack([first, second])))
 
 
 def test_what_lies_outside_a_mask_is_not_looked_at() -> None:
@@ -87,5 +90,52 @@ def test_gradient_of_a_ramp_is_its_slope() -> None:
     assert gradient_map(grey(0.4)).mean().item() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_frame_change_is_the_mean_absolute_step() -> None:
-    assert_close(frame_change(grey(0.1, 0.4, 0.2)), torch.tensor([0.3, 0.2]))
+def labels(seed: int) -> torch.Tensor:
+    """Three frames of four classes."""
+    return torch.randint(0, 4, (3, 6, 8), generator=torch.Generator().manual_seed(seed)).to(torch.uint8)
+
+
+def test_confusions_of_frames_and_of_regions_add_up_to_the_whole() -> None:
+    said, true, mask = labels(0), labels(1), labels(2) < 2
+    whole = frame_confusions(said, true, 4)
+    assert whole[:, :, :4].sum(dim=0).equal(confusion_matrix(said, true, 4))
+    assert not whole[:, :, 4].any()
+    assert (frame_confusions(said, true, 4, mask) + frame_confusions(said, true, 4, ~mask)).equal(whole)
+    assert whole[1, :, :4].equal(confusion_matrix(said[1], true[1], 4))
+
+
+def test_iou_by_hand_with_an_absent_class() -> None:
+    target = torch.tensor([[0, 0, 1, 2]], dtype=torch.uint8)
+    confusion = confusion_matrix(torch.tensor([[0, 1, 1, 1]], dtype=torch.uint8), target, 4)
+    assert confusion.tolist() == [[1, 1, 0, 0], [0, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]]
+    iou = class_iou(confusion)
+    assert iou[:3].tolist() == pytest.approx([1 / 2, 1 / 3, 0.0])
+    assert math.isnan(float(iou[3]))
+    assert mean_iou(confusion) == pytest.approx((1 / 2 + 1 / 3 + 0) / 3)
+
+
+def test_the_majority_of_each_cell_wins_and_ties_go_to_the_lowest_id() -> None:
+    labels = torch.tensor([[2, 2, 0, 1], [2, 1, 1, 1], [0, 3, 2, 2], [3, 0, 3, 3]], dtype=torch.uint8)
+    assert majority_classes(labels[None], 2, 2, 4).tolist() == [[[2, 1], [0, 2]]]
+
+
+def test_predictions_of_no_class_are_wrong_and_nobodys() -> None:
+    true = torch.tensor([[[0, 0, 1, 1]]], dtype=torch.uint8)
+    said = torch.tensor([[[0, NO_CLASS, 1, NO_CLASS]]], dtype=torch.uint8)
+    found = frame_confusions(said, true, 2)
+    assert found.tolist() == [[[1, 0, 1], [0, 1, 1]]]
+    assert class_iou(found[0]).tolist() == [0.5, 0.5]
+
+
+def test_void_is_known_by_its_name_whatever_the_case() -> None:
+    assert void_ids(["Road", "Void", "Car", "unlabelled", "UNLABELED "]) == (1, 3, 4)
+    assert void_ids(["Road", "Avoided"]) == ()
+    assert void_ids(["Void"] * 256) == ()
+
+
+def test_a_map_without_void_has_no_class_there_and_the_others_stay() -> None:
+    assert without_classes(labels(0), ()).equal(labels(0))
+    made = without_classes(labels(0), (1, 3))
+    assert made.dtype == torch.uint8
+    assert ((made == NO_CLASS) == (labels(0) % 2 == 1)).all()
+    assert made[labels(0) % 2 == 0].equal(labels(0)[labels(0) % 2 == 0])

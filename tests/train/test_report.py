@@ -82,18 +82,6 @@ def test_a_models_clips_are_named_and_its_steps_compared(report: Summary) -> Non
     assert second.startswith("| driving 8 (00000025) |")
 
 
-def test_what_nobody_has_is_left_out() -> None:
-    clips = PlaneClips.orbits([SphericalDelta(azimuth_deg=40.0, radius_m=-1.0)])
-    found = tuple(evaluated(without_learning(clips, named=False), clips))
-    shot = Shot(world="drop", scene=4, clip="00000013", change=(40.0, 0.0, -1.0))
-    orbit = msgspec.structs.replace(
-        conditions("copy"), camera="spherical", shots=(shot,), true_mount=None, declared_mount=None
-    )
-    text = to_markdown(Summary(conditions=orbit, classes=(), model=found[:1], baselines=found))
-    assert "| drop 4 (00000013) az +40 el +0 r -1.0 |" in text
-    assert [word for word in ("mIoU", "accuracy", "IoU of", "declared", "Class figures", "nan") if word in text] == []
-
-
 def test_json_holds_every_figure_and_null_for_none(report: Summary, tmp_path: Path) -> None:
     write_summary(report, "text", tmp_path)
     read = json.loads((tmp_path / "evaluation.json").read_text())
@@ -161,17 +149,6 @@ def test_weights_are_evaluated_from_the_command_line_with_a_declared_mount(tmp_p
     assert 0 < found["total"]["psnr_db"] < 30
     assert read["conditions"]["declared_mount"]["height_m"] == 1.8
     assert read["conditions"]["true_mount"]["height_m"] == 1.55
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "hint"),
-    [((), 78, "--train"), (("--no-baselines",), 78, "--weights"), (("--train", "nowhere"), 66, "nowhere")],
-)
-def test_what_is_missing_is_said(tmp_path: Path, arguments: tuple[str, ...], code: int, hint: str) -> None:
-    held_out = PlaneClips.make(1).write(tmp_path / "a")
-    found, output = run("--data", held_out, "--out", tmp_path / "out", *arguments)
-    assert found == code
-    assert hint in output
 
 
 def test_an_orbit_is_evaluated_from_the_command_line(tmp_path: Path) -> None:

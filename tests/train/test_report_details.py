@@ -1,21 +1,19 @@
 """What stands in a report's tables, stars, ticks and captions, and which options it refuses."""
 
-import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
+import msgspec
 import pytest
 from made_records import FRAMES, note, record, region
-from typer.testing import CliRunner
 
-from gcd_train.cli.main import app
-from gcd_train.evaluation.comparison import differences
-from gcd_train.evaluation.comparison import differences_markdown as differences_told
 from gcd_train.evaluation.galleries import caption
-from gcd_train.evaluation.report import Choices, make_report
-from gcd_train.evaluation.runs import Run, gather
-from gcd_train.evaluation.store import ClipRecord, RunKeeper
-from gcd_train.evaluation.tables import Measured, frames_csv, main_tables, region_table, to_markdown
+from gcd_train.evaluation.report import differences
+from gcd_train.evaluation.report import differences_markdown as differences_told
+from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
+from gcd_train.evaluation.store import ClipRecord
+from gcd_train.evaluation.tables import Measured, main_tables, region_table, to_markdown
 
 COUNTS = [(0, 0, 9), (1, 0, 1)]
 
@@ -38,14 +36,6 @@ def measured(*methods: list[ClipRecord], **told: object) -> Measured:
     return Measured(of=found)
 
 
-def kept(folder: Path, **told: object) -> Path:
-    keeper = RunKeeper(folder)
-    keeper.begin(note(methods={"mine": {"weights": "ab"}}, **told))  # pyright: ignore[reportArgumentType]
-    for each in two("mine"):
-        keeper.keep(each)
-    return folder
-
-
 # --- rows ---------------------------------------------------------------------------------------------------------
 
 
@@ -58,21 +48,6 @@ def test_methods_outside_the_papers_rows_stand_below_in_the_last_frame_too(kind:
         ("not in the paper", "copy_source"),
         ("HexPlane, not in this table", "hexplane_1"),
     ]
-
-
-@pytest.mark.parametrize(
-    ("kind", "protocol", "hint"),
-    [
-        ("kubric", "paper", "--row mine: no row is called 'anything'; there are GCD (direct, max 90, scratch);"),
-        ("orbit", "pairs", "none of them is for these clips"),
-    ],
-)
-def test_a_row_that_no_table_has_is_refused(tmp_path: Path, kind: str, protocol: str, hint: str) -> None:
-    folder = kept(tmp_path / "run", kind=kind, protocol=protocol)
-    given = ["report", str(folder), "--out", str(tmp_path / "out"), "--no-plots", "--row", "mine=anything"]
-    done = CliRunner().invoke(app, given)
-    assert (done.exit_code, done.output.count("\n")) == (78, 1)
-    assert hint in done.output
 
 
 # --- stars --------------------------------------------------------------------------------------------------------
@@ -110,17 +85,6 @@ def test_visible_pixels_diversity_and_sharpness_stand_in_a_table() -> None:
     assert "nan" not in to_markdown(table)
 
 
-def test_every_frame_has_its_figures_on_all_kinds_of_pixels(tmp_path: Path) -> None:
-    lines = list(csv.DictReader(frames_csv(measured(two("a", draws=2))).splitlines()))
-    found = {(line["frame"], line["pixels"], line["figure"]): line["value"] for line in lines}
-    assert {frame for frame, _, _ in found} == {"2", "3", "4"}
-    assert (found["3", "visible", "psnr_db"], found["4", "occluded", "psnr_db"]) == ("30", "10")
-    assert found["2", "all", "diversity"] == "0.01"
-    text = make_report([kept(tmp_path / "run")], tmp_path / "out", Choices(drawn=False, worst=0)).read_text()
-    assert "frame by frame: [frames.csv](tables/frames.csv)" in text
-    assert "### Visible and occluded pixels, diversity, sharpness: frames 2-4" in text
-
-
 # --- pictures -----------------------------------------------------------------------------------------------------
 
 
@@ -130,3 +94,52 @@ def test_a_caption_is_no_wider_than_its_picture_and_nothing_of_it_is_lost(name: 
     lines, scale = caption(name, width)
     assert all(cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] + 2 <= width for line in lines)
     assert "".join("".join(lines).split()) == "".join(name.split())
+
+
+# --- sets that end at the same goals --------------------------------------------------------------------------------
+
+Change = tuple[float, float, float]
+AHEAD: Change = (30.0, 5.0, 0.0)
+ASIDE: Change = (-60.0, 20.0, 1.0)
+
+
+def clips(method: str, *changes: Change | None, target: Sequence[float] = (2.0,) * FRAMES) -> list[ClipRecord]:
+    """A clip of each of as many scenes as there are changes, whose targets are so sharp in each frame."""
+    sharp = msgspec.structs.replace(region((20.0,) * FRAMES), gradient_target=tuple(target))
+    return [
+        record(method, f"scn{number:05d}.sample_00", change=change, regions={"all": sharp})
+        for number, change in enumerate(changes)
+    ]
+
+
+def sets_of(**runs: list[ClipRecord]) -> tuple[EvaluatedSet, ...]:
+    """A run of one method by each name, of clips of its own digest."""
+    told = {name: note(kind="kubric", protocol="paper", data_identity=name, methods={name: {}}) for name in runs}
+    return gather([Run(folder=Path(name), note=told[name], records=tuple(of)) for name, of in runs.items()])
+
+
+def test_clips_of_the_same_name_that_go_elsewhere_are_not_joined_and_it_is_said_why() -> None:
+    found = on_the_same_goals(sets_of(k0=clips("a", AHEAD, ASIDE), k1=clips("b", ASIDE, AHEAD)))
+    assert found[0] == ()
+    (told,) = found[1]
+    assert told.startswith("k0 and k1: of 2 clips of the same names 2 do not end at the same goal")
+    assert "azimuth +30.0, elevation +5.0, radius +0.0 and by azimuth -60.0" in told
+
+
+def test_of_clips_that_end_at_the_same_goal_in_part_only_those_are_joined() -> None:
+    nearly = (30.001, 5.0, 0.0)
+    found = on_the_same_goals(sets_of(k0=clips("a", AHEAD, ASIDE), k1=clips("b", nearly, AHEAD)))
+    (joined,) = found[0]
+    assert {method.name: method.keys for method in joined.methods} == {
+        "a": ("scn00000.sample_00", "scn00001.sample_00"),
+        "b": ("scn00000.sample_00",),
+    }
+    assert "of 2 clips of the same names 1 do not" in found[1][0]
+
+
+@pytest.mark.parametrize("change", [None, AHEAD])
+def test_the_same_path_at_another_moment_is_another_goal(change: Change | None) -> None:
+    moved = clips("b", change, change, target=(2.0, 2.0, 2.0, 2.01))
+    found = on_the_same_goals(sets_of(k0=clips("a", change, change), k1=moved))
+    assert (found[0], len(found[1])) == ((), 1)
+    assert "the target's pictures differ" in found[1][0]

@@ -11,8 +11,7 @@ from driving_plane import PlaneClips
 from gcd_model.geometry import CameraMount
 from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError
-from gcd_train.evaluation.predictors import CameraPair, SourceClip, to_pictures
-from gcd_train.evaluation.saved_frames import SavedFrames
+from gcd_train.evaluation.predictors import CameraPair, SavedFrames, SourceClip, to_pictures
 
 FRAMES, HEIGHT, WIDTH = 3, 32, 48
 KEY = "scn02900.sample_02"

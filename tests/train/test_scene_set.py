@@ -20,7 +20,7 @@ from gcd_train.cli.main import app
 from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_split_names
+from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_splits
 from gcd_train.evaluation.protocol import (
     RELEASED_SOURCE,
     DrawnControls,
@@ -106,14 +106,6 @@ def traits(family: FamilyName, move_time: int) -> Traits:
     )
 
 
-def test_a_scene_has_the_same_clips_whatever_others_there_are_and_another_seed_has_others() -> None:
-    first = [DRAWN.control("scn02900", name, 60) for name in DRAWN.names("scn02900")]
-    assert first == [DRAWN.control("scn02900", name, 60) for name in DRAWN.names("scn02900")]
-    assert len({str(each.goal) for each in first}) == 4
-    assert first[0].goal != DRAWN.control("scn02901", "sample_00", 60).goal
-    assert first[0].goal != replace(DRAWN, seed=4).control("scn02900", "sample_00", 60).goal
-
-
 def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
     control = ListedControls(
         controls=released_controls(["scn02900"], orbit=True), clips=1, bounds=FrameBounds(skip=4)
@@ -176,9 +168,9 @@ def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Pa
 
 def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
     drawn = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="paper"))
-    assert (drawn.fps, tuple(drawn.rates)) == (24.0, (24.0, 12.0, 8.0, 6.0))
+    assert tuple(drawn.rates) == (24.0, 12.0, 8.0, 6.0)
     released = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="release"))
-    assert (released.fps, tuple(released.rates)) == (12.0, (12.0,))
+    assert tuple(released.rates) == (12.0,)
     listed = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), controls=controls(tmp_path, ["scn02900"])))
     assert tuple(listed.rates) == (24.0,)
     assert tuple(opened(kubric, replace(KUBRIC, bounds=FrameBounds(skip=3))).rates) == (8.0,)
@@ -205,14 +197,6 @@ def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
         opened(kubric, KUBRIC, split="kubric4d-train")
     with pytest.raises(RecipeError, match="not both"):
         opened(kubric, KUBRIC, split="kubric4d-test", listed=listed)
-
-
-@pytest.mark.parametrize("scenes", ["kubric", "driving"])
-def test_a_public_split_of_another_world_is_refused(scenes: str, request: pytest.FixtureRequest) -> None:
-    root = request.getfixturevalue(scenes)
-    said = "the world drop, but .* is of kubric4d" if scenes == "kubric" else "the world drop, but .* parallel_domain4d"
-    with pytest.raises(DataError, match=f"--split drop-test is for {said}; give another"):
-        opened(root, KUBRIC if scenes == "kubric" else DRIVING, split="drop-test")
 
 
 def test_a_scene_of_ours_is_of_the_world_that_its_manifest_says(tmp_path: Path) -> None:
@@ -256,7 +240,7 @@ def test_the_identity_follows_the_files_and_neither_their_place_nor_their_times(
 
 
 def test_public_splits_of_a_world_share_no_scene() -> None:
-    assert {"driving-test", "drop-test", "tabletop-test", "kubric4d-test20"} <= set(public_split_names())
+    assert {"driving-test", "drop-test", "tabletop-test", "kubric4d-test20"} <= set(public_splits())
     for world in ("driving", "drop", "tabletop", "kubric4d"):
         parts = [public_split(f"{world}-{part}") for part in ("train", "valid", "test")]
         assert all(len(part) > 0 for part in parts)

@@ -9,17 +9,20 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from box_world import box_scene
 from headless import needs_egl
 from stage_world import STAGE
 from tiny_scenes4d import write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
+from gcd_train.data.files import FileFault
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.layouts.manifest import GEOMETRY
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.look.clip import SKY_M, UNSEEN, Footage
-from gcd_train.look.open_scene import open_scene
-from gcd_train.look.scene_clip import ShowOptions
+from gcd_train.look.open_scene import ShowOptions, open_scene
+from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World
 
 FRAMES = 4
@@ -89,14 +92,16 @@ def test_every_layout_gives_a_clip_whose_path_begins_at_the_source(layout: str, 
 
 def test_only_surfaces_that_were_not_seen_turn_orange(pairs: Path) -> None:
     footage = opened(pairs)
-    visible, surface = footage.visible.copy(), footage.surface.copy()
+    assert footage.target_depth is not None
+    visible, depth = footage.visible.copy(), footage.target_depth.copy()
     visible[:, :, :8] = False
-    surface[:, :, :4] = False  # sky
-    painted = replace(footage, visible=visible, surface=surface).seen()
+    depth[:, :, :4] = 0.0  # sky
+    footage = replace(footage, visible=visible, target_depth=depth)
+    painted = footage.seen()
     assert np.array_equal(painted[:, :, 8:], footage.target[:, :, 8:])
     assert np.array_equal(painted[:, :, :4], footage.target[:, :, :4])
     assert np.abs(painted[:, :, 4:8].astype(int) - UNSEEN).max() < 100
-    assert replace(footage, visible=visible, surface=surface).seen_shares[0] == pytest.approx(40 / 44)
+    assert footage.seen_shares[0] == pytest.approx(40 / 44)
 
 
 # which clip
@@ -189,3 +194,14 @@ def test_a_scene_of_ours_is_wholly_seen_from_where_its_source_stands(compact: bo
     footage = opened(tmp_path / "scn00000")
     assert footage.target_is.startswith("rendered")
     assert footage.seen_shares[0] > 0.9
+    points = opened(tmp_path / "scn00000", exact=False)
+    assert points.target_depth is None
+    assert np.abs(points.target[0].astype(int) - footage.target[0]).mean() < 8
+
+
+def test_geometry_of_too_few_frames_is_named(tmp_path: Path) -> None:
+    scene = write_kubric(tmp_path, 7, views=5, frames=FRAMES)
+    with (scene / GEOMETRY).open("wb") as file:
+        freeze(box_scene(0, 1)).save(file)
+    with pytest.raises(FileFault, match=GEOMETRY):
+        opened(scene)

@@ -13,8 +13,8 @@ from torch import Tensor
 from typer import Typer
 from typer.testing import CliRunner
 
-from gcd_model import View, load_synthesizer
-from gcd_model.geometry import CameraMount, driving_trajectory
+from gcd_model import load_synthesizer
+from gcd_model.geometry import CameraMount
 from gcd_model.weights.load import inspect_weights
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.errors import DataError
@@ -27,7 +27,6 @@ from gcd_train.evaluation.calibration import (
     miscoverage,
 )
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.metrics import pixel_deviation
 from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip
 
 T, H, W = 4, 48, 64
@@ -66,17 +65,6 @@ def test_the_scale_is_the_truths_own_spread(share: float) -> None:
     counts = spread_by(share).counts["all"]
     assert best_scale(counts) == pytest.approx(share, rel=0.03)
     assert miscoverage(counts, share) < 0.01
-
-
-def test_the_deviation_is_that_of_a_view() -> None:
-    samples = torch.rand(3, T, 3, H, W, generator=torch.Generator().manual_seed(1))
-    path = driving_trajectory(frames=T, move_time=T - 1)
-    view = View(samples=samples, latents=torch.zeros(1), trajectory=path, motion_bucket=0.0, uncertainty_scale=2.5)
-    assert view.std is not None
-    assert view.uncertainty is not None
-    assert torch.equal(pixel_deviation(samples), view.std)
-    assert torch.equal(view.uncertainty, 2.5 * view.std)
-    assert replace(view, uncertainty_scale=None).uncertainty is None
 
 
 def test_the_first_frame_does_not_count() -> None:
@@ -166,9 +154,3 @@ def test_a_scale_that_cannot_be_stored_is_refused_before_measuring(
     assert code == 78
     assert said in " ".join(shown.split())
     assert not (tmp_path / "out").exists()
-
-
-def test_a_model_that_states_its_own_spread_is_refused_before_measuring(tmp_path: Path) -> None:
-    code, shown = run("--data", tmp_path / "none", "--weights", "random:live", "--out", tmp_path / "out")
-    assert code == 78
-    assert "states its own spread" in " ".join(shown.split())

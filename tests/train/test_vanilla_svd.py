@@ -12,12 +12,10 @@ from test_start import given, write
 from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View
 from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.config import SVD_14
 from gcd_model.geometry import CameraMount
-from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings, build, described
+from gcd_train.errors import RecipeError
+from gcd_train.evaluation.baselines import BaselineSettings, VanillaSVD, build, described
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
-from gcd_train.evaluation.svd import VanillaSVD
 
 SIZE = (16, 32)
 """As small as the networks can halve."""
@@ -129,12 +127,6 @@ def test_the_network_is_told_what_was_published(told: Told) -> None:
     assert torch.equal(features.latents[13], features.latents[0])
     sampling = told.traits.config.sampling
     assert (sampling.steps, sampling.guidance, options.steps, options.guidance) == (25, (1.0, 2.5), None, None)
-
-
-def test_weights_that_are_told_a_camera_path_are_refused(told: Told) -> None:
-    steered = Told(replace(told.traits, config=SVD_14))
-    with pytest.raises(DataError, match=r"is told a camera path; give svd\.safetensors"):
-        VanillaSVD(synthesizer=steered)
 
 
 def test_by_its_name_it_is_built_from_the_settings(weights: Path) -> None:

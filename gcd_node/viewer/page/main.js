@@ -4,35 +4,29 @@ import { Controls } from "./controls.js";
 import { HealthPanel } from "./health.js";
 import { Link } from "./link.js";
 import { InputPicture, ViewPicture } from "./pictures.js";
-import { Plots } from "./plots.js";
 
 const TICK_MS = 100;
 const element = (id) => document.getElementById(id);
 
 const health = new HealthPanel();
-const plots = new Plots();
 const input = new InputPicture();
 const view = new ViewPicture();
 let bootId = null;
 let steered = ""; // what the controls were last fitted to
 let taking = Promise.resolve(); // pictures are taken in the order they came
-let ticked = 0;
 let silence = null; // at the last look
 
 const link = new Link({
   open: () => { steered = ""; if (view.view) link.say({ type: "watch", view: view.view }); },
-  welcome: ({ commands }) => { controls.commands = commands; controls.explain(); },
+  welcome: ({ commands }) => { health.forget(); controls.commands = commands; controls.explain(); },
   role: ({ role, refused }) => {
     element("role").textContent = refused ? "viewer: the token is not this node's" : role;
     element("role").dataset.role = role;
     controls.setRole(role);
   },
-  history: ({ samples }) => { health.forget(); plots.forget(); plots.addSamples(samples, false); },
-  windows: ({ windows }) => plots.addWindows(windows),
   status: (told) => {
     noticeBoot(told.boot_id);
     health.take(told);
-    plots.addSamples([{ at_s: told.at_s, stages: medians(told.fields.stages) }], true);
     fitControls();
   },
   meta: (told) => { noticeBoot(told.boot_id); offerViews(told.fields.views ?? []); },
@@ -50,12 +44,7 @@ const controls = new Controls(link);
 async function take(head, bytes, at) {
   if (head.kind === "src") return input.take(head, bytes, at);
   if (head.view !== view.view) return;
-  if (head.kind === "win") plots.addWindows([{ view: head.view, at_s: head.at_s, ...head.published }]);
   await view.take(head, bytes, at);
-}
-
-function medians(stages = {}) {
-  return Object.fromEntries(Object.entries(stages).map(([name, told]) => [name, told.p50_ms]));
 }
 
 // The node was started anew: what was tied to the old one is forgotten.
@@ -121,7 +110,6 @@ function turn(now) {
     document.title = `${state === "live" ? "" : `${state}: `}${health.status ? element("node").textContent : "gcd-node"}`;
   }
   if (element("why").textContent !== reason) element("why").textContent = reason;
-  return state === "dead";
 }
 
 function paint() {
@@ -133,12 +121,5 @@ function paint() {
   requestAnimationFrame(paint);
 }
 
-setInterval(() => {
-  const now = performance.now();
-  turn(now);
-  if (now - ticked > 1000) {
-    ticked = now;
-    plots.draw(view.view);
-  }
-}, TICK_MS);
+setInterval(() => turn(performance.now()), TICK_MS);
 requestAnimationFrame(paint);

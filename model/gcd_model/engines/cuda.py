@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, TorchBackbone, unit_noise
+from gcd_model.diffusion import Schedule, unit_noise
 from gcd_model.engines.graphs import (
     CudaGraphs,
     Pace,
@@ -56,14 +56,12 @@ class CudaOptions:
         graphs. channels_last: lay convolutions out as tensor cores read them.
     decoder: its precision; "checked" means bfloat16 where its pictures reach 50 dB against float32, see
         `checked_decoder`.
-    cache: folder of compiled code; None for the usual one, see `cache_folder`.
     """
 
     backend: str | None = "inductor"
     graphs: bool = True
     channels_last: bool = True
     decoder: Literal["checked", "float32", "bfloat16"] = "checked"
-    cache: Path | None = None
 
     @classmethod
     def of_device(cls, device: torch.device) -> Self:
@@ -108,7 +106,6 @@ class CudaEngine:
         update = _compiled(networks, options)
         self._networks, self._update = networks, update
         self._plain = TorchEngine(networks)
-        self._backbone = TorchBackbone(networks.unet)
         on_gpu = options.graphs and self.like.device.type == "cuda"
         self._recorder = recorder or (CudaGraphs() if on_gpu else Unrecorded())
         self._memories: Recent[StepMemory] = Recent()
@@ -149,7 +146,7 @@ class CudaEngine:
         widths = [2 if guided else 1 for guided in schedule.guided]
         memory = self._memories.get(
             (start.shape, given.latents.shape, given.tokens is None),
-            lambda: StepMemory(self._backbone, self._update, start, given, schedule),
+            lambda: StepMemory(self._plain, self._update, start, given, schedule),
         )
         memory.begin(start, given, schedule)
         if memory.record(set(widths), self._recorder):
@@ -180,16 +177,15 @@ def _settle_decoder(networks: Networks, precision: str) -> None:
     if precision == "bfloat16":
         networks.decoder = copy.deepcopy(networks.decoder).to(torch.bfloat16)  # others may share its weights
     elif precision == "checked":
-        choice = checked_decoder(networks)
-        networks.decoder = choice.decoder
-        _LOG.info("decoder in %s: %.1f dB from float32 in bfloat16", choice.decoder.stem.weight.dtype, choice.psnr_db)
+        networks.decoder, psnr = checked_decoder(networks)
+        _LOG.info("decoder in %s: %.1f dB from float32 in bfloat16", networks.decoder.stem.weight.dtype, psnr)
 
 
 def _compiled(networks: Networks, options: CudaOptions) -> Update:
     if options.backend is None:
         return solved
     if options.backend == "inductor":
-        keep_compiled(options.cache or cache_folder())
+        keep_compiled(cache_folder())
     compile_regions(networks, options.backend)
     return torch.compile(solved, backend=options.backend, fullgraph=True, dynamic=False)
 
@@ -279,24 +275,16 @@ _SEED = 11
 _FRAMES = 4  # decoding all of a clip in float32 without graphs takes more memory than anything else does
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DecoderChoice:
-    """The decoder that is used. psnr_db: of its pictures in bfloat16 against float32."""
-
-    decoder: TemporalDecoder
-    psnr_db: float
-
-
 @torch.inference_mode()
-def checked_decoder(networks: Networks) -> DecoderChoice:
-    """The decoder in bfloat16 if its pictures of a test clip are good enough for that, else as it is."""
+def checked_decoder(networks: Networks) -> tuple[TemporalDecoder, float]:
+    """The decoder, in bfloat16 if its pictures of a test clip are good enough for that; and their PSNR."""
     config, full = networks.config, networks.decoder
     frames = drifting_clip(min(config.frames, _FRAMES), config.height, config.width)
     encoder = networks.condition_encoder
     latents = torch.cat([encoder(each[None].to(encoder.stem.weight)).mean for each in frames]).float()
     half = copy.deepcopy(full).to(torch.bfloat16)
     psnr = psnr_db(*(to_pixels(each(latents.to(each.stem.weight), len(latents))) for each in (half, full)))
-    return DecoderChoice(decoder=half if psnr > WANTED_DB else full, psnr_db=psnr)
+    return half if psnr > WANTED_DB else full, psnr
 
 
 def drifting_clip(frames: int, height: int, width: int) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gcd_model.conditioning import Conditioning
 from gcd_model.diffusion import Backbone, Schedule, denoised, preconditioning
-from gcd_model.unet import StageInputs, StagePlan, UNetPlan
+from gcd_model.unet import StageInputs, UNetPlan
 
 Kept = TypeVar("Kept")
 Replay = Callable[[], None]
@@ -209,47 +209,26 @@ class PlanMemory:
 
     def __init__(self, plan: UNetPlan) -> None:
         """plan: any one of this batch's shape."""
-        self._table = _packed(plan)  # [S, all embeddings]
-        self._row = self._table[0].clone()
-        self._stages = plan.stages
-        self._crosses = [tuple(None if each is None else each.clone() for each in _crosses(s)) for s in plan.stages]
+        self._plan = plan
+        self._spatial, self._temporal = plan.spatial_embedding[0].clone(), plan.temporal_embedding[0].clone()
+        self._crosses = [None if each is None else each.clone() for each in (plan.spatial_cross, plan.temporal_cross)]
 
     def load(self, plan: UNetPlan) -> None:
         """From now on this plan, of the same shape but for its number of steps, counts."""
-        self._table = _packed(plan)
-        for kept, stage in zip(self._crosses, plan.stages, strict=True):
-            for memory, cross in zip(kept, _crosses(stage), strict=True):
-                if memory is not None and cross is not None:
-                    memory.copy_(cross)
+        self._plan = plan
+        for memory, cross in zip(self._crosses, (plan.spatial_cross, plan.temporal_cross), strict=True):
+            if memory is not None and cross is not None:
+                memory.copy_(cross)
 
     def seek(self, step: int) -> None:
         """The embeddings of this step."""
-        self._row.copy_(self._table[step])
+        self._spatial.copy_(self._plan.spatial_embedding[step])
+        self._temporal.copy_(self._plan.temporal_embedding[step])
 
-    def inputs(self, branches: int, given: int) -> tuple[StageInputs, ...]:
+    def inputs(self, branches: int, given: int) -> StageInputs:
         """Of as many branches as a step computes. given: those there are; the conditional one comes last."""
-        embeddings = iter(self._row.split([each.shape[1:].numel() for stage in self._stages for each in _both(stage)]))
-        return tuple(
-            StageInputs(
-                next(embeddings).view(stage.spatial_embedding.shape[1:]).repeat(branches, 1),
-                next(embeddings).view(stage.temporal_embedding.shape[1:]).repeat(branches, 1),
-                *(None if cross is None else _last(cross, branches, given) for cross in crosses),
-            )
-            for stage, crosses in zip(self._stages, self._crosses, strict=True)
-        )
-
-
-def _both(stage: StagePlan) -> tuple[Tensor, Tensor]:
-    return stage.spatial_embedding, stage.temporal_embedding
-
-
-def _crosses(stage: StagePlan) -> tuple[Tensor | None, Tensor | None]:
-    return stage.spatial_cross, stage.temporal_cross
-
-
-def _packed(plan: UNetPlan) -> Tensor:
-    """All embeddings of a step one after the other, [S, numbers]: one copy brings them all."""
-    return torch.cat([each.flatten(1) for stage in plan.stages for each in _both(stage)], dim=1)
+        crosses = (None if each is None else _last(each, branches, given) for each in self._crosses)
+        return StageInputs(self._spatial.repeat(branches, 1), self._temporal.repeat(branches, 1), *crosses)
 
 
 def _last(rows: Tensor, branches: int, given: int) -> Tensor:

@@ -7,7 +7,7 @@ imported when the first export is loaded.
 import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,9 +23,8 @@ from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.unet import StageInputs, StagePlan, UNetPlan
+from gcd_model.unet import StageInputs, UNetPlan
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import family_named
 
 CPU_PROVIDER, CUDA_PROVIDER = "CPUExecutionProvider", "CUDAExecutionProvider"
 TENSORRT_PROVIDER = "TensorrtExecutionProvider"
@@ -54,17 +53,7 @@ def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence
         raise CheckpointError(f"{folder}: its {MANIFEST} must name {', '.join(sorted(wanted))}; export it again")
     chosen = provider_options(device, providers, folder / "tensorrt", half=manifest.precision == "float16")
     files = {name: folder / record.files[0].name for name, record in manifest.graphs.items()}
-    traits = Traits(
-        name=card.name,
-        config=card.config,
-        family=None if card.family is None else family_named(card.family),
-        move_time=card.move_time,
-        sha256_12=manifest.sha256_12,
-        precision=manifest.precision,
-        device="cpu",
-        trained=card.trained,
-        uncertainty_scale=card.uncertainty_scale,
-    )
+    traits = Traits.of(card, sha256_12=manifest.sha256_12, precision=manifest.precision, device="cpu")
     return Synthesizer(empty_networks(card.diffusion), traits, OnnxEngine(Sessions(files, chosen), card.diffusion))
 
 
@@ -87,20 +76,12 @@ def provider_options(device: str, names: Sequence[str], cache: Path, *, half: bo
     return [*((name, options.get(name, {})) for name in names if name != CPU_PROVIDER), (CPU_PROVIDER, {})]
 
 
-class Graphs(Protocol):
-    """The graphs of one export, ready to run."""
-
-    def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """One run. inputs: in the graph's order."""
-        ...
-
-
 class OnnxEngine:
-    """The networks of an export, clip by clip. Source: `Engine`."""
+    """The networks of an export, clip by clip. Implements Engine, and Backbone with graphs for the U-Net."""
 
-    def __init__(self, graphs: Graphs, config: ModelConfig) -> None:
+    def __init__(self, graphs: "Sessions", config: ModelConfig) -> None:
         self._graphs, self._config = graphs, config
-        self._backbone = OnnxBackbone(graphs, config.frames)
+        self._frames = config.frames
         self.like = torch.zeros(())
         """See Engine: float32 on the CPU; onnxruntime copies to its own device."""
 
@@ -127,7 +108,7 @@ class OnnxEngine:
         return None if control == "none" else camera_features(control, path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = planned_denoiser(self._backbone, given, schedule)
+        denoiser = planned_denoiser(self, given, schedule)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
 
     def decode(self, latents: Tensor) -> Tensor:
@@ -135,13 +116,6 @@ class OnnxEngine:
 
     def _frame_by_frame(self, name: str, frames: Tensor) -> Tensor:
         return torch.cat([self._graphs.run(name, frame)[0] for frame in frames.split(1)])
-
-
-class OnnxBackbone:
-    """The U-Net as graphs. Its plan has one entry for all stages, side by side. Source: `Backbone`."""
-
-    def __init__(self, graphs: Graphs, frames: int) -> None:
-        self._graphs, self._frames = graphs, frames
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         rows = [given.vector] if given.camera is None else [given.vector, given.camera]
@@ -151,14 +125,13 @@ class OnnxBackbone:
         crosses: Sequence[Tensor | None] = (None, None)
         if given.tokens is not None:
             crosses = self._joined([("crosses", clip) for clip in given.tokens.split(self._frames)])
-        return UNetPlan((StagePlan(spatial, temporal, crosses[0], crosses[1]),), given.branches)
+        return UNetPlan(spatial, temporal, crosses[0], crosses[1], given.branches)
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: tuple[StageInputs, ...]) -> Tensor:
-        (stage,) = inputs
-        parts = [rows, condition, stage.spatial_embedding, stage.temporal_embedding]
+    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+        parts = [rows, condition, inputs.spatial_embedding, inputs.temporal_embedding]
         clips = [each.split(self._frames) for each in parts]
-        if stage.spatial_cross is not None and stage.temporal_cross is not None:
-            clips += [stage.spatial_cross.split(self._frames), stage.temporal_cross.split(1)]
+        if inputs.spatial_cross is not None and inputs.temporal_cross is not None:
+            clips += [inputs.spatial_cross.split(self._frames), inputs.temporal_cross.split(1)]
         return torch.cat([self._graphs.run("step", *clip)[0] for clip in zip(*clips, strict=True)])
 
     def _joined(self, runs: Sequence[tuple[Any, ...]]) -> tuple[Tensor, ...]:
@@ -181,7 +154,7 @@ class _Session(nn.Module):
 
 
 class Sessions:
-    """Graphs in onnxruntime's hands. Source: `Graphs`."""
+    """The graphs of one export, in onnxruntime's hands."""
 
     def __init__(self, files: dict[str, Path], providers: Sequence[Provider] = ((CPU_PROVIDER, {}),)) -> None:
         """Raises: OptionError if onnxruntime or a provider is not there; ModelError if it refuses a graph."""
@@ -199,7 +172,7 @@ class Sessions:
         self._sessions = {name: _Session(_session(onnxruntime, path, providers)) for name, path in files.items()}
 
     def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """See Graphs. Raises: DeviceMemoryError, ModelError."""
+        """One run. inputs: in the graph's order. Raises: DeviceMemoryError, ModelError."""
         try:
             return self._sessions[name](inputs)
         except Exception as error:

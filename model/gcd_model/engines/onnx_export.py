@@ -9,7 +9,7 @@ import importlib.util
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -21,10 +21,9 @@ from torch import Tensor, nn
 
 from gcd_model.config import CAMERA_FEATURES
 from gcd_model.errors import CheckpointError, FileError, OptionError
-from gcd_model.layers import Layers, prepare
+from gcd_model.layers import prepare
 from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.small_files import decode_json, read_small
-from gcd_model.temporal import SpatialBlock, TemporalBlock
 from gcd_model.unet import StageInputs, VideoUNet
 from gcd_model.weights.card import FULL_PRECISION, Card
 from gcd_model.weights.load import digest
@@ -56,9 +55,8 @@ class Embeddings(nn.Module):
     def forward(self, label: Tensor, vector: Tensor, camera: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Spatial and temporal, [T, sum of C] each."""
         features = None if self.camera is None or camera is None else self.camera(camera)
-        stages = self.unet.plan(label, vector, features, None).stages
-        spatial = torch.cat([stage.spatial_embedding[0] for stage in stages], dim=1)
-        return spatial, torch.cat([stage.temporal_embedding[0] for stage in stages], dim=1)
+        plan = self.unet.plan(label, vector, features, None)
+        return plan.spatial_embedding[0], plan.temporal_embedding[0]
 
 
 class Crosses(nn.Module):
@@ -66,18 +64,12 @@ class Crosses(nn.Module):
 
     def __init__(self, unet: VideoUNet) -> None:
         super().__init__()
-        attending = [stage.attention for stage in unet.all_stages() if stage.attention is not None]
-        self.spatial = _token_layers(attention.spatial for attention in attending)
-        self.temporal = _token_layers(attention.temporal for attention in attending)
+        self.spatial, self.temporal = (nn.ModuleList(layers) for layers in unet.token_layers())
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """[T, sum of C] and, of the first frame alone, [1, sum of C]."""
         spatial = torch.cat([layer(tokens) for layer in self.spatial], dim=1)
         return spatial, torch.cat([layer(tokens[:1]) for layer in self.temporal], dim=1)
-
-
-def _token_layers(blocks: Iterable[SpatialBlock | TemporalBlock]) -> Layers[nn.Module]:
-    return Layers[nn.Module](block.token for block in blocks if block.token is not None)
 
 
 class Step(nn.Module):
@@ -86,24 +78,12 @@ class Step(nn.Module):
     def __init__(self, unet: VideoUNet) -> None:
         super().__init__()
         self.unet = unet
-        self.widths = [stage.res.spatial.norm2.num_channels for stage in unet.all_stages()]
-        self.crossed = [
-            width if stage.attention is not None and stage.attention.spatial.token is not None else 0
-            for width, stage in zip(self.widths, unet.all_stages(), strict=True)
-        ]
 
     def forward(
         self, latents: Tensor, condition: Tensor, spatial: Tensor, temporal: Tensor, *crosses: Tensor
     ) -> Tensor:
         """latents: [T, C, h, w] -> the same shape."""
-        embeddings = (each.split(self.widths, dim=1) for each in (spatial, temporal))
-        added = [self._by_stage(each) for each in crosses] or [[None] * len(self.widths)] * 2
-        inputs = [StageInputs(*stage) for stage in zip(*embeddings, *added, strict=True)]
-        return self.unet(latents, condition, inputs)
-
-    def _by_stage(self, cross: Tensor) -> Sequence[Tensor | None]:
-        parts = iter(cross.split([width for width in self.crossed if width], dim=1))
-        return [next(parts) if width else None for width in self.crossed]
+        return self.unet(latents, condition, StageInputs(spatial, temporal, *(crosses or (None, None))))
 
 
 class _Function(nn.Module):
@@ -156,12 +136,12 @@ def step_graph(networks: Networks) -> Graph:
     inputs = {
         "latents": torch.zeros(frames, unet.latent_channels, *size),
         "condition": torch.zeros(frames, unet.condition_channels, *size),
-        "spatial_embedding": torch.zeros(frames, sum(step.widths)),
-        "temporal_embedding": torch.zeros(frames, sum(step.widths)),
     }
+    widths = [stage.res.spatial.norm2.num_channels for stage in networks.unet.all_stages()]
+    inputs |= {name: torch.zeros(frames, sum(widths)) for name in ("spatial_embedding", "temporal_embedding")}
     if networks.image_encoder is not None:
-        inputs["spatial_cross"] = torch.zeros(frames, sum(step.crossed))
-        inputs["temporal_cross"] = torch.zeros(1, sum(step.crossed))
+        crossed = sum(layer.out.out_features for layer in networks.unet.token_layers()[0])
+        inputs |= {"spatial_cross": torch.zeros(frames, crossed), "temporal_cross": torch.zeros(1, crossed)}
     return _graph("step", step, inputs, "prediction")
 
 

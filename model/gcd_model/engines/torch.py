@@ -1,15 +1,22 @@
 """What computes the networks of a checkpoint, behind one interface: plain torch here, faster ones beside it."""
 
+from collections.abc import Callable
+from functools import partial
+from itertools import repeat
 from typing import Protocol
 
-from torch import Tensor
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, TorchBackbone, planned_denoiser, sample
+from gcd_model.diffusion import Schedule, planned_denoiser, sample
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
+from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample
 from gcd_model.networks import Networks
+from gcd_model.unet import StageInputs, UNetPlan, VideoUNet
 
 
 class Engine(Protocol):
@@ -48,11 +55,10 @@ class Engine(Protocol):
 
 
 class TorchEngine:
-    """The networks as torch runs them."""
+    """The networks as torch runs them. Implements Engine, and Backbone with the U-Net in its own precision."""
 
     def __init__(self, networks: Networks) -> None:
         self._networks = networks
-        self._backbone = TorchBackbone(networks.unet)
 
     @property
     def like(self) -> Tensor:
@@ -72,10 +78,149 @@ class TorchEngine:
         return None if embedder is None else embedder(path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = planned_denoiser(self._backbone, given, schedule)
+        denoiser = planned_denoiser(self, given, schedule)
         start = start.to(self.like.device)
         return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
+
+    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
+        unet, on_device = self._networks.unet, labels.to(self.like.device)
+        return unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
+
+    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+        return self._networks.unet(rows.to(self.like), condition, inputs).float()
 
     def decode(self, latents: Tensor) -> Tensor:
         decoder = self._networks.decoder
         return decoder(latents.to(decoder.stem.weight), len(latents))
+
+
+# --- a CPU: working sets that fit its caches and the memory it has at hand -------------------------------------------
+
+# A buffer above 32 MB is fetched from the system afresh each time, page by page; writing it then costs more than what
+# is computed for it. Smaller ones are used again. The networks know nothing of this: `arrange` wraps their parts. What
+# they compute stays the same; on other devices, with gradient and in a compiler a wrapped part is as it was.
+
+REUSED_FLOATS = 7 * 2**20
+"""The largest buffer that is used again instead of being fetched anew, in float32 values."""
+
+
+def arrange(model: nn.Module) -> None:
+    """Wrap the parts of a model for a CPU, in place; a part that is wrapped already stays so."""
+    computed: dict[type[nn.Module], Callable[..., Tensor]] = {
+        ResBlock: _res_block,
+        Attention: _attention,
+        FeedForward: _feed_forward,
+        Upsample: _upsample,
+    }
+    for module in model.modules():
+        compute = computed.get(type(module))
+        if compute is not None:
+            _wrap(module, compute)
+        if isinstance(module, ResBlock):
+            _wrap(module, _residual, "residual")
+        if isinstance(module, VideoUNet) and "forward" not in vars(module):
+            _wrap(module, _clip_by_clip)
+            for layer in (module.stem, *(level.down for level in module.down), *(level.up for level in module.up)):
+                if layer is not None:
+                    layer.register_forward_hook(_laid_out)
+
+
+def _wrap(module: nn.Module, compute: Callable[..., Tensor], name: str = "forward") -> None:
+    if name not in vars(module):
+        setattr(module, name, partial(_chosen, compute, getattr(module, name), module))  # copies with its module
+
+
+def _chosen(
+    compute: Callable[..., Tensor],
+    plain: Callable[..., Tensor],
+    module: nn.Module,
+    x: Tensor,
+    *more: object,
+    **named: bool,
+) -> Tensor:
+    return compute(module, x, *more, **named) if frugal(x) and not any(named.values()) else plain(x, *more, **named)
+
+
+def frugal(x: Tensor) -> bool:
+    """Whether to work in pieces: on a CPU, without gradient, and while nothing records a graph of the network."""
+    return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+
+
+def _rows_at_once(floats_per_row: int) -> int:
+    return max(1, REUSED_FLOATS // max(1, floats_per_row))
+
+
+def _by_rows(compute: Callable[[Tensor], Tensor], x: Tensor, floats_per_row: int) -> Tensor:
+    """compute(x), which gives every row of x for itself and in its shape, a few rows at a time."""
+    at_once = _rows_at_once(floats_per_row)
+    if at_once >= len(x):
+        return compute(x)
+    result = torch.empty_like(x)
+    for few, into in zip(x.split(at_once), result.split(at_once), strict=True):
+        into.copy_(compute(few))
+    return result
+
+
+def _residual(block: ResBlock, x: Tensor, embedding: Tensor | None = None) -> Tensor:
+    h = block.conv1(F.silu(block.norm1(x), inplace=True))
+    h = h if embedding is None else h.add_(embedding)
+    return block.conv2(F.silu(block.norm2(h), inplace=True))
+
+
+def _res_block(block: ResBlock, x: Tensor, embedding: Tensor | None = None) -> Tensor:
+    def few(x: Tensor, embedding: Tensor | None) -> Tensor:
+        skip = x if block.skip is None else block.skip(x)
+        return block.residual(x, embedding).add_(skip)
+
+    at_once = _rows_at_once(x.shape[1:].numel())
+    if at_once >= len(x):
+        return few(x, embedding)
+    embeddings = repeat(None) if embedding is None else embedding.expand(len(x), -1, -1, -1).split(at_once)
+    return torch.cat([few(*each) for each in zip(x.split(at_once), embeddings, strict=False)])
+
+
+def _attention(attention: Attention, x: Tensor) -> Tensor:
+    return _by_rows(partial(Attention.forward, attention), x, 3 * x.shape[1:].numel())
+
+
+def _feed_forward(feed: FeedForward, x: Tensor) -> Tensor:
+    def few(rows: Tensor) -> Tensor:
+        if type(feed.expand) is not nn.Linear:  # an adapter computes more than its weight says
+            return FeedForward.forward(feed, rows)
+        halves = zip(feed.expand.weight.chunk(2), feed.expand.bias.chunk(2), strict=True)
+        value, gate = (F.linear(rows, weight, bias) for weight, bias in halves)
+        return feed.contract(F.gelu(gate).mul_(value))
+
+    return _by_rows(few, x.reshape(-1, x.shape[-1]), feed.contract.in_features).view_as(x)
+
+
+def _upsample(up: Upsample, x: Tensor) -> Tensor:
+    """One phase at a time, written where it belongs."""
+    whole: Tensor | None = None
+    for (row, column), phase in up.phases(x):
+        if whole is None:
+            whole = phase.new_empty(*phase.shape[:2], 2 * phase.shape[2], 2 * phase.shape[3])
+        whole[..., row::2, column::2] = phase
+    assert whole is not None
+    return whole
+
+
+def _laid_out(_module: nn.Module, _given: object, x: Tensor) -> Tensor:
+    """x: [N, C, H, W], in the order of memory in which a CPU convolves it fastest.
+
+    Channels last is faster, and makes tokens of pixels without a copy, but re-orders the 9 C^2 weights in each
+    call: it pays where there are many more pixels than channels.
+    """
+    if not frugal(x):
+        return x
+    last = x.numel() // x.shape[1] >= 4 * x.shape[1]
+    return x.contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)
+
+
+def _clip_by_clip(unet: VideoUNet, latents: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+    """Clips that are large together go through it one after the other: nothing of one is held for the next."""
+    clips, widest = len(latents) // unet.frames, unet.stem.out_channels * latents.shape[-2:].numel()
+    if clips == 1 or _rows_at_once(widest) >= len(latents):
+        return VideoUNet.forward(unet, latents, condition, inputs).contiguous()
+    parts = zip(latents.chunk(clips), condition.chunk(clips), inputs.chunk(clips), strict=True)
+    return torch.cat([VideoUNet.forward(unet, *part).contiguous() for part in parts])

@@ -2,11 +2,9 @@
 
 from gcd_model.geometry.pinhole import Intrinsics, center_crop_box
 from gcd_model.geometry.pose import (
-    RIGID_TOLERANCE,
     CameraMount,
     invert_rigid,
     look_at,
-    pose_from_axes,
     relative_pose,
     require_rigid,
 )
@@ -42,7 +40,6 @@ __all__ = [
     "DRIVING_SOURCE_POSITION",
     "DRIVING_SOURCE_TARGET",
     "LOOK_AT",
-    "RIGID_TOLERANCE",
     "CameraMount",
     "DeltaFit",
     "Interpolation",
@@ -60,7 +57,6 @@ __all__ = [
     "motion_bucket",
     "nearest_delta",
     "path_progress",
-    "pose_from_axes",
     "pose_trajectory",
     "relative_pose",
     "require_rigid",

@@ -8,8 +8,6 @@ from torch import Tensor
 
 from gcd_model.errors import OptionError, ShapeError
 
-_SKEW_TOLERANCE = 1e-6
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Intrinsics:
@@ -46,22 +44,6 @@ class Intrinsics:
             raise OptionError(f"a horizontal field of view must lie between 0 and 180 degrees, got {hfov_deg:g}")
         focal = width / 2 / math.tan(math.radians(hfov_deg) / 2)
         return cls(fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
-
-    @classmethod
-    def from_matrix(cls, matrix: Tensor, width: int, height: int) -> "Intrinsics":
-        """A camera from its matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, any dtype.
-
-        Raises:
-            ShapeError: not [3, 3]. OptionError: skewed, or the last row is not (0, 0, 1).
-        """
-        if matrix.shape != (3, 3):
-            raise ShapeError(f"a camera matrix must be [3, 3], got {list(matrix.shape)}")
-        (fx, skew, cx), (turn, fy, cy), last = matrix.to("cpu", torch.float64).tolist()
-        if max(abs(skew), abs(turn)) > _SKEW_TOLERANCE * abs(fx) or last != [0.0, 0.0, 1.0]:
-            raise OptionError(
-                "a camera matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: undistort to such a one first"
-            )
-        return cls(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     @property
     def matrix(self) -> Tensor:

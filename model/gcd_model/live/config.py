@@ -5,9 +5,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gcd_model.config import CameraControl, SamplingConfig, SemanticClass, require_ontology
+from gcd_model.config import DRIVING_CLASSES, CameraControl, SamplingConfig, SemanticClass, require_ontology
 from gcd_model.errors import OptionError
-from gcd_model.live.ontology import LIVE_CLASSES
 
 Widths = Annotated[tuple[Annotated[int, Meta(ge=8, le=4096, multiple_of=8)], ...], Meta(min_length=2, max_length=4)]
 """Channels of the levels, each of half the size of the one before."""
@@ -20,6 +19,15 @@ _Sigma = Annotated[float, Meta(ge=1e-4, le=1e4)]
 _MOST_PIXELS = 2**22
 _Channels = Annotated[int, Meta(ge=8, le=4096)]
 _HalfWidth = Annotated[int, Meta(ge=0, le=4096, multiple_of=8)]
+
+LIVE_CLASSES = (
+    *DRIVING_CLASSES,
+    SemanticClass(name="background", colour=(176, 168, 158)),
+    SemanticClass(name="table", colour=(196, 142, 92)),
+    SemanticClass(name="robot", colour=(70, 70, 78)),
+    SemanticClass(name="object", colour=(238, 92, 120)),
+)
+"""Ids of class maps: the driving world's thirteen, then what stands around a stage or a table."""
 
 
 class DepthConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

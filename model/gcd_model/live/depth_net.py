@@ -16,8 +16,6 @@ from torch import Tensor, nn
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.blocks import FineHead, Trunk
 from gcd_model.live.config import SKY_M, DepthConfig
-from gcd_model.live.familiarity import summary_of
-from gcd_model.live.sweep import SWEEP_SCALE, sweep_channels
 
 INPUTS = 7
 _FARTHEST_GROUND_M = 200.0
@@ -30,6 +28,12 @@ _TRUST, _TRUST_AT_FIRST, _DOUBT_PX = 4.0, -2.0, 5
 _OFFSET_REACH = 1.5
 _SMOOTH_PX, _SMOOTH_SPREAD, _SMOOTH_ROUNDS = 2, 0.1, 2
 """Depth is averaged over so many pixels to each side, where it differs by about this share at most, so many times."""
+SWEEP_SCALE = 2
+"""Costs are worked out at half the size."""
+_CONTRAST, _UNSEEN = 4.0, 1.0
+_BEHIND_M = 0.02
+_LEAST_SHARE = 1e-3
+"""Of the mean variance of standardised features: less counts as this, or noise would decide."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,14 +62,13 @@ class DepthOutput:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DepthReading:
-    """What is read off it. metres: [N, H, W], SKY_M for the sky. confidence: [N, H, W], probability of the peak.
+    """What is read off it. metres: [N, H, W], SKY_M for the sky.
 
     spread: [N, H, W], standard deviation of log-depth within the peak; errors are one to three times as large.
     entropy: [N], mean over pixels of the classes' entropy, in parts of its largest.
     """
 
     metres: Tensor
-    confidence: Tensor
     spread: Tensor
     entropy: Tensor
 
@@ -206,7 +209,6 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     metres = torch.where(sky, SKY_M, place.exp())
     return DepthReading(
         metres=torch.where(sky, SKY_M, _smoothed(metres, confidence)),
-        confidence=confidence,
         spread=spread,
         entropy=_entropy(output.classes),
     )
@@ -234,3 +236,100 @@ def _entropy(logits: Tensor) -> Tensor:
     """Mean over pixels of the entropy of choices [N, C, H, W], in parts of log C: [N]."""
     log = logits.log_softmax(dim=1)
     return -(log.exp() * log).sum(dim=1).mean(dim=(1, 2)) / math.log(logits.shape[1])
+
+
+# --- what the camera's own motion tells of depth: how well each depth explains an earlier frame ----------------------
+
+# For every pixel and every bin of depth the earlier picture is looked up where that point would have been; at the right
+# depth the colours agree. What moves by itself agrees nowhere, and so does what the earlier frame did not see.
+# Source: the cost volume of Watson et al. 2021 (ManyDepth), with colours instead of features.
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Reference:
+    """An earlier frame of the same camera.
+
+    picture: [3, H, W] in [-1, 1]. reference_from_camera: float64 [4, 4], metres.
+    """
+
+    picture: Tensor
+    reference_from_camera: Tensor
+
+
+def sweep_channels(config: DepthConfig) -> int:
+    """A cost for every bin, the sky's among them, and whether there is a reference at all."""
+    return config.bins + 1
+
+
+def sweep_costs(picture: Tensor, lens: Intrinsics, reference: Reference | None, config: DepthConfig) -> Tensor:
+    """Differences of colour by depth: [bins + 1, H/2, W/2]; all zero without a reference.
+
+    picture: [3, H, W] in [-1, 1].
+    """
+    height, width = lens.height // SWEEP_SCALE, lens.width // SWEEP_SCALE
+    if reference is None:
+        return picture.new_zeros(sweep_channels(config), height, width)
+    here, there = (F.avg_pool2d(each, SWEEP_SCALE) for each in (picture, reference.picture.to(picture)))
+    move = reference.reference_from_camera.to(picture.device)
+    turn, step = move[:3, :3].float(), move[:3, 3].float()
+    x = ((torch.arange(width, device=picture.device) + 0.5) * SWEEP_SCALE - lens.cx) / lens.fx
+    y = ((torch.arange(height, device=picture.device) + 0.5) * SWEEP_SCALE - lens.cy) / lens.fy
+    u, v = torch.meshgrid(x.float(), y.float(), indexing="xy")
+    turned = turn @ torch.stack([u, v, torch.ones_like(u)]).flatten(1)  # [3, h*w], of points 1 m ahead
+    points = turned + step[:, None] * _inverse_depths(config).to(picture.device)[:, None, None]  # [bins, 3, h*w]
+    ahead = points[:, 2] > _BEHIND_M
+    z = points[:, 2].clamp(min=_BEHIND_M)
+    place = torch.stack(
+        [
+            (points[:, 0] / z * lens.fx + lens.cx) * (2 / lens.width) - 1,
+            (points[:, 1] / z * lens.fy + lens.cy) * (2 / lens.height) - 1,
+        ],
+        dim=-1,
+    )  # [bins, h*w, 2]
+    inside = ahead & (place.abs() <= 1).all(dim=-1)
+    looked_up = F.grid_sample(there[None], place[None], mode="bilinear", padding_mode="border", align_corners=False)
+    difference = (looked_up[0] - here.flatten(1)[:, None]).abs().mean(dim=0) * _CONTRAST  # [bins, h*w]
+    costs = torch.where(inside, difference, _UNSEEN)
+    return torch.cat([costs, torch.ones_like(costs[:1])]).view(-1, height, width)
+
+
+def _inverse_depths(config: DepthConfig) -> Tensor:
+    """Of the bins' centres, 1 / m; 0 for the sky: [bins]."""
+    steps = (torch.arange(config.bins - 1) + 0.5) / (config.bins - 1)
+    return torch.cat([(config.nearest_m / config.farthest_m) ** steps / config.nearest_m, torch.zeros(1)])
+
+
+# --- how unlike its training a picture looks: classes it is unsure of, features it never had -------------------------
+
+
+def summary_of(features: Tensor) -> Tensor:
+    """Means and standard deviations over the picture: [N, C, h, w] -> float32 [N, 2 C]."""
+    flat = features.float().flatten(2)
+    return torch.cat([flat.mean(dim=2), flat.std(dim=2, correction=0)], dim=1)
+
+
+class Familiarity(nn.Module):
+    """A Gaussian of the training's summaries. Mahalanobis distance of features: Lee et al. 2018."""
+
+    mean: Tensor
+    whiten: Tensor
+
+    def __init__(self, channels: int) -> None:
+        """channels: C of `summary_of`. Until `fit`, mean 0 and variance 1."""
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(2 * channels))
+        self.register_buffer("whiten", torch.eye(2 * channels))
+
+    def fit(self, summaries: Tensor) -> None:
+        """summaries: [N, 2 C] of pictures of the training."""
+        wide = summaries.double()
+        spread = wide.std(dim=0).clamp(min=1e-6)
+        values, vectors = torch.linalg.eigh(torch.cov(((wide - wide.mean(dim=0)) / spread).T))
+        scale = values.clamp(min=_LEAST_SHARE).rsqrt()
+        self.mean.copy_(wide.mean(dim=0))
+        self.whiten.copy_(vectors * scale / spread[:, None])
+
+    def score(self, summaries: Tensor, entropy: Tensor) -> Tensor:
+        """0 to 1, low where the training was. summaries: [N, 2 C]. entropy: [N], of the classes, 0 to 1; -> [N]."""
+        distance = ((summaries - self.mean.float()) @ self.whiten.float()).square().mean(dim=1)
+        return 1 - torch.exp(-entropy * distance)

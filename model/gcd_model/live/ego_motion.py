@@ -59,14 +59,12 @@ class Motion:
     """Where the camera of a frame is.
 
     world_from_camera: float64 [4, 4]; the world is the camera of the first frame, or of the last one that was lost.
-    inliers: tracks that agree; 0 with odometry. lost: the motion since the last frame is unknown, for this reason:
-        the world begins anew here, and what was placed in the old one must be forgotten.
+    lost: why the motion since the last frame is unknown: the world begins anew here, and what was placed in the old one
+        must be forgotten. None where it is known.
     """
 
     world_from_camera: Tensor
-    inliers: int = 0
-    lost: bool = False
-    reason: str | None = None
+    lost: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -139,11 +137,11 @@ class EgoMotion:
                 raise _LostError(refused)
             if last is None:
                 return Motion(world_from_camera=torch.eye(4, dtype=torch.float64))
-            inliers = self._advance(last, self._new)
+            self._advance(last, self._new)
         except _LostError as error:
             self._begin_world()
-            return Motion(world_from_camera=torch.eye(4, dtype=torch.float64), lost=True, reason=str(error))
-        return Motion(world_from_camera=torch.from_numpy(self._pose.copy()), inliers=inliers)
+            return Motion(world_from_camera=torch.eye(4, dtype=torch.float64), lost=str(error))
+        return Motion(world_from_camera=torch.from_numpy(self._pose.copy()))
 
     def settle(self, depth: Tensor, static: Tensor, spread: Tensor | None = None) -> None:
         """What the frame shows that was just followed: the next one's motion hangs on it.
@@ -160,8 +158,8 @@ class EgoMotion:
             here = self._pose
             self._tracks = _placed_better(self._tracks, frame, here).rows(frame.usable[row, column] > 0)
 
-    def _advance(self, last: _Frame, frame: _Frame) -> int:
-        """Number of inliers. Raises _LostError."""
+    def _advance(self, last: _Frame, frame: _Frame) -> None:
+        """The pose, the last step and the tracks of this frame. Raises _LostError."""
         if last.odometry is not None and frame.odometry is not None:
             step = inverse(last.odometry.numpy()) @ frame.odometry.numpy()
             _require_plausible(step, "the odometry")
@@ -171,7 +169,6 @@ class EgoMotion:
             step = inverse(self._pose) @ pose
             _require_plausible(step, "the picture")
         self._pose, self._step, self._tracks = pose, step, tracks
-        return len(tracks)
 
 
 def _frame(picture: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame:

@@ -3,18 +3,23 @@
 frame + an earlier one -> depth network, ego-motion -> SeenFrame
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gcd_model.errors import ShapeError
-from gcd_model.geometry import Intrinsics
+from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.config import SIZE_FACTOR, SKY_M
-from gcd_model.live.depth_net import depth_inputs, pixel_rays, plane_depth, read_depth
+from gcd_model.live.depth_net import Reference, depth_inputs, pixel_rays, plane_depth, read_depth, sweep_costs
 from gcd_model.live.ego_motion import EgoMotion
-from gcd_model.live.networks import LiveNetworks
-from gcd_model.live.sweep import Reference, References, sweep_costs
+from gcd_model.networks import LiveNetworks
+
+_FRAMES = 6
+"""So many earlier frames are kept."""
+LONGEST = 0.3
+"""Of the median depth: how far away an earlier camera may have been."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,6 +63,32 @@ class SeenFrame:
     world_from_source: Tensor
     begins: bool
     lost: str | None
+
+
+class References:
+    """The last frames of a camera, of which one is chosen to compare the next one with."""
+
+    def __init__(self) -> None:
+        self._frames: deque[tuple[Tensor, Tensor]] = deque(maxlen=_FRAMES)
+        self._median_m = 0.0
+
+    def reset(self) -> None:
+        """Forget them."""
+        self._frames.clear()
+
+    def add(self, picture: Tensor, world_from_camera: Tensor, metres: Tensor) -> None:
+        """picture: [3, H, W]. metres: [H, W]; 0 for holes."""
+        self._frames.append((picture, world_from_camera))
+        near = metres[(metres > 0) & (metres < SKY_M)]
+        self._median_m = float(near.median()) if near.numel() else 0.0
+
+    def chosen(self, world_from_camera: Tensor) -> Reference | None:
+        """The oldest one from which the scene does not look too different, or None."""
+        for picture, pose in self._frames:
+            move = invert_rigid(pose) @ world_from_camera
+            if float(move[:3, 3].norm()) <= LONGEST * self._median_m:
+                return Reference(picture=picture, reference_from_camera=move)
+        return None
 
 
 class Eyes:
@@ -131,14 +162,14 @@ class Eyes:
             self.reset()
             self._lens = lens
         motion = self._ego.follow(picture, lens, odometry)
-        if motion.lost:
+        if motion.lost is not None:
             self._references.reset()
         pose = motion.world_from_camera
         if geometry is None:
             geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
         self._ego.settle(geometry.metres, geometry.static, geometry.spread)
         self._references.add(picture, pose, geometry.metres)
-        begins, self._begins = self._begins or motion.lost, False
+        begins, self._begins = self._begins or motion.lost is not None, False
         return SeenFrame(
             picture=picture,
             geometry=geometry,
@@ -146,7 +177,7 @@ class Eyes:
             floor=floor,
             world_from_source=pose,
             begins=begins,
-            lost=motion.reason,
+            lost=motion.lost,
         )
 
     def _checked(self, frame: Tensor, lens: Intrinsics) -> Tensor:

@@ -1,5 +1,6 @@
 """Views of what was seen and placed: painted where nothing was seen, and every pixel says which."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -7,13 +8,24 @@ from torch import Tensor
 
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics, invert_rigid
-from gcd_model.live.config import SKY_M
+from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays, plane_depth
-from gcd_model.live.eyes import Floor, likeliest
-from gcd_model.live.networks import COVERED, PAINTED, SEEN_BEFORE, SEEN_NOW, LiveNetworks, movable_classes
+from gcd_model.live.eyes import Eyes, Floor, FrameGeometry, likeliest
+from gcd_model.live.memory import PlacedFrame, seen_world
 from gcd_model.live.paint_net import Painted, Seen, camera_features, filled, seen_of
-from gcd_model.live.seen_world import PlacedFrame
 from gcd_model.live.splat import Splat, Surfels, splat, unproject
+from gcd_model.networks import LiveNetworks
+
+PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2
+"""Visibility of a pixel."""
+COVERED = 0.5
+"""A pixel that points cover by less than this share counts as painted, whatever the network says."""
+_MOVABLE = ("car", "truck", "cyclist", "person", "own_car", "robot", "object")
+
+
+def movable_classes(config: LiveConfig) -> Tensor:
+    """Classes of which nothing that was painted is carried to the next frame: nobody knows where it goes. bool [K]."""
+    return torch.tensor([entry.name in _MOVABLE for entry in config.classes])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -135,3 +147,59 @@ def _floor_of(floor: Floor, target_from_source: Tensor, lens: Intrinsics) -> Ten
     up = turn @ floor.up
     height = floor.height_m - float(up @ move)
     return plane_depth(lens, up, height) if height > 0 else torch.zeros(lens.height, lens.width)
+
+
+# --- the three steps at once, frame by frame -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LiveFrame:
+    """What became of a source frame. world_from_source: [4, 4], the world begins as a frame's camera.
+
+    lost: why the memory was dropped before this frame, or None.
+    """
+
+    views: tuple[ViewFrame, ...]
+    geometry: FrameGeometry
+    world_from_source: Tensor
+    lost: str | None
+
+
+class LiveView:
+    """Views of one camera's video, one frame at a time; a window is its frames one by one.
+
+    Not thread-safe. The state is what was seen and what was painted; `reset` drops both, and so does another lens.
+    """
+
+    def __init__(self, networks: LiveNetworks, *, steps: int | None = None, seed: int = 0) -> None:
+        """steps, seed: see `Painter`."""
+        self.eyes = Eyes(networks)
+        self._world = seen_world(networks.config, next(networks.parameters()).device)
+        self._painter = Painter(networks, steps=steps, seed=seed)
+
+    def reset(self) -> None:
+        """Forget all that was seen and painted."""
+        self.eyes.reset()
+
+    def step(
+        self,
+        frame: Tensor,
+        poses: Sequence[Tensor],
+        *,
+        lens: Intrinsics,
+        depth: Tensor | None = None,
+        odometry: Tensor | None = None,
+        floor: Floor | None = None,
+        geometry: FrameGeometry | None = None,
+        target_lens: Intrinsics | None = None,
+    ) -> LiveFrame:
+        """One frame of every view.
+
+        Args:
+            frame, lens, depth, odometry, floor, geometry: see `Eyes.see`. poses, target_lens: see `SeenWorld.place`.
+        Raises:
+            ShapeError, PoseError: see there.
+        """
+        seen = self.eyes.see(frame, lens=lens, depth=depth, odometry=odometry, floor=floor, geometry=geometry)
+        views = self._painter.paint(self._world.place(seen, poses, target_lens))
+        return LiveFrame(views=views, geometry=seen.geometry, world_from_source=seen.world_from_source, lost=seen.lost)

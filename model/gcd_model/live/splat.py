@@ -101,7 +101,6 @@ class Splat:
     inverse_depth: [H, W], 1 / m.
     votes: [K, H, W], shares of the classes; they sum to 1 wherever coverage is above 0.
     age: [H, W], frames since it was seen. now_share: [H, W], share that this frame saw, in 0..1.
-    painted_share: [H, W], share that was painted rather than seen.
     """
 
     colour: Tensor
@@ -110,7 +109,6 @@ class Splat:
     votes: Tensor
     age: Tensor
     now_share: Tensor
-    painted_share: Tensor
 
 
 @torch.no_grad()
@@ -216,38 +214,37 @@ def splat(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics, classes
     pixel, owner, weight, z = _in_front(_fragments(footprints, size[1]), pixels)
     label, standing, facts = _shown(surfels, number, now)
     share = weight * standing.index_select(0, owner)
-    sums = weight.new_zeros(8, pixels)
+    sums = weight.new_zeros(7, pixels)
     for total, fact in zip(sums, facts, strict=False):
         total.scatter_add_(0, pixel, fact.index_select(0, owner).mul_(share))
-    sums[6].scatter_add_(0, pixel, share / z)
-    sums[7].scatter_add_(0, pixel, share)
+    sums[5].scatter_add_(0, pixel, share / z)
+    sums[6].scatter_add_(0, pixel, share)
     covered = weight.new_zeros(pixels).scatter_add_(0, pixel, weight).clamp_(max=1.0)
     votes = weight.new_zeros(classes * pixels).scatter_add_(0, label.index_select(0, owner) * pixels + pixel, share)
     inside = (slice(_MARGIN, -_MARGIN), slice(_MARGIN, -_MARGIN))
-    sums = sums.view(8, *size)[:, *inside]  # [8, H, W]
-    scale = torch.where(sums[7] > 0, 1 / sums[7], 0.0)
+    sums = sums.view(7, *size)[:, *inside]  # [7, H, W]
+    scale = torch.where(sums[6] > 0, 1 / sums[6], 0.0)
     mean = sums * scale
     return Splat(
         colour=mean[:3],
         coverage=covered.view(size)[inside].contiguous(),
-        inverse_depth=mean[6],
+        inverse_depth=mean[5],
         votes=votes.view(classes, *size)[:, *inside] * scale,
         age=mean[3],
         now_share=mean[4],
-        painted_share=mean[5],
     )
 
 
 def _shown(surfels: Surfels, number: Tensor, now: float) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """What surfels by number tell a pixel: label (int64), how much it counts, and six facts, [M] each.
+    """What surfels by number tell a pixel: label (int64), how much it counts, and five facts, [M] each.
 
-    The facts: red, green, blue, age, whether seen now, whether painted.
+    The facts: red, green, blue, age, whether seen now.
     """
     stamp, painted = surfels.stamp.index_select(0, number), surfels.painted.index_select(0, number)
     fresh = (stamp == now) & ~painted
     standing = torch.where(painted, _PAINTED_WEIGHT, torch.where(fresh, 1.0, _OLD_WEIGHT))
     colour = surfels.colour.index_select(0, number).T.contiguous()
-    facts = (*colour, now - stamp, fresh.float(), painted.float())
+    facts = (*colour, now - stamp, fresh.float())
     return surfels.label.index_select(0, number).long(), standing, facts
 
 

@@ -13,15 +13,15 @@ from gcd_model.conditioning import SourceFeatures, SourceGeometry
 from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.live.eyes import Eyes, Floor, SeenFrame
-from gcd_model.live.networks import COVERED, PAINTED, SEEN_NOW, LiveNetworks
-from gcd_model.live.painter import Painter, ViewFrame
-from gcd_model.live.seen_world import PlacedFrame, seen_world
+from gcd_model.live.memory import PlacedFrame, seen_world
+from gcd_model.live.painter import COVERED, PAINTED, SEEN_NOW, Painter, ViewFrame
 from gcd_model.live.splat import splat, unproject
+from gcd_model.networks import LiveNetworks
 from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
-from gcd_model.weights.card import Card, Entry
+from gcd_model.weights.card import Card
 from gcd_model.weights.families import LIVE
-from gcd_model.weights.save import own_content, write_safetensors
+from gcd_model.weights.save import write_safetensors
 
 _SEED_STEP, _SEEDS = 0x9E3779B97F4A7C15, 1 << 63  # neighbouring seeds of samples would meet those of other windows
 
@@ -253,6 +253,6 @@ def save_live(
     Raises: OptionError if `path` exists and `overwrite` is not set; CheckpointError if it cannot be written.
     """
     state: dict[str, Tensor] = networks.state_dict()
-    entries = {each: Entry(tuple(tensor.shape), torch.float16) for each, tensor in state.items()}
     card = Card(name=name, config=networks.config, family=LIVE.name, move_time=0, trained=trained)
-    write_safetensors(Path(path), own_content(entries, state.__getitem__, card), overwrite=overwrite)
+    halves = dict.fromkeys(state, torch.float16)
+    write_safetensors(Path(path), state, card.to_metadata(), dtypes=halves, overwrite=overwrite)

@@ -17,10 +17,9 @@ from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, FileError
 from gcd_model.networks import Networks, empty_networks, weights_digest
 from gcd_model.small_files import decode_json
-from gcd_model.weights.card import Card
-
-ADAPTER_KEY = "gcd.adapter"
-"""Metadata that only adapter files have."""
+from gcd_model.weights.card import ADAPTER_KEY, Card
+from gcd_model.weights.infer import NO_LEVELS, match_weights, shapes_of
+from gcd_model.weights.names import own_source
 
 DOWN, UP = ".down", ".up"
 """Endings of an adapted layer's two factors, after the layer's own name."""
@@ -74,10 +73,8 @@ def base_digest(weights: Mapping[str, Tensor]) -> str:
 
     The camera embedder does not: an adapter may bring its own.
     """
-    counted = {
-        name: tensor.float() for name, tensor in weights.items() if name.startswith("unet.") and not _is_camera(name)
-    }
-    return weights_digest(counted)
+    counted = {name: each for name, each in weights.items() if name.startswith("unet.") and not name.startswith(CAMERA)}
+    return weights_digest({name: tensor.float() for name, tensor in counted.items()})
 
 
 def adapted(networks: Networks, adapter: Adapter) -> Networks:
@@ -105,40 +102,29 @@ def adapted(networks: Networks, adapter: Adapter) -> Networks:
 
 def merged(weights: Mapping[str, Tensor], adapter: Adapter) -> dict[str, Tensor]:
     """Plain weights: the factors added in float32, whole weights put in place. Raises CheckpointError as `adapted`."""
-    state, scale = dict(weights), adapter.alpha / adapter.rank
-    layers = {name.removesuffix(UP) for name in adapter.tensors if name.endswith(UP)}
-    for layer in layers:
-        weight, up, down = (_found(source, f"{layer}{end}") for source, end in _parts(state, adapter.tensors))
+    state, tensors = dict(weights), adapter.tensors
+    known = shapes_of(empty_networks(adapter.card.diffusion).state_dict())
+    for name, tensor in tensors.items():
+        if name.endswith((UP, DOWN)):
+            continue
+        if known.get(name) != tensor.shape:
+            raise CheckpointError(f"the adapter holds {name} {list(tensor.shape)}, which the model does not have")
+        state[name] = tensor
+    for layer in {name.removesuffix(UP) for name in tensors if name.endswith(UP)}:
+        if f"{layer}.weight" not in weights or layer + DOWN not in tensors:
+            raise CheckpointError(f"{layer} is not whole: the adapter does not belong to this model, or is damaged")
+        weight, up, down = weights[f"{layer}.weight"], tensors[layer + UP], tensors[layer + DOWN]
         if weight.shape != (up.shape[0], down.shape[1]) or up.shape[1] != down.shape[0]:
             raise CheckpointError(
                 f"{layer} is {list(weight.shape)}, its factors are {list(up.shape)} and {list(down.shape)}"
             )
-        state[f"{layer}.weight"] = added(weight, up, down, scale)
-    whole = {name: tensor for name, tensor in adapter.tensors.items() if not name.endswith((UP, DOWN))}
-    known = empty_networks(adapter.card.diffusion).state_dict()
-    for name, tensor in whole.items():
-        if name not in known or known[name].shape != tensor.shape:
-            raise CheckpointError(f"the adapter holds {name} {list(tensor.shape)}, which the model does not have")
-    return state | whole
+        state[f"{layer}.weight"] = added(weight, up, down, adapter.alpha / adapter.rank)
+    return state
 
 
 def added(weight: Tensor, up: Tensor, down: Tensor, scale: float) -> Tensor:
     """weight + scale * up @ down, computed in float32, in the weight's precision."""
     return torch.addmm(weight.float(), up.float(), down.float(), alpha=scale).to(weight.dtype)
-
-
-def _parts(state: Mapping[str, Tensor], factors: Mapping[str, Tensor]) -> tuple[tuple[Mapping[str, Tensor], str], ...]:
-    return (state, ".weight"), (factors, UP), (factors, DOWN)
-
-
-def _found(source: Mapping[str, Tensor], name: str) -> Tensor:
-    if name not in source:
-        raise CheckpointError(f"{name} is missing: the adapter does not belong to this model, or is damaged")
-    return source[name]
-
-
-def _is_camera(name: str) -> bool:
-    return name.startswith(CAMERA)
 
 
 # --- weights of one model as the start of another --------------------------------------------------------------------
@@ -178,25 +164,12 @@ def carried_over(networks: Networks, config: ModelConfig, *, anew: tuple[str, ..
     wanted = empty_networks(config).state_dict()
     fresh = tuple(name for name in wanted if name.startswith(anew))
     weights = {name: tensor for name, tensor in given.items() if not name.startswith(anew)}
-    _require_fit(weights, {name: tensor for name, tensor in wanted.items() if not name.startswith(anew)})
+    expected = {name: shape for name, shape in shapes_of(wanted).items() if name not in fresh}
+    try:
+        match_weights(expected, shapes_of(weights), own_source, NO_LEVELS)
+    except CheckpointError as error:
+        raise CheckpointError(f"holds another model than is wanted: {error}") from error
     return CarriedOver(weights, fresh)
-
-
-def _require_fit(given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
-    missing = [name for name in wanted if name not in given]
-    unknown = [name for name in given if name not in wanted]
-    misshapen = [
-        f"{name} wants {list(wanted[name].shape)}, got {list(tensor.shape)}"
-        for name, tensor in given.items()
-        if name in wanted and tensor.shape != wanted[name].shape
-    ]
-    faults = [
-        f"{len(names)} weights are {what}, first: {names[0]}"
-        for what, names in (("missing", missing), ("superfluous", unknown), ("misshapen", misshapen))
-        if names
-    ]
-    if faults:
-        raise CheckpointError(f"holds another model than is wanted: {'; '.join(faults)}")
 
 
 def unshared(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,6 +1,5 @@
-"""Our weight files: safetensors with the config in the metadata. Pure: text and bytes in, text and bytes out."""
+"""What our weight files say about themselves, and what can be said about any checkpoint without loading it."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,9 +14,10 @@ from gcd_model.live.config import LiveConfig
 from gcd_model.small_files import decode_json
 
 FORMAT = "1"
-CONFIG_KEY = "gcd.config"
-LINE = 64
-"""Bytes of a cache line, and of what torch aligns memory to."""
+CONFIG_KEY, ADAPTER_KEY = "gcd.config", "gcd.adapter"
+"""Metadata that our weight files have, and those of adapters alone."""
+NOTES = "gcd_node"
+"""Where in the hyper-parameters of a `.ckpt` our card stands."""
 NO_DIFFUSION = "is the live model, which has no U-Net and no VAE: this is for diffusion models"
 _SCALE_KEY = "gcd.uncertainty_scale"
 
@@ -30,8 +30,6 @@ PRECISIONS: dict[str, torch.dtype] = {
 
 FULL_PRECISION = ("decoder",)
 """Networks that compute in float32 whatever --dtype says: what they make is looked at."""
-
-_DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16"}
 
 
 def precision(name: str) -> torch.dtype:
@@ -115,45 +113,6 @@ def _config(text: str) -> ModelConfig | LiveConfig:
     return decode_json(text, LiveConfig if decode_json(text, _Kind).kind == "live" else ModelConfig)
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One tensor to be written."""
-
-    shape: tuple[int, ...]
-    dtype: torch.dtype
-
-    @property
-    def size(self) -> int:
-        """Bytes."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-
-def file_order(entries: Mapping[str, Entry]) -> list[str]:
-    """Names as their tensors follow each other: whole cache lines first, then widest type first, then by name.
-
-    So each lies where its type may, and all but the small ones of odd sizes begin with a cache line when the file is
-    mapped, as memory that torch allocates does: some processors' kernels round otherwise elsewhere.
-    """
-    return sorted(entries, key=lambda name: (entries[name].size % LINE != 0, -entries[name].dtype.itemsize, name))
-
-
-def header(entries: Mapping[str, Entry], metadata: Mapping[str, str]) -> bytes:
-    """The head of a safetensors file whose tensors follow in `file_order`.
-
-    Eight bytes of length, then JSON padded with spaces to the end of a cache line. Source: the safetensors format.
-    """
-    content: dict[str, object] = {"__metadata__": dict(metadata)}
-    start = 0
-    for name in file_order(entries):
-        entry = entries[name]
-        offsets = [start, start + entry.size]
-        content[name] = {"dtype": _DTYPES[entry.dtype], "shape": list(entry.shape), "data_offsets": offsets}
-        start = offsets[1]
-    text = json.dumps(content, separators=(",", ":")).encode()
-    text += b" " * (-(8 + len(text)) % LINE)
-    return len(text).to_bytes(8, "little") + text
-
-
 # --- what can be said about a checkpoint without loading it ----------------------------------------------------------
 
 
@@ -182,30 +141,23 @@ class Leftover:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class WeightsReport:
-    """What `gcd-node weights inspect` shows.
+class WeightsReport(Card):
+    """What `gcd-node weights inspect` shows: what the checkpoint says of itself, or what was worked out, and the rest.
 
-    uncertainty_scale: see `Traits`.
-    family: None if unknown; told_by: "option", "metadata", "file name" or "yaml".
+    told_by: who named the family: "option", "metadata", "file name" or "yaml".
     optimizer_size: bytes of optimizer state, which is never read; 0 without. other_entries: further top-level names.
     size: bytes on disk, all files together. digest: see `digest`.
     """
 
     path: str
-    name: str
     layout: Layout
-    config: ModelConfig | LiveConfig
-    family: str | None
     told_by: str | None
-    move_time: int
-    trained: bool
     networks: tuple[NetworkReport, ...]
     leftovers: tuple[Leftover, ...]
     optimizer_size: int
     other_entries: tuple[str, ...]
     size: int
     digest: str
-    uncertainty_scale: float | None = None
 
     @property
     def sha256_12(self) -> str:

@@ -222,12 +222,11 @@ def _family_of_views(text: str) -> FamilyName | None:
 
 def combined(*told: Provenance) -> Provenance:
     """Each fact from the first that knows it; who names the family first is named."""
-    return Provenance(
-        family=next((p.family for p in told if p.family is not None), None),
-        move_time=next((p.move_time for p in told if p.move_time is not None), None),
-        frames=next((p.frames for p in told if p.frames is not None), None),
-        told_by=next((p.told_by for p in told if p.family is not None), None),
-    )
+    nothing = Provenance()
+    named = next((each for each in told if each.family is not None), nothing)
+    move_time = next((each.move_time for each in told if each.move_time is not None), None)
+    frames = next((each.frames for each in told if each.frames is not None), None)
+    return Provenance(family=named.family, move_time=move_time, frames=frames, told_by=named.told_by)
 
 
 def checked_family(told: Provenance, config: ModelConfig | LiveConfig) -> Family | None:

@@ -1,24 +1,18 @@
-"""From the names and shapes of published weights to a config. Pure: tensors are never looked into."""
+"""From the names and shapes of published weights to a config, and each of our parameters to its place among them.
+
+Pure: tensors are never looked into.
+"""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from gcd_model.config import CAMERA_FEATURES, CameraControl, ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.weights.names import (
-    GCD_CONDITION_VAE,
-    GCD_IMAGE,
-    GCD_UNET,
-    GCD_VAE,
-    IMAGE,
-    Form,
-    Levels,
-    Source,
-    assembled,
-)
+from gcd_model.weights.names import GCD_CONDITION_VAE, GCD_IMAGE, GCD_UNET, GCD_VAE, IMAGE, Levels, Source, assembled
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Published names and their shapes."""
@@ -26,10 +20,15 @@ Shapes = Mapping[str, tuple[int, ...]]
 Naming = Callable[[str, Levels], Source | None]
 """Where a layout keeps a parameter of ours: `gcd_source` or `diffusers_source`."""
 
-PUBLISHED_GROUPS = 32
-PUBLISHED_HEAD_WIDTH = 64
-PUBLISHED_IMAGE_HEADS = 16
-PUBLISHED_FRAMES = 14
+NO_LEVELS = Levels(attention=(), unet_blocks=0, vae_levels=0, vae_blocks=0, image_layers=0)
+"""For names that no block numbers stand in."""
+
+PUBLISHED_GROUPS, PUBLISHED_HEAD_WIDTH, PUBLISHED_IMAGE_HEADS, PUBLISHED_FRAMES = 32, 64, 16, 14
+
+
+def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
+    """Names and shapes."""
+    return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,20 +46,18 @@ class Hints:
     latent_scale: float | None = None
 
     def __post_init__(self) -> None:
-        for name, value in (("head_width", self.head_width), ("image_heads", self.image_heads)):
-            if value is not None and value < 1:
-                raise OptionError(f"{name} must be at least 1, got {value}")
-        if self.frames is not None and self.frames < 2:
-            raise OptionError(f"frames must be at least 2, got {self.frames}")
+        for name, least in (("head_width", 1), ("image_heads", 1), ("frames", 2)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise OptionError(f"{name} must be at least {least}, got {value}")
 
 
 def gcd_levels(names: Iterable[str]) -> Levels:
     """The counts behind Stability's block numbers. Attention is not known yet: see `infer_config`."""
     names = list(names)
-    inputs = _numbers(names, rf"{re.escape(GCD_UNET)}\.input_blocks\.(\d+)\.")
-    downs = sorted(_numbers(names, rf"{re.escape(GCD_UNET)}\.input_blocks\.(\d+)\.0\.op\."))
-    blocks = (downs[0] if downs else len(inputs)) - 1
-    vae = rf"{re.escape(GCD_VAE)}\.encoder\.down\."
+    inputs, vae = rf"{re.escape(GCD_UNET)}\.input_blocks\.", rf"{re.escape(GCD_VAE)}\.encoder\.down\."
+    downs = sorted(_numbers(names, inputs + r"(\d+)\.0\.op\."))
+    blocks = (downs[0] if downs else len(_numbers(names, inputs + r"(\d+)\."))) - 1
     return Levels(
         attention=(False,) * (len(downs) + 1),
         unet_blocks=max(blocks, 1),
@@ -84,8 +81,7 @@ def diffusers_levels(names: Iterable[str]) -> Levels:
 
 def _numbers(names: Iterable[str], pattern: str) -> set[int]:
     """Distinct numbers at the pattern's group, so that a made-up huge number counts once."""
-    matches = map(re.compile(pattern).match, names)
-    return {int(match[1]) for match in matches if match is not None}
+    return {int(match[1]) for match in map(re.compile(pattern).match, names) if match is not None}
 
 
 def infer_config(shapes: Shapes, naming: Naming, levels: Levels, hints: Hints) -> ModelConfig:
@@ -118,33 +114,21 @@ class _Probe:
     naming: Naming
     levels: Levels
 
-    def shape(self, parameter: str) -> tuple[int, ...] | None:
-        """Shape our parameter would have; None if it is not there."""
-        source = self.naming(parameter, self.levels)
-        if source is None or any(name not in self.shapes for name in source.names):
+    def optional(self, name: str, axis: int) -> int | None:
+        """One side of our parameter; None where it is absent."""
+        source = self.naming(name, self.levels)
+        if source is None or any(each not in self.shapes for each in source.names):
             return None
-        return tuple(assembled([_hollow(self.shapes[name]) for name in source.names], source.form).shape)
+        shape = assembled([torch.empty(self.shapes[each], device="meta") for each in source.names], source.form).shape
+        return shape[axis] if axis < len(shape) and shape[axis] > 0 else None
 
-    def size(self, module: str, axis: int, *, leaf: str = "weight") -> int:
-        """One side of a module's weight. Output widths can be read off the bias too."""
-        found = self.optional(module, axis, leaf=leaf)
+    def size(self, name: str, axis: int) -> int:
+        """The same, of one that must be there."""
+        found = self.optional(name, axis)
         if found is None:
-            source = self.naming(f"{module}.{leaf}" if leaf else module, self.levels)
-            name = module if source is None else source.names[0]
-            raise CheckpointError(f"1 weight that tells the architecture is missing or misshapen: {name}")
+            source = self.naming(name, self.levels) or Source((name,))
+            raise CheckpointError(f"1 weight that tells the architecture is missing or misshapen: {source.names[0]}")
         return found
-
-    def optional(self, module: str, axis: int, *, leaf: str = "weight") -> int | None:
-        """The same, or None where the module is absent."""
-        shape = self.shape(f"{module}.{leaf}" if leaf else module)
-        if shape is None and axis == 0 and leaf:
-            shape = self.shape(f"{module}.bias")
-        return None if shape is None or len(shape) <= axis or shape[axis] < 1 else shape[axis]
-
-
-def _hollow(shape: tuple[int, ...]) -> torch.Tensor:
-    """A tensor without storage."""
-    return torch.empty(shape, device="meta")
 
 
 def _multipliers(what: str, width: int, widths: tuple[int, ...]) -> tuple[int, ...]:
@@ -158,74 +142,50 @@ def _multipliers(what: str, width: int, widths: tuple[int, ...]) -> tuple[int, .
 
 def _unet(probe: _Probe, hints: Hints) -> UNetConfig:
     places = [f"unet.down.{level}.stages.0" for level in range(len(probe.levels.attention))]
-    width, latent_channels = probe.size("unet.stem", 0), probe.size("unet.conv_out", 0)
-    widths = tuple(probe.size(f"{place}.res.spatial.conv2", 0) for place in places)
-    attention = tuple(probe.optional(f"{place}.attention.proj_in", 0) is not None for place in places)
-    multipliers = _multipliers("the U-Net", width, widths)
+    width, latent_channels = probe.size("unet.stem.weight", 0), probe.size("unet.conv_out.weight", 0)
+    widths = tuple(probe.size(f"{place}.res.spatial.conv2.weight", 0) for place in places)
+    attention = tuple(probe.optional(f"{place}.attention.proj_in.weight", 0) is not None for place in places)
     return UNetConfig(
         latent_channels=latent_channels,
-        condition_channels=probe.size("unet.stem", 1) - latent_channels,
+        condition_channels=probe.size("unet.stem.weight", 1) - latent_channels,
         width=width,
-        multipliers=multipliers,
+        multipliers=_multipliers("the U-Net", width, widths),
         attention=attention,
         blocks_per_level=probe.levels.unet_blocks,
-        embedding_width=probe.size("unet.embed_noise.0", 0),
+        embedding_width=probe.size("unet.embed_noise.0.weight", 0),
         head_width=_head_width(attention, widths, hints),
-        context_width=_context_width(probe),
-        vector_width=probe.size("unet.embed_vector.0", 1),
-        camera_width=_camera_width(probe),
+        context_width=probe.optional("unet.middle.0.attention.spatial.token.value.weight", 1),
+        vector_width=probe.size("unet.embed_vector.0.weight", 1),
+        camera_width=probe.optional("unet.embed_camera.0.weight", 1) or 0,
         norm_groups=PUBLISHED_GROUPS,
     )
 
 
 def _head_width(attends: tuple[bool, ...], widths: tuple[int, ...], hints: Hints) -> int:
     """The given head width, or the published one. The middle, as wide as the deepest level, always attends."""
-    attending = [width for width, there in zip(widths, (*attends[:-1], True), strict=True) if there]
-    head_width = hints.head_width or _width_of_heads(attends, widths, hints.heads) or PUBLISHED_HEAD_WIDTH
-    for width in attending:
-        if width % head_width:
+    there = [level for level, attending in enumerate((*attends[:-1], True)) if attending]
+    head_width = hints.head_width or PUBLISHED_HEAD_WIDTH
+    if hints.head_width is None and hints.heads is not None:
+        heads = (hints.heads,) * len(widths) if isinstance(hints.heads, int) else hints.heads
+        if len(heads) != len(widths) or min(heads) < 1:
+            raise CheckpointError(f"config.json gives heads {heads} for {len(widths)} levels")
+        found = {widths[level] / heads[level] for level in there}
+        if len(found) > 1 or not all(width.is_integer() for width in found):
+            raise CheckpointError(f"heads {heads} over widths {widths} are not all of one width; give --head-width")
+        head_width = int(found.pop())
+    for level in there:
+        if widths[level] % head_width:
             raise CheckpointError(
-                f"an attention level is {width} wide, no multiple of the head width {head_width}, which the weights "
-                "do not tell; give --head-width"
+                f"an attention level is {widths[level]} wide, no multiple of the head width {head_width}, which the "
+                "weights do not tell; give --head-width"
             )
     return head_width
 
 
-def _width_of_heads(
-    attends: tuple[bool, ...], widths: tuple[int, ...], heads: int | tuple[int, ...] | None
-) -> int | None:
-    """Head width from numbers of heads; None without them."""
-    if heads is None:
-        return None
-    counts = (heads,) * len(widths) if isinstance(heads, int) else heads
-    if len(counts) != len(widths) or min(counts) < 1:
-        raise CheckpointError(f"config.json gives heads {counts} for {len(widths)} levels")
-    found = {width / count for width, count, there in zip(widths, counts, (*attends[:-1], True), strict=True) if there}
-    if len(found) > 1 or not all(width.is_integer() for width in found):
-        raise CheckpointError(f"heads {counts} over widths {widths} are not all of one width; give --head-width")
-    return int(found.pop())
-
-
-def _context_width(probe: _Probe) -> int | None:
-    """Width of the image token, None without cross-attention; any of the middle's four matrices tells."""
-    for branch in ("spatial", "temporal"):
-        token = f"unet.middle.0.attention.{branch}.token"
-        width = probe.optional(f"{token}.value", 1) or probe.optional(f"{token}.dormant.key", 1, leaf="")
-        if width is not None:
-            return width
-    return None
-
-
-def _camera_width(probe: _Probe) -> int:
-    """Width of the camera vector, 0 without one; either of its two modules tells."""
-    width = probe.optional("unet.embed_camera.0", 1)
-    return width or probe.optional("camera.proj", 0) or 0
-
-
 def _camera_control(probe: _Probe, camera_width: int) -> CameraControl:
     """The control whose number of features the camera embedder takes."""
-    features = probe.optional("camera.proj", 1)
-    if features is None:
+    features = probe.optional("camera.proj.weight", 1)
+    if not camera_width or features is None:
         return "spherical" if camera_width else "none"  # of a camera with half its weights, the check names the rest
     for control, count in CAMERA_FEATURES.items():
         if features == count:
@@ -236,11 +196,10 @@ def _camera_control(probe: _Probe, camera_width: int) -> CameraControl:
 
 
 def _vae(probe: _Probe, hints: Hints) -> VAEConfig:
-    width = probe.size("target_encoder.stem", 0)
-    levels = range(probe.levels.vae_levels)
-    widths = tuple(probe.size(f"target_encoder.levels.{level}.blocks.0.conv2", 0) for level in levels)
+    width, levels = probe.size("target_encoder.stem.weight", 0), range(probe.levels.vae_levels)
+    widths = tuple(probe.size(f"target_encoder.levels.{level}.blocks.0.conv2.weight", 0) for level in levels)
     return VAEConfig(
-        latent_channels=probe.size("target_encoder.conv_out", 0) // 2,
+        latent_channels=probe.size("target_encoder.conv_out.weight", 0) // 2,
         width=width,
         multipliers=_multipliers("the VAE", width, widths),
         blocks_per_level=probe.levels.vae_blocks,
@@ -252,29 +211,25 @@ def _vae(probe: _Probe, hints: Hints) -> VAEConfig:
 
 def _image_encoder(probe: _Probe, context_width: int | None, hints: Hints) -> ImageEncoderConfig | None:
     """None only for a U-Net without cross-attention: a tower that is wanted and absent is found missing later."""
-    tokens = probe.optional("image_encoder.positions", 0, leaf="")
+    tokens = probe.optional("image_encoder.positions", 0)
     if tokens is None:
         return None if context_width is None else ImageEncoderConfig(output_width=context_width)
-    patch, width = probe.size("image_encoder.patches", 2), probe.size("image_encoder.patches", 0)
-    return ImageEncoderConfig(
-        image_size=round((tokens - 1) ** 0.5) * patch,
-        patch=patch,
-        width=width,
-        layers=probe.levels.image_layers,
-        heads=_image_heads(width, hints),
-        hidden_width=probe.size("image_encoder.layers.0.expand", 0),
-        output_width=probe.size("image_encoder.projection", 1, leaf=""),
-    )
-
-
-def _image_heads(width: int, hints: Hints) -> int:
+    patch, width = probe.size("image_encoder.patches.weight", 2), probe.size("image_encoder.patches.weight", 0)
     heads = hints.image_heads or PUBLISHED_IMAGE_HEADS
     if width % heads:
         raise CheckpointError(
             f"the image tower is {width} wide, no multiple of its {heads} heads, which the weights do not tell; "
             "give --image-heads"
         )
-    return heads
+    return ImageEncoderConfig(
+        image_size=round((tokens - 1) ** 0.5) * patch,
+        patch=patch,
+        width=width,
+        layers=probe.levels.image_layers,
+        heads=heads,
+        hidden_width=probe.size("image_encoder.layers.0.expand.weight", 0),
+        output_width=probe.size("image_encoder.projection", 1),
+    )
 
 
 # --- strict matching: nothing missing, nothing unknown, all of one shape ---------------------------------------------
@@ -316,65 +271,39 @@ def match_weights(expected: Shapes, shapes: Shapes, naming: Naming, levels: Leve
     Raises:
         CheckpointError: says how many weights are missing, unknown and misshapen, and the first five of each.
     """
-    sources = {name: naming(name, levels) for name in expected}
-    missing = [
-        published
-        for name, source in sources.items()
-        for published in ([name] if source is None else [n for n in source.names if n not in shapes])
-    ]
-    found = {name: source for name, source in sources.items() if source is not None}
-    used = {name for source in found.values() for name in source.names}
-    leftovers, unknown = _sorted_out(name for name in shapes if name not in used)
-    misshapen = [line for name, source in found.items() for line in _misfit(expected[name], source, shapes)]
-    _require_fit(len(expected), missing, unknown, misshapen)
-    return Match(found, leftovers)
-
-
-def _sorted_out(names: Iterable[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """Recognised leftovers by kind, and the rest."""
-    patterns = {kind: re.compile(pattern) for kind, pattern in LEFTOVERS.items()}
+    sources = {name: naming(name, levels) or Source((name,)) for name in expected}
+    used = {published for source in sources.values() for published in source.names}
+    missing = [published for source in sources.values() for published in source.names if published not in shapes]
+    misshapen = [line for name, source in sources.items() for line in _misfit(expected[name], source, shapes)]
     leftovers: dict[str, list[str]] = {}
     unknown: list[str] = []
-    for name in names:
-        kind = next((kind for kind, pattern in patterns.items() if pattern.fullmatch(name)), None)
+    for name in (name for name in shapes if name not in used):
+        kind = next((kind for kind, pattern in LEFTOVERS.items() if re.fullmatch(pattern, name)), None)
         (unknown if kind is None else leftovers.setdefault(kind, [])).append(name)
-    return leftovers, unknown
+    faults = [
+        f"{len(names)} {what}, first: {', '.join(names[:_FIRST])}"
+        for what, names in (
+            (f"of {len(expected)} weights are missing", missing),
+            (f"of {len(expected)} weights are misshapen", misshapen),
+            ("unexpected names", unknown),
+        )
+        if names
+    ]
+    if faults:
+        raise CheckpointError(f"{'; '.join(faults)}. Nothing was loaded: it is damaged, or of another architecture")
+    return Match(sources, leftovers)
 
 
 def _misfit(wanted: tuple[int, ...], source: Source, shapes: Shapes) -> list[str]:
     """One line if the published tensors do not make ours; none if they do or are missing anyway."""
     given = [shapes[name] for name in source.names if name in shapes]
-    if len(given) < len(source.names) or published_fit(wanted, given, source.form):
-        return []
-    return [f"{source.names[0]} wants {list(published_shape(wanted, source))}, got {list(given[0])}"]
-
-
-def published_shape(wanted: tuple[int, ...], source: Source) -> tuple[int, ...]:
-    """Shape of each published tensor that makes one of ours."""
+    published = wanted
     if source.form == "stacked":
-        return (wanted[0] // len(source.names), *wanted[1:])
-    if source.form == "transposed":
-        return wanted[::-1]
-    return wanted[:2] if source.form == "pixelwise" else wanted
-
-
-def published_fit(wanted: tuple[int, ...], given: Sequence[tuple[int, ...]], form: Form) -> bool:
-    """Whether published tensors of these shapes make one of ours."""
-    if form == "pixelwise" and given[0] == wanted:
-        return True  # some converters keep the 1x1 convolution
-    names = tuple("" for _ in given)
-    return all(shape == published_shape(wanted, Source(names, form)) for shape in given)
-
-
-def _require_fit(expected: int, missing: list[str], unknown: list[str], misshapen: list[str]) -> None:
-    faults = [
-        f"{len(names)} of {expected} weights are {what}, first: {', '.join(names[:_FIRST])}"
-        for what, names in (("missing", missing), ("misshapen", misshapen))
-        if names
-    ]
-    if unknown:
-        faults.append(f"{len(unknown)} unexpected names, first: {', '.join(unknown[:_FIRST])}")
-    if faults:
-        raise CheckpointError(
-            f"{'; '.join(faults)}. Nothing was loaded: the file is damaged, or of another architecture than GCD's"
-        )
+        published = (wanted[0] // len(source.names), *wanted[1:])
+    elif source.form == "transposed":
+        published = wanted[::-1]
+    elif source.form == "pixelwise" and given[:1] != [wanted]:  # some converters keep the 1x1 convolution
+        published = wanted[:2]
+    if len(given) < len(source.names) or all(shape == published for shape in given):
+        return []
+    return [f"{source.names[0]} wants {list(published)}, got {list(given[0])}"]

@@ -194,16 +194,10 @@ _UNET_ENDS = (
 
 
 def _unet_rows(levels: Levels) -> Iterator[Row]:
-    inner = (*_UNET_ENDS, *_down_rows(levels), *_middle_rows(), *_up_rows(levels))
-    yield from (row.under("unet", GCD_UNET, "") for row in _unet_camera_rows())
-    for row in inner:
+    for layer in (0, 2):  # the camera vector's own embedding: GCD adds it, diffusers has none
+        yield Row(f"unet.embed_camera.{layer}", f"{GCD_UNET}.aux_label_emb.{layer}", "")
+    for row in (*_UNET_ENDS, *_down_rows(levels), *_middle_rows(), *_up_rows(levels)):
         yield Row(f"unet.{row.own}", f"{GCD_UNET}.{row.gcd}", f"unet/{row.diffusers}", row.form)
-
-
-def _unet_camera_rows() -> Iterator[Row]:
-    """The camera vector's own embedding: GCD adds it, diffusers has none."""
-    for layer in (0, 2):
-        yield Row(f"embed_camera.{layer}", f"aux_label_emb.{layer}", "")
 
 
 def _stage_rows(own: str, gcd: str, diffusers: str, index: int) -> Iterator[Row]:
@@ -262,15 +256,11 @@ def _image_rows(levels: Levels) -> Iterator[Row]:
     yield from (row.under("image_encoder", "", "") for row in _IMAGE_ENDS)
     for i in range(levels.image_layers):
         own, gcd = f"image_encoder.layers.{i}", f"{GCD_IMAGE}.transformer.resblocks.{i}"
-        yield from (row.under(own, gcd, f"{IMAGE}.encoder.layers.{i}") for row in _IMAGE_LAYER)
-        yield from _joint_projection_rows(own, gcd, f"{IMAGE}.encoder.layers.{i}")
-
-
-def _joint_projection_rows(own: str, gcd: str, diffusers: str) -> Iterator[Row]:
-    """Query, key and value: one matrix (whose names end in no module), or three modules."""
-    for leaf in ("weight", "bias"):
-        apart = diffusers + ".self_attn.{}_proj." + leaf
-        yield Row(f"{own}.query_key_value.{leaf}", f"{gcd}.attn.in_proj_{leaf}", apart, "stacked")
+        diffusers = f"{IMAGE}.encoder.layers.{i}"
+        yield from (row.under(own, gcd, diffusers) for row in _IMAGE_LAYER)
+        for leaf in ("weight", "bias"):  # one matrix, whose names end in no module, or three modules
+            apart = diffusers + ".self_attn.{}_proj." + leaf
+            yield Row(f"{own}.query_key_value.{leaf}", f"{gcd}.attn.in_proj_{leaf}", apart, "stacked")
 
 
 # --- the autoencoders ----------------------------------------------------------------------------------------------
@@ -299,21 +289,16 @@ _CODER_ENDS = (
 
 
 def _vae_rows(levels: Levels) -> Iterator[Row]:
-    yield from _encoder_rows(levels, "target_encoder", f"{GCD_VAE}.encoder", "vae/encoder")
+    encoder = list(_encoder_rows(levels))
+    yield from (row.under("target_encoder", f"{GCD_VAE}.encoder", "vae/encoder") for row in encoder)
     yield Row("target_encoder.quant", "", "vae/quant_conv")
-    yield from _encoder_rows(levels, "own_condition_encoder", f"{GCD_CONDITION_VAE}.encoder", "")
-    yield Row("own_condition_encoder.quant", f"{GCD_CONDITION_VAE}.quant_conv", "")
-    yield from _decoder_rows(levels)
+    for row in (*encoder, Row("quant", "quant_conv", "")):  # diffusers has no second encoder
+        below = f"{GCD_CONDITION_VAE}." + ("" if row.own == "quant" else "encoder.")
+        yield Row(f"own_condition_encoder.{row.own}", below + row.gcd, "")
+    yield from (row.under("decoder", f"{GCD_VAE}.decoder", "vae/decoder") for row in _decoder_rows(levels))
 
 
-def _encoder_rows(levels: Levels, own: str, gcd: str, diffusers: str) -> Iterator[Row]:
-    """diffusers: "" for an encoder it does not have."""
-    for row in _encoder_inner_rows(levels):
-        placed = row.under(own, gcd, diffusers)
-        yield placed if diffusers else Row(placed.own, placed.gcd, "")
-
-
-def _encoder_inner_rows(levels: Levels) -> Iterator[Row]:
+def _encoder_rows(levels: Levels) -> Iterator[Row]:
     yield from _CODER_ENDS
     for level in range(levels.vae_levels):
         own, gcd, diffusers = f"levels.{level}", f"down.{level}", f"down_blocks.{level}"
@@ -331,11 +316,6 @@ def _vae_middle_rows(own: tuple[str, str, str], res: Sequence[Row]) -> Iterator[
 
 
 def _decoder_rows(levels: Levels) -> Iterator[Row]:
-    for row in _decoder_inner_rows(levels):
-        yield row.under("decoder", f"{GCD_VAE}.decoder", "vae/decoder")
-
-
-def _decoder_inner_rows(levels: Levels) -> Iterator[Row]:
     """Ours and diffusers count levels from the deepest, Stability's from the shallowest."""
     yield from (*_CODER_ENDS, Row("mix_frames", "conv_out.time_mix_conv", "time_conv_out"))
     for up in range(levels.vae_levels):

@@ -10,7 +10,7 @@ import io
 import pickle
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import cast
 
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.errors import CheckpointError
-from gcd_model.weights.save import NOTES
+from gcd_model.weights.card import NOTES
 
 
 class Placeholder:
@@ -41,20 +41,10 @@ class Placeholder:
         """A placeholder used as a function gives itself."""
         return self
 
-    def __setstate__(self, state: object) -> None:
-        """Forgets it."""
+    def forget(self, *_args: object) -> None:
+        """What state, items and elements of a foreign object come to."""
 
-    def __setitem__(self, key: object, value: object) -> None:
-        """Forgets it."""
-
-    def append(self, item: object) -> None:
-        """Forgets it."""
-
-    def extend(self, items: object) -> None:
-        """Forgets them."""
-
-    def add(self, item: object) -> None:
-        """Forgets it."""
+    __setstate__ = __setitem__ = append = extend = add = forget
 
 
 def _sealed(function: Callable[..., object]) -> object:
@@ -69,16 +59,16 @@ def _sealed(function: Callable[..., object]) -> object:
     return Sealed()
 
 
-def _tensor_of_parameter(data: object, *_rest: object) -> object:
-    """A parameter counts as its tensor."""
-    return data
-
-
 class UntypedBytes(Placeholder):
     """The storage class of the newest dtypes, of which torch asks the dtype only."""
 
     __slots__ = ()
     dtype = torch.uint8
+
+
+def _data_of(data: object, *_rest: object) -> object:
+    """A parameter counts as its tensor."""
+    return data
 
 
 _DTYPES = (
@@ -89,8 +79,8 @@ _ALLOWED: dict[tuple[str, str], object] = {
     ("collections", "OrderedDict"): OrderedDict,
     ("torch", "Size"): torch.Size,
     ("torch", "device"): torch.device,
-    ("torch._utils", "_rebuild_parameter"): _sealed(_tensor_of_parameter),
-    ("torch._utils", "_rebuild_parameter_with_state"): _sealed(_tensor_of_parameter),
+    ("torch._utils", "_rebuild_parameter"): _sealed(_data_of),
+    ("torch._utils", "_rebuild_parameter_with_state"): _sealed(_data_of),
     ("torch.storage", "UntypedStorage"): UntypedBytes,
     ("torch", "UntypedStorage"): UntypedBytes,
     **{("torch", name): getattr(torch, name) for name in _DTYPES},
@@ -116,7 +106,7 @@ class RestrictedPickle:
 
 
 class _Census(pickle.Unpickler):
-    """Reads a pickle for nothing but the storages it refers to; every name is a placeholder."""
+    """Reads a pickle for nothing but the bytes it says its storages have, by key; every name is a placeholder."""
 
     def __init__(self, pickled: bytes) -> None:
         super().__init__(io.BytesIO(pickled))
@@ -134,24 +124,18 @@ class _Census(pickle.Unpickler):
         return Placeholder()
 
 
-def claimed_storages(pickled: bytes) -> dict[str, int]:
-    """Bytes a checkpoint's pickle says its storages have, by key. Raises whatever a damaged pickle raises."""
-    census = _Census(pickled)
-    census.load()
-    return census.claims
-
-
 def check_storages(archive: zipfile.ZipFile) -> None:
     """Whether every record of an open torch zip holds what its pickle claims: a short one would be read past its end.
 
-    Raises:
-        CheckpointError: a record is missing or too short.
+    Raises: CheckpointError if not; whatever a damaged pickle raises.
     """
     entries = {entry.filename: entry.file_size for entry in archive.infolist()}
     pickled = next(name for name in entries if name.endswith("/data.pkl"))
     if entries[pickled] > _LARGEST_PICKLE:
         raise CheckpointError(f"its pickle has {entries[pickled]} bytes, more than {_LARGEST_PICKLE}: refused")
-    for key, claimed in claimed_storages(archive.read(pickled)).items():
+    census = _Census(archive.read(pickled))
+    census.load()
+    for key, claimed in census.claims.items():
         there = entries.get(f"{pickled.removesuffix('data.pkl')}data/{key}", 0)
         if there < claimed:
             raise CheckpointError(
@@ -208,17 +192,15 @@ def contents(root: object) -> Contents:
             names = ", ".join(str(key) for key in list(entries)[:5])
             raise CheckpointError(f"has no entry {_WEIGHTS!r} (found: {names}); it holds no weights")
         return Contents(_weights(entries))
-    others = (str(key) for key in entries if key not in (_WEIGHTS, _OPTIMIZER))
-    size = _stored_bytes(entries.get(_OPTIMIZER))
-    return Contents(_weights(entries[_WEIGHTS]), size, tuple(others), _notes(entries.get(_FACTS)))
+    others = tuple(str(key) for key in entries if key not in (_WEIGHTS, _OPTIMIZER))
+    size = sum(tensor.numel() * tensor.element_size() for tensor in _tensors(entries.get(_OPTIMIZER), set()))
+    return Contents(_weights(entries[_WEIGHTS]), size, others, _notes(entries.get(_FACTS)))
 
 
 def _notes(facts: object) -> dict[str, str]:
     """Our notes, if they are what we write: text to text."""
     noted = cast("dict[object, object]", facts).get(NOTES) if isinstance(facts, dict) else None
-    if not isinstance(noted, dict):
-        return {}
-    texts = cast("dict[object, object]", noted).items()
+    texts = cast("dict[object, object]", noted).items() if isinstance(noted, dict) else ()
     return {key: value for key, value in texts if isinstance(key, str) and isinstance(value, str)}
 
 
@@ -231,16 +213,11 @@ def _weights(state: object) -> dict[str, Tensor]:
             raise CheckpointError(
                 f"{_what(value)} stands among the weights, at {name!r}: refused; wanted are tensors only"
             )
-        _require_backing(name, value)
+        claimed, there = value.numel() * value.element_size(), value.untyped_storage().nbytes()
+        if claimed > there:  # a few bytes can claim to be a huge tensor by repeating themselves; real weights do not
+            raise CheckpointError(f"{name} claims {claimed} bytes and stores {there}: refused")
         found[name] = value
     return found
-
-
-def _require_backing(name: str, tensor: Tensor) -> None:
-    """A few bytes can claim to be a huge tensor by repeating themselves; real weights do not."""
-    claimed, there = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
-    if claimed > there:
-        raise CheckpointError(f"{name} claims {claimed} bytes and stores {there}: refused")
 
 
 def _what(value: object) -> str:
@@ -251,20 +228,14 @@ def _what(value: object) -> str:
     return f"a {type(value).__name__}"
 
 
-def _stored_bytes(value: object) -> int:
-    """Bytes of all tensors in nested containers, from their headers alone."""
-    return sum(tensor.numel() * tensor.element_size() for tensor in _tensors(value, set()))
-
-
 def _tensors(value: object, seen: set[int]) -> Iterator[Tensor]:
+    """All in nested containers, each once."""
     if id(value) in seen:
         return
     seen.add(id(value))
     if isinstance(value, Tensor):
         yield value
-    elif isinstance(value, Mapping):
-        for item in cast("Mapping[object, object]", value).values():
-            yield from _tensors(item, seen)
-    elif isinstance(value, list | tuple):
-        for item in cast("list[object]", value):
+    elif isinstance(value, Mapping | list | tuple):
+        items = value.values() if isinstance(value, Mapping) else value
+        for item in cast("Iterable[object]", items):
             yield from _tensors(item, seen)

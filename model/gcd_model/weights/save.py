@@ -3,11 +3,12 @@
 Every file appears under its name only once it is complete, and replaces another only when that is allowed.
 """
 
+import json
 import os
 import shutil
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,57 +19,64 @@ from torch import Tensor
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.weights.adapter import Adapter, unshared
-from gcd_model.weights.card import FULL_PRECISION, Card, Entry, file_order, header
-from gcd_model.weights.infer import Hints, gcd_levels, infer_config
+from gcd_model.weights.card import NOTES, Card
+from gcd_model.weights.infer import Hints, gcd_levels, infer_config, shapes_of
 from gcd_model.weights.names import Levels, gcd_source
 
 Report = Callable[[int, int], None]
 """Called with (bytes written, bytes)."""
 
+_LINE = 64
+"""Bytes of a cache line, and of what torch aligns memory to."""
+_DTYPES = {torch.float64: "F64", torch.float32: "F32", torch.bfloat16: "BF16", torch.float16: "F16"}
+_LIGHTNING = "2.1.0"
 
-@dataclass(frozen=True, slots=True)
-class Content:
-    """What goes into a file: what is to be written of each tensor, where it comes from, and the metadata."""
-
-    entries: dict[str, Entry]
-    tensor: Callable[[str], Tensor]
-    metadata: Mapping[str, str]
-
-
-def written_dtype(name: str, stored: torch.dtype, wanted: torch.dtype | None) -> torch.dtype:
-    """The precision asked for; what computes in float32 is only ever widened. name: ours."""
-    if wanted is None or (name.partition(".")[0] in FULL_PRECISION and wanted.itemsize < stored.itemsize):
-        return stored
-    return wanted
+CARRIED = ("CLIP text tower", "decoder of the condition VAE", "LPIPS")
+"""Leftovers worth carrying from file to file; averages and tables of the old weights are not."""
 
 
-def own_content(entries: Mapping[str, Entry], tensor: Callable[[str], Tensor], card: Card) -> Content:
-    """Networks in our own layout."""
-    return Content(dict(entries), tensor, card.to_metadata())
+def write_safetensors(
+    out: Path,
+    state: Mapping[str, Tensor],
+    metadata: Mapping[str, str],
+    *,
+    dtypes: Mapping[str, torch.dtype] | None = None,
+    overwrite: bool,
+    report: Report | None = None,
+) -> None:
+    """Write one tensor after the other, mapped ones without ever holding the file.
 
+    First all of whole cache lines, then the widest type, then by name: so all but small ones of odd sizes begin with a
+    cache line when the file is mapped, as memory that torch allocates does: some processors' kernels round otherwise
+    elsewhere. (The library's own writer aligns to eight bytes, and wants all tensors at once.)
 
-def write_safetensors(out: Path, content: Content, *, overwrite: bool, report: Report | None = None) -> None:
-    """Write one tensor after the other: at any time no more than one of them is held twice.
-
+    Args:
+        dtypes: to be written in, where it is not the tensor's own.
     Raises: OptionError if `out` exists and `overwrite` is not set; CheckpointError if it cannot be written.
     """
-    entries = content.entries
-    done, total = 0, sum(entry.size for entry in entries.values())
+    kinds = {name: tensor.dtype for name, tensor in state.items()} | dict(dtypes or {})
+    sizes = {name: tensor.numel() * kinds[name].itemsize for name, tensor in state.items()}
+    order = sorted(state, key=lambda name: (sizes[name] % _LINE != 0, -kinds[name].itemsize, name))
+    content: dict[str, object] = {"__metadata__": dict(metadata)}
+    done, end = 0, 0
+    for name in order:
+        place = [end, end := end + sizes[name]]
+        content[name] = {"dtype": _DTYPES[kinds[name]], "shape": list(state[name].shape), "data_offsets": place}
+    header = json.dumps(content, separators=(",", ":")).encode()
+    header += b" " * (-(8 + len(header)) % _LINE)
     with _whole_or_nothing(out, ".safetensors", overwrite=overwrite) as file:
-        file.write(header(entries, content.metadata))
-        for name in file_order(entries):
-            tensor = content.tensor(name).detach().to("cpu", entries[name].dtype).contiguous()
+        file.write(len(header).to_bytes(8, "little") + header)
+        for name in order:
+            tensor = state[name].detach().to("cpu", kinds[name]).contiguous()
             file.write(tensor.flatten().view(torch.uint8).numpy().data)
-            done += entries[name].size
+            done += sizes[name]
             if report is not None:
-                report(done, total)
+                report(done, end)
 
 
 def write_adapter(out: Path, adapter: Adapter, *, overwrite: bool) -> None:
     """Write an adapter as `.safetensors`. Raises: as `write_safetensors`."""
-    entries = {name: Entry(tuple(tensor.shape), tensor.dtype) for name, tensor in adapter.tensors.items()}
-    content = Content(entries, adapter.tensors.__getitem__, adapter.to_metadata())
-    write_safetensors(out, content, overwrite=overwrite)
+    write_safetensors(out, adapter.tensors, adapter.to_metadata(), overwrite=overwrite)
 
 
 def write_published(
@@ -87,9 +95,9 @@ def write_published(
     Raises: as `write_safetensors`; OptionError if the published layout cannot hold such networks.
     """
     state = {name: _alone(value) for name, value in gcd_state(weights, card.diffusion, carried).items()}
-    card = replace(card, config=published_config(card.diffusion))
+    notes = replace(card, config=published_config(card.diffusion)).to_metadata()
     with _whole_or_nothing(out, ".ckpt", overwrite=overwrite) as file:
-        torch.save(lightning_checkpoint(state, card, updates), file)
+        torch.save(_lightning_checkpoint(state, notes, updates), file)
 
 
 def _alone(tensor: Tensor) -> Tensor:
@@ -127,15 +135,6 @@ def _require_writable(out: Path, suffix: str, *, overwrite: bool) -> None:
 # --- the `.ckpt` of the released code --------------------------------------------------------------------------------
 
 
-CARRIED = ("CLIP text tower", "decoder of the condition VAE", "LPIPS")
-"""Leftovers worth carrying from file to file; averages and tables of the old weights are not."""
-
-NOTES = "gcd_node"
-"""Where in a checkpoint's hyper-parameters our card stands."""
-
-_LIGHTNING = "2.1.0"
-
-
 def published_config(config: ModelConfig) -> ModelConfig:
     """The config as the published layout tells it: with one encoder for targets and one for conditions."""
     return msgspec.structs.replace(config, vae=msgspec.structs.replace(config.vae, shared=False))
@@ -161,28 +160,25 @@ def gcd_state(weights: Mapping[str, Tensor], config: ModelConfig, carried: Mappi
     return {**carried, **state}
 
 
-def lightning_checkpoint(state: Mapping[str, Tensor], card: Card, updates: int) -> dict[str, object]:
-    """What stands at the root of a Lightning checkpoint: plain containers and tensors, no optimizer state.
-
-    updates: of the optimizer, so far.
-    """
+def _lightning_checkpoint(state: dict[str, Tensor], notes: dict[str, str], updates: int) -> dict[str, object]:
+    """What stands at the root of a Lightning checkpoint: plain containers and tensors, no optimizer state."""
     return {
         "epoch": 0,
         "global_step": updates,
         "pytorch-lightning_version": _LIGHTNING,
-        "state_dict": dict(state),
+        "state_dict": state,
         "loops": {},
         "callbacks": {},
         "optimizer_states": [],
         "lr_schedulers": [],
         "hparams_name": "kwargs",
-        "hyper_parameters": {NOTES: card.to_metadata()},
+        "hyper_parameters": {NOTES: notes},
     }
 
 
 def _require_told(state: Mapping[str, Tensor], config: ModelConfig) -> None:
     """Whether a reader of the names and shapes alone would build these networks."""
-    shapes = {name: tuple(tensor.shape) for name, tensor in state.items()}
+    shapes = shapes_of(state)
     try:
         told = infer_config(shapes, gcd_source, gcd_levels(shapes), Hints())
     except CheckpointError as error:

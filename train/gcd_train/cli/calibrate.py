@@ -5,11 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
 from typer import Option, echo
 
 from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.cli.progress_bar import progress_bar, say
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from gcd_train.evaluation.clips import EvaluationSet
     from gcd_train.evaluation.opening import Choice
     from gcd_train.evaluation.predictors import Predictor
-
-_LOG = Console(stderr=True, highlight=False)
 
 
 def calibrate_command(
@@ -73,19 +70,15 @@ def calibrate_command(
         text = write_calibration(note, out)
         if path is not None and store is not None:
             convert_weights(path, store, uncertainty_scale=found.scale)
-            _say(
+            say(
                 f"{store} holds the scale {found.scale:.3g}: for {samples} samples in {note.steps} steps, and scenes "
                 "like these; with other --samples it is wrong"
             )
     echo(text)
     if note.warning:
-        _say(f"warning: {note.warning}")
+        say(f"warning: {note.warning}")
     written = f"{out}/calibration.json, calibration.md and reliability.png" + ("" if store is None else f", {store}")
-    _say(f"wrote {written}")
-
-
-def _say(line: str) -> None:
-    _LOG.print(line, markup=False, soft_wrap=True)
+    say(f"wrote {written}")
 
 
 def _clips(data: Sequence[Path], choice: "Choice", model: "ViewSynthesizer", seed: int) -> "EvaluationSet":
@@ -97,7 +90,7 @@ def _clips(data: Sequence[Path], choice: "Choice", model: "ViewSynthesizer", see
     else:
         clips, notes = open_scenes(data[0], choice, replace(SceneCuts.suiting(model.traits), seed=seed, semantic=False))
     for note in notes:
-        _say(note)
+        say(note)
     return clips
 
 
@@ -126,7 +119,7 @@ def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Dis
                 clip = clips.clip(key)
             except DataError as error:
                 unreadable.append(f"{key}: {error}")
-                _say(f"left out {key}: {error}")
+                say(f"left out {key}: {error}")
             else:
                 measured.append(distances(clip, views.predict(clip.seen)))
             show(number)

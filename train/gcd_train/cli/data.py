@@ -1,15 +1,13 @@
 """`gcd-train data`: what is done with data sets that were downloaded."""
 
-import signal
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from gcd_model import printable
 from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.cli.progress_bar import progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import DataError
 
 app = typer.Typer(no_args_is_help=True, help="Downloaded data sets: repacking.")
@@ -46,8 +44,7 @@ def compact(
     from gcd_train.layouts.compact import Compaction
     from gcd_train.parallel import map_items, one_thread_each
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind
-    say = Console(stderr=True, highlight=False)
+    stop_as_by_ctrl_c()
     with errors_shown():
         work = Compaction.of(source, out, cameras=tuple(camera or ()), gaps=gaps)
         scenes = work.scenes[:limit]
@@ -60,14 +57,14 @@ def compact(
                     done = outcome.unwrap()
                 except DataError as fault:
                     damaged += 1
-                    say.print(printable(f"{outcome.item}: {fault}"), markup=False, soft_wrap=True)
+                    say(printable(f"{outcome.item}: {fault}"))
                 else:
                     packed, there = packed + done.made, there + (not done.made)
                     read, written = read + done.read, written + done.written
                     if done.gaps:
-                        say.print(f"{outcome.item}: packed without {done.gaps} views that are missing", soft_wrap=True)
+                        say(f"{outcome.item}: packed without {done.gaps} views that are missing")
                 show(number)
         sizes = f", {read / 1e6:.1f} MB in {written / 1e6:.1f} MB" if packed else ""
-        say.print(f"scenes: {packed} packed{sizes}; {there} there already; {damaged} damaged", soft_wrap=True)
+        say(f"scenes: {packed} packed{sizes}; {there} there already; {damaged} damaged")
     if damaged:
         raise typer.Exit(DataError.exit_code)

@@ -1,28 +1,25 @@
 """`gcd-train evaluate`: weights and what they have to beat, on held-out clips."""
 
-import signal
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 import typer
-from rich.console import Console
 from typer import Option
 
 from gcd_model import Quality, SolverName
 from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.cli.progress_bar import progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.cli.training_run import command_line
-from gcd_train.errors import RecipeError
+from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.plan import EvaluateOptions, planned
-from gcd_train.evaluation.runner import Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.store import RunKeeper
 from gcd_train.evaluation.summary import complete_rows, to_markdown, write_summary
 
-_LOG = Console(stderr=True, highlight=False)
 _FIELD = HexPlaneSettings()
 
 Folders = Annotated[list[Path], Option(help="Folder of pairs (several may be given), or one of whole scenes.")]
@@ -133,7 +130,7 @@ def _evaluate(
     out.mkdir(parents=True, exist_ok=True)  # to know at once
     plan, keeper = planned(options), RunKeeper(out)
     for line in plan.notes:
-        _say(line)
+        say(line)
     with keeper.in_use(plan.note(command_line())):
         plan = plan.with_means(progress_bar)
         work = ClipWork(
@@ -146,7 +143,7 @@ def _evaluate(
         )
         account = _measured(work, workers, ray, options.device)
     for line in account.lines():
-        _say(line)
+        say(line)
     rows = complete_rows(keeper, list(work.makers), plan.clips.keys, account.records)
     summary = plan.summary(rows, account.failed())
     text = to_markdown(summary)
@@ -156,14 +153,14 @@ def _evaluate(
     if keys:
         plan.write_sheet(out / "contact_sheet.png", summary, keys, keeper)
     typer.echo(text)
-    _say(f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * bool(keys))
+    say(f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * bool(keys))
     if account.failures:
-        raise typer.Exit(account.exit_code)
+        raise typer.Exit(TrainError.exit_code)
 
 
 def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Account:
     if workers > 1 or ray is not None:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind
+        stop_as_by_ctrl_c()
     account, gpus = Account(clips=len(work.clips.keys)), assign_gpus(device, torch.cuda.device_count())
     with progress_bar("clips", len(work.clips.keys)) as show:
         for account in measure_all(
@@ -171,7 +168,3 @@ def _measured(work: ClipWork, workers: int, ray: str | None, device: str) -> Acc
         ):
             show(account.done)
     return account
-
-
-def _say(line: str) -> None:
-    _LOG.print(line, markup=False, soft_wrap=True)

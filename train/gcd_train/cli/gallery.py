@@ -6,20 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
 from typer import Argument, Option
 
 from gcd_model.errors import NonFiniteError
 from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.cli.progress_bar import progress_bar, say
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
     from gcd_model import Spherical, SphericalDelta, Trajectory, ViewSynthesizer
     from gcd_train.look.gallery import Viewed, ViewRecipe
     from gcd_train.look.real_video import RealVideo, WindowChoice
-
-_LOG = Console(stderr=True, highlight=False)
 
 
 def gallery_command(
@@ -76,10 +73,10 @@ def gallery_command(
         viewed, faults = _viewed(found, model, choice, recipe, out)
         write_page(viewed, faults, [*_facts(model, recipe), *assumed], out / "index.html")
         for _, told in assumed:
-            _LOG.print(f"source camera: {told}", markup=False, soft_wrap=True)
+            say(f"source camera: {told}")
         if not viewed:
             raise DataError(f"none of {len(found)} videos can be shown; {faults[0]}")
-    _LOG.print(f"wrote {out}/index.html: {len(viewed)} windows", markup=False, soft_wrap=True)
+    say(f"wrote {out}/index.html: {len(viewed)} windows")
 
 
 def _angles(text: str) -> "SphericalDelta":
@@ -151,7 +148,7 @@ def _viewed(
 
 def _leave_out(fault: str, faults: list[str]) -> None:
     faults.append(fault)
-    _LOG.print(f"left out: {fault}", markup=False, soft_wrap=True)
+    say(f"left out: {fault}")
 
 
 def _facts(model: "ViewSynthesizer", recipe: "ViewRecipe") -> list[tuple[str, str]]:

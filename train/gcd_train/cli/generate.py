@@ -1,7 +1,6 @@
 """`gcd-train generate`: make data."""
 
 import os
-import signal
 import time
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar
+from gcd_train.cli.progress_bar import progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError
 from gcd_train.layouts.scene_writer import SceneFormat, SceneRun, generate_scenes, write_scene_sheet
 from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
@@ -174,7 +173,7 @@ def live(
     from gcd_train.live.clips import ClipSettings, generate_live
 
     with errors_shown():
-        _stop_as_by_ctrl_c()
+        stop_as_by_ctrl_c()
         settings, console = ClipSettings(width=width, height=height, path=path), Console(stderr=True, highlight=False)
         for each in worlds_of(path) if world is None else (world,):
             seeds = range(first_seed, first_seed + (scenes or LIVE_SCENES[each]))
@@ -238,7 +237,7 @@ def _make_scenes(
     sheet: Path | None,
 ) -> None:
     """Exit code: that of the last failure, 0 without."""
-    _stop_as_by_ctrl_c()
+    stop_as_by_ctrl_c()
     run = SceneRun()
     console = Console(stderr=True, highlight=False)
     started = time.monotonic()
@@ -250,7 +249,7 @@ def _make_scenes(
             rate = f"{(run.done - run.there) / (time.monotonic() - started):.3g} scenes/s"
             bar.update(task, completed=run.done, rate=rate)
     for line in run.lines():
-        console.print(line, markup=False, soft_wrap=True)
+        say(line)
     if sheet is not None and run.written + run.there:
         write_scene_sheet([out / world.scene_name(seed) for seed in seeds], sheet)
     if run.failures:
@@ -260,13 +259,9 @@ def _make_scenes(
 def _make_pairs(
     out: Path, world: World, seeds: range, workers: int | None, ray: str | None, sheet: Path | None
 ) -> None:
-    _stop_as_by_ctrl_c()
+    stop_as_by_ctrl_c()
     with progress_bar("clips", len(seeds), keep=True) as show:
         for done in generate(out, world, seeds, workers or os.cpu_count() or 1, ray):
             show(done)
     if sheet is not None:
         write_contact_sheet(out, sheet)
-
-
-def _stop_as_by_ctrl_c() -> None:
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that no worker is left behind

@@ -1,5 +1,6 @@
-"""The one progress bar of `gcd-train`."""
+"""What `gcd-train` says while it works: the one progress bar, and lines on stderr."""
 
+import signal
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
@@ -14,3 +15,13 @@ def progress_bar(what: str, total: int, *, keep: bool = False) -> Generator[Call
     with Progress(*columns, console=Console(stderr=True), transient=not keep) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+def say(line: str) -> None:
+    """A line on stderr, as it is."""
+    Console(stderr=True, highlight=False).print(line, markup=False, soft_wrap=True)
+
+
+def stop_as_by_ctrl_c() -> None:
+    """From now on SIGTERM ends this process as Ctrl-C does, so that no worker is left behind."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)

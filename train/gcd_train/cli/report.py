@@ -1,7 +1,5 @@
 """`gcd-train report`: runs of `gcd-train evaluate` as tables, plots and galleries."""
 
-import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +7,7 @@ from typing import Annotated
 import typer
 
 from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.training_run import command_line
 from gcd_train.errors import RecipeError
 
 
@@ -33,7 +32,7 @@ def report_command(
         choices = Choices(
             leads=tuple(lead or ()), rows=_rows(row or ()), clips=clips, worst=worst, drawn=plots, seed=seed
         )
-        path = make_report(runs, out, choices, command=_command(sys.argv))
+        path = make_report(runs, out, choices, command=command_line())
     typer.echo(f"wrote {path}")
 
 
@@ -44,8 +43,3 @@ def _rows(given: Sequence[str]) -> dict[str, str]:
         if not method or not label:
             raise RecipeError(f"--row wants METHOD=ROW, got {text!r}; write --row 'my-model=GCD (gradual, finetuned)'")
     return {method: label for method, _, label in pairs}
-
-
-def _command(words: Sequence[str]) -> str:
-    """The line as it was typed, without the folder of the program."""
-    return shlex.join([Path(words[0]).name, *words[1:]])

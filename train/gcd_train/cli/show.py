@@ -44,16 +44,14 @@ def show(
     """Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."""
     with errors_shown():
         from gcd_train.evaluation.plots import require_matplotlib
-        from gcd_train.look.clip import facts_of
-        from gcd_train.look.open_scene import open_scene
-        from gcd_train.look.scene_clip import ShowOptions
+        from gcd_train.look.open_scene import ShowOptions, open_scene
         from gcd_train.look.sheet import write_sheet, write_trajectory, write_video
 
         require_matplotlib()
         _refuse_unwritable(out)
-        footage = open_scene(scene, ShowOptions(start=start, stride=stride, seed=seed, exact=not points), clip)
-        _print_facts(footage, facts_of(footage))
-        write_sheet(footage, out / "sheet.png", facts_of(footage))
+        footage = open_scene(scene, ShowOptions(start=start, stride=stride, seed=seed, exact=not points, clip=clip))
+        _print_facts(footage)
+        write_sheet(footage, out / "sheet.png")
         write_trajectory(footage, out / "trajectory.png")
         if video:
             write_video(footage, out / "video.mp4")
@@ -68,13 +66,13 @@ def _refuse_unwritable(folder: Path) -> None:
         raise RunError(f"{folder} cannot be written to; give a folder that takes files with --out")
 
 
-def _print_facts(footage: "Footage", facts: list[tuple[str, str]]) -> None:
+def _print_facts(footage: "Footage") -> None:
     from gcd_train.look.sheet import percent
 
     table = Table(title=footage.title, box=SIMPLE, show_header=False, title_justify="left")
     table.add_column(no_wrap=True)
     table.add_column()
-    for name, value in [("folder", footage.layout), *facts, ("axes", footage.world)]:
+    for name, value in [("folder", footage.layout), *footage.facts(), ("axes", footage.world)]:
         table.add_row(name, value.replace("\n(", " (").replace(",\n", ", ").replace("\n", ", "))
     shares = [f"{label.name} {percent(share)}" for label, share in footage.shares()]
     if shares:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gcd_model import ModelConfig
-from gcd_model.engines.cpu import arrange
+from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
 from gcd_model.image_encoder import ImageEncoder, clip_pixels
 from gcd_model.loading import random_weights, weights_path

@@ -166,7 +166,7 @@ class ExactPictures:
         self._ontology = _ontology_of(dataset, options)
         self._dataset, self._options, (self._width, self._height) = dataset, options, options.size
         self._renderer: tuple[int, Renderer] | None = None
-        _renderer_kind()  # what is not installed is said now, not sample by sample
+        renderer_kind()  # what is not installed is said now, not sample by sample
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_renderer": None}  # an OpenGL context cannot go to another process
@@ -177,8 +177,8 @@ class ExactPictures:
 
         folder, numbers = self._dataset.folder(scene), list(draw.frame_numbers)
         lens = render_lens(self._dataset.lens(scene), self._width, self._height)
-        renderer, still = self._own_renderer(), _frames_of(folder, numbers, lens)
-        geometry_from_world = _geometry_from_world(folder, numbers)
+        renderer, still = self._own_renderer(), frames_of(folder, numbers, lens)
+        geometry_from_world = geometry_poses(folder, numbers)
         cameras = {
             _SOURCE: geometry_from_world @ draw.world_from_source,
             _TARGET: geometry_from_world @ draw.world_from_target,
@@ -201,7 +201,7 @@ class ExactPictures:
     def _own_renderer(self) -> "Renderer":
         """Of this process: an OpenGL context does not survive a fork."""
         if self._renderer is None or self._renderer[0] != os.getpid():
-            self._renderer = os.getpid(), _renderer_kind()(self._width, self._height)
+            self._renderer = os.getpid(), renderer_kind()(self._width, self._height)
         return self._renderer[1]
 
 
@@ -255,7 +255,8 @@ def _ontology_of(dataset: Dataset4D, options: PictureOptions) -> Ontology | None
     return dataset.ontology
 
 
-def _renderer_kind() -> "type[Renderer]":
+def renderer_kind() -> "type[Renderer]":
+    """The renderer, an extra. Raises RenderError where it is not installed."""
     try:
         from gcd_train.scenes.renderer import Renderer
     except ImportError as error:
@@ -267,8 +268,8 @@ def _view(rgb: Bytes, depth: NDArray[np.float32], world_from_camera: Doubles, le
     return SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=world_from_camera, lens=lens)
 
 
-def _frames_of(folder: Path, numbers: Sequence[int], lens: Intrinsics) -> "FrozenScene":
-    """The scene at these times only, for a camera with this lens."""
+def frames_of(folder: Path, numbers: Sequence[int], lens: Intrinsics) -> "FrozenScene":
+    """A scene's kept geometry at these times only, for a camera with this lens. Raises DataError if it is damaged."""
     from gcd_train.scenes.frozen import FrozenScene
 
     frozen = FrozenScene.load(folder / GEOMETRY)
@@ -277,7 +278,7 @@ def _frames_of(folder: Path, numbers: Sequence[int], lens: Intrinsics) -> "Froze
     return replace(frozen, poses=frozen.poses[numbers], focus=frozen.focus[numbers], hfov_deg=lens.hfov_deg)
 
 
-def _geometry_from_world(folder: Path, numbers: Sequence[int]) -> Doubles:
+def geometry_poses(folder: Path, numbers: Sequence[int]) -> Doubles:
     """f64 [T, 4, 4]: from the frame that poses are given in (the vehicle's, in driving) to that of the geometry."""
     known = read_manifest(folder).world_from_vehicle
     if known is None:

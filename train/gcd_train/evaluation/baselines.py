@@ -1,39 +1,56 @@
 """Every baseline by name, and what it is built from."""
 
 import difflib
+import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Self
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
+from gcd_model import (
+    Augmentation,
+    Clip,
+    RenderOptions,
+    SourceFeatures,
+    ViewSynthesizer,
+    inspect_weights,
+    load_synthesizer,
+    pose_trajectory,
+    weights_path,
+)
 from gcd_model.config import SemanticClass
-from gcd_train.errors import RecipeError
-from gcd_train.evaluation.hexplane import HexPlaneSettings
-from gcd_train.evaluation.hexplane_learning import HexPlane
+from gcd_model.diffusion import unit_noise
+from gcd_train.data.sample import to_network
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
     CopySource,
     Fixed,
-    GroundHomography,
     Prediction,
     Predictor,
     SourceClip,
     TargetStatistics,
+    to_pictures,
 )
 from gcd_train.evaluation.reprojection import (
     REPROJECT_RGBD,
     REPROJECT_SEMD,
     DepthReprojection,
+    GroundHomography,
     ReprojectRgbd,
     ReprojectSemd,
 )
-from gcd_train.evaluation.svd import VANILLA_SVD, VanillaSVD, weights_named
 
-DEPTH_ON_MEAN = "depth_reprojection_on_mean"
-"""Depth reprojection with holes as in the mean target and the majority map."""
-HEXPLANE_VIEWS = (1, 2, 4, 8)
-"""Numbers of input views that a HexPlane is usually given; any other number goes too."""
+VANILLA_SVD, DEPTH_ON_MEAN = "vanilla_svd", "depth_reprojection_on_mean"
+"""Stable Video Diffusion, and depth reprojection with holes as in the mean target and the majority map."""
+MOTION_BUCKET = 127.0
+"""What Stable Video Diffusion is told of the motion: the middle of its range."""
 FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
 """Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
 
@@ -79,16 +96,8 @@ class ClassesAlone:
     """A predictor whose pictures do not count, as the targets are class maps."""
 
     inner: Predictor
-
-    @property
-    def name(self) -> str:
-        """See Predictor."""
-        return self.inner.name
-
-    @property
-    def privileged(self) -> bool:
-        """See Predictor."""
-        return self.inner.privileged
+    name: str
+    privileged: bool
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor."""
@@ -96,9 +105,148 @@ class ClassesAlone:
         return replace(made, video=None, more=tuple(replace(each, video=None) for each in made.more))
 
 
-def baseline_names(*, hexplane: Sequence[int] = HEXPLANE_VIEWS) -> tuple[str, ...]:
-    """All there are, in the order of the tables. hexplane: numbers of views that are listed."""
-    return (*_NAMES, *(f"hexplane_{views}" for views in hexplane))
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HexPlane:
+    """HexPlane with so many input views: the source clip, and further cameras of the scene from two on.
+
+    views: K. settings: what is learnt of each clip, and how long. seed, device: of the learning, see `learn`.
+    With two views or more it is given more than the others, so `privileged`. It makes no class maps.
+    Source: Cao and Johnson 2023 (HexPlane); as a baseline, Van Hoorick et al. 2024 (GCD), section 5.
+    """
+
+    views: int = 1
+    settings: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
+    seed: int = 0
+    device: str = "auto"
+
+    @property
+    def name(self) -> str:
+        """`hexplane_K`."""
+        return f"hexplane_{self.views}"
+
+    @property
+    def privileged(self) -> bool:
+        """True from two views on."""
+        return self.views > 1
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. Raises DataError where the clip's scene has fewer cameras."""
+        if self.views > 1 and clip.others is None:
+            raise DataError(
+                f"{self.name} wants {self.views} cameras of a scene, but clip {clip.key or 'without a key'} has one; "
+                "give a 4D data set, or ask for hexplane_1"
+            )
+        own, frames = clip.cameras, len(clip.source)
+        times = [2.0 * number / max(frames - 1, 1) - 1.0 for number in range(frames)]
+        pictures = [
+            (colours, Camera(lens=own.source, world_from_camera=own.ground_from_source, time=time))
+            for colours, time in zip(to_pictures(clip.source), times, strict=True)
+        ]
+        for video in clip.others(self.views - 1) if clip.others is not None and self.views > 1 else ():
+            pictures += [
+                (
+                    to_pictures(view.rgb[None])[0],
+                    Camera(lens=view.lens, world_from_camera=torch.from_numpy(view.world_from_camera), time=time),
+                )
+                for view, time in zip(video, times, strict=True)
+            ]
+        wanted = own.ground_from_source @ own.source_from_target  # [T, 4, 4]
+        known = torch.stack([camera.world_from_camera for _, camera in pictures])
+        bounds = SceneBounds.around(torch.cat([known, wanted]))
+        field = learn(pictures, bounds, self.settings, frames=frames, seed=self.seed, device=self.device)
+        drawn = [
+            draw(field, Camera(lens=own.target, world_from_camera=pose, time=time), self.settings)
+            for pose, time in zip(wanted, times, strict=True)
+        ]
+        return Prediction(video=torch.stack(drawn))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VanillaSVD:
+    """A video out of the first frame, for each draw from noise of its own.
+
+    The frame is stretched to the size the network was trained at, and what comes out is stretched back: nothing is
+    cropped, so that all of the target is measured.
+
+    synthesizer: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
+        the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
+        the clip's key.
+    Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
+    """
+
+    synthesizer: ViewSynthesizer
+    size: tuple[int, int] | None = None
+    steps: int | None = None
+    samples: int = 1
+    seed: int = 0
+    name: str = VANILLA_SVD
+    privileged: bool = False
+
+    @classmethod
+    def open(cls, weights: str | Path, *, device: str = "auto", dtype: str | None = None) -> Self:
+        """The published file `svd.safetensors`, its diffusers folder, or our own weights of the same task.
+
+        Args: see `gcd_model.load_synthesizer`; a published file is taken to be SVD, whatever it is called.
+        Raises:
+            CheckpointError: the file is missing, damaged or of another architecture.
+            DataError: it is steered: that is another task.
+        """
+        of_ours = isinstance(weights, str) and weights.startswith(("package:", "random:"))
+        family = None if of_ours or inspect_weights(weights).family else "svd"
+        return cls(synthesizer=load_synthesizer(weights, family=family, device=device, dtype=dtype))
+
+    def __post_init__(self) -> None:
+        traits = self.synthesizer.traits
+        if traits.config.camera != "none":
+            raise DataError(
+                f"{self.name} wants weights that make a video out of a picture, {traits.name} is told a camera path; "
+                "give svd.safetensors"
+            )
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. No class map. Raises DataError for a clip that is longer than what the network makes."""
+        traits, frames = self.synthesizer.traits, len(clip.source)
+        if frames > traits.config.frames:
+            raise DataError(
+                f"{traits.name} makes {traits.config.frames} frames, {clip.key or 'a clip'} has {frames}; evaluate on "
+                "shorter clips"
+            )
+        height, width = clip.cameras.target.height, clip.cameras.target.width
+        features = self._features(clip)
+        draws = [
+            Prediction(video=_stretched(self._draw(features, clip.key, number), height, width)[:frames])
+            for number in range(self.samples)
+        ]
+        return replace(draws[0], more=tuple(draws[1:]))
+
+    def _features(self, clip: SourceClip) -> SourceFeatures:
+        """Of the first frame, encoded once, for all frames."""
+        config = self.synthesizer.traits.config
+        height, width = self.size or (config.height, config.width)
+        first = _stretched(to_network(clip.source[:1]), height, width, low=-1.0)
+        noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(clip.key)))
+        told = self.synthesizer.encode(Clip(video=first, fps=clip.fps), noise)
+        tokens = None if told.tokens is None else told.tokens.repeat(config.frames, 1)
+        return replace(told, tokens=tokens, latents=told.latents.repeat(config.frames, 1, 1, 1))
+
+    def _draw(self, features: SourceFeatures, key: str, number: int) -> Tensor:
+        """One video, [T, 3, H, W] in [0, 1]: draws go one by one, as full size leaves no room for two."""
+        still = torch.eye(4, dtype=torch.float64).repeat(features.frames, 1, 1)
+        seed = self._seed(f"{key}#{number}")
+        options = RenderOptions(steps=self.steps, seed=seed, motion_bucket=MOTION_BUCKET)
+        (view,) = self.synthesizer.render(features, [pose_trajectory(still)], options)
+        return view.video
+
+    def _seed(self, name: str) -> int:
+        return int.from_bytes(hashlib.sha256(f"{self.seed}:{name}".encode()).digest()[:6])
+
+
+def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> Tensor:
+    """[T, 3, ...] at another size, within low..1."""
+    if pictures.shape[-2:] == (height, width):
+        return pictures
+    resized = F.interpolate(pictures, size=(height, width), mode="bicubic", align_corners=False, antialias=True)
+    return resized.clamp(low, 1.0)
 
 
 def hexplane_views(name: str) -> int | None:
@@ -116,15 +264,16 @@ def build(name: str, settings: BaselineSettings) -> Predictor:
     """
     views = hexplane_views(name)
     if name not in _NAMES and not views:
-        near = difflib.get_close_matches(name, baseline_names(), n=1)
+        every = (*_NAMES, *(f"hexplane_{views}" for views in (1, 2, 4, 8)))  # any other number goes too
+        near = difflib.get_close_matches(name, every, n=1)
         meant = f"did you mean {near[0]}? " if near else ""
-        raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(baseline_names())}")
+        raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")
     if settings.painted and (views or name in _PICTURES_ALONE):
         raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
     if views:
         return HexPlane(views=views, settings=settings.hexplane, seed=settings.seed, device=settings.device)
     made = _made(name, settings)
-    return ClassesAlone(inner=made) if settings.painted else made
+    return ClassesAlone(inner=made, name=made.name, privileged=made.privileged) if settings.painted else made
 
 
 def described(name: str, settings: BaselineSettings, trained_on: str = "nothing") -> dict[str, str]:
@@ -139,7 +288,9 @@ def described(name: str, settings: BaselineSettings, trained_on: str = "nothing"
     told |= {"seed": str(settings.seed)} if svd or hexplane else {}
     told |= {"means of": trained_on} if name in _OF_MEANS else {}
     told |= {"published rounding": "yes"} if settings.published and name in (REPROJECT_RGBD, REPROJECT_SEMD) else {}
-    told |= {"weights": weights_named(settings.svd)} if svd and settings.svd is not None else {}
+    if svd and settings.svd is not None:  # 12 digits of the digest, or `random:...` as it is
+        of_ours = settings.svd.startswith("random:")
+        told["weights"] = settings.svd if of_ours else inspect_weights(weights_path(settings.svd)).digest[:12]
     told |= {key: str(value) for key, value in asdict(settings.hexplane).items()} if hexplane else {}
     filled = settings.statistics is not None and name != REPROJECT_SEMD
     return told | ({"holes": "of no class"} if settings.classes and name in _WITH_HOLES and not filled else {})

@@ -223,8 +223,8 @@ def write_calibration(note: CalibrationNote, folder: Path) -> str:
 def _text(note: CalibrationNote) -> str:
     """Markdown: one row for each kind of pixel."""
     found = note.found
-    head = ["pixels", *(f"{100 * level:.0f} % interval holds | with the scale" for level in STATED)]
-    columns = " | ".join([*head, "mean absolute miscoverage | with the scale"]).split(" | ")
+    told = [*(f"{100 * level:.0f} % interval holds" for level in STATED), "mean absolute miscoverage"]
+    columns = ["pixels", *(heading for each in told for heading in (each, "with the scale"))]
     rows: list[list[str]] = []
     for region, of in found.regions.items():
         places = [LEVELS.index(level) for level in STATED]

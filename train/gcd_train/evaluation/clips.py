@@ -1,25 +1,34 @@
-"""The clips that predictors are measured on, and pairs of clips as such a set."""
+"""The clips that predictors are measured on: pairs, and whole scenes with many cameras."""
 
 import hashlib
 import zipfile
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal, Protocol, Self, TypeAlias
+from typing import Literal, Protocol, Self, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
-from gcd_model.geometry import CameraMount
+from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, to_pose
+from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.files import ZIP_FAULTS
 from gcd_train.data.pairs import PairedClip, PairedClips
-from gcd_train.data.sample import Bytes
+from gcd_train.data.pictures import SAME_POSE, trained_lens, trained_picture
+from gcd_train.data.sample import Bytes, Sample, SceneView
+from gcd_train.data.splits import Control
+from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_views
-from gcd_train.pointcloud import depth_visibility
+from gcd_train.evaluation.protocol import ClipControls
+from gcd_train.pointcloud import depth_visibility, render_lens, splat
+
+Number = TypeVar("Number", bound=np.generic)
 
 SetKind: TypeAlias = Literal["kubric", "driving", "orbit"]
 """Which tables clips belong to: Kubric-4D and scenes in its layout, driving, or pairs seen along orbits."""
@@ -44,11 +53,12 @@ class HeldOutClip:
     change: tuple[float, float, float] | None = None
 
 
-class ClipFacts(Protocol):
-    """What a model has to fit.
+class EvaluationSet(Protocol):
+    """Clips by key, the same whenever they are asked for, in any process.
 
-    camera: "none" for the one path of driving, "spherical" for a path of each clip's own. frames, height, width: T, H
-    and W of each clip.
+    frames, height, width: T, H and W of each clip. camera: "none" for the one path of driving, "spherical" for a path
+    of each clip's own. classes: the ontology, empty for none. rates: frames per second that clips may have, the highest
+    first. identity: digest of what the clips are read from and how they were drawn.
     """
 
     @property
@@ -61,21 +71,10 @@ class ClipFacts(Protocol):
     def camera(self) -> CameraControl: ...
     @property
     def classes(self) -> Sequence[SemanticClass]: ...
-
-
-class EvaluationSet(ClipFacts, Protocol):
-    """Clips by key, the same whenever they are asked for, in any process.
-
-    fps: frames per second; of clips that differ, the highest. rates: all that clips may have, the highest first.
-    identity: digest of what the clips are read from and how they were drawn.
-    """
-
     @property
     def keys(self) -> Sequence[str]: ...
     @property
     def kind(self) -> SetKind: ...
-    @property
-    def fps(self) -> float: ...
     @property
     def rates(self) -> Sequence[float]: ...
     @property
@@ -87,11 +86,7 @@ class EvaluationSet(ClipFacts, Protocol):
 
 
 def cameras_of(clips: PairedClips, number: int, declared: CameraMount | None = None) -> CameraPair:
-    """Both cameras of a clip.
-
-    Args:
-        declared: mount that is declared for the source camera of driving clips; None for the true one.
-    """
+    """Both cameras of a clip. declared: mount of the source camera of driving clips; None for the true one."""
     if clips.camera == "none":
         mount = declared or clips.mount or CameraMount()
         reached = clips.trajectory(number).at_goal.index(True)
@@ -99,43 +94,9 @@ def cameras_of(clips: PairedClips, number: int, declared: CameraMount | None = N
     return CameraPair.orbit(clips.trajectory(number), hfov_deg=clips.hfov_deg, height=clips.height, width=clips.width)
 
 
-def source_side(clips: PairedClips, number: int, clip: PairedClip, declared: CameraMount | None) -> SourceClip:
-    """What predictors may see of a clip. declared: see `cameras_of`."""
-    return SourceClip(
-        source=clip.source,
-        source_depth=clip.source_depth,
-        source_classes=clip.source_classes if clips.classes else None,
-        cameras=cameras_of(clips, number, declared),
-        fps=clips.fps,
-    )
-
-
-def class_grid(clips: ClipFacts) -> tuple[int, int]:
-    """Height and width at which class maps are compared: half the pictures'."""
-    return clips.height // 2, clips.width // 2
-
-
-def require_same_kind(training: PairedClips, clips: PairedClips) -> None:
-    """Raises DataError unless means over the training clips fit the held-out ones."""
-    sizes = [(each.frames, each.height, each.width) for each in (training, clips)]
-    if sizes[0] != sizes[1] or names_of(training.classes) != names_of(clips.classes):
-        raise DataError(
-            f"training and held-out clips must be of one kind, got T, H, W = {sizes[0]} and {sizes[1]}, "
-            f"classes {names_of(training.classes)} and {names_of(clips.classes)}; generate both alike"
-        )
-    if training.camera != clips.camera:
-        raise DataError(
-            f"training and held-out clips must be of one kind, got camera control {training.camera!r} and "
-            f"{clips.camera!r}; generate both alike"
-        )
-
-
 def names_of(classes: Sequence[SemanticClass]) -> str:
     """An ontology in one line."""
     return ", ".join(each.name for each in classes) or "none"
-
-
-_DIGITS = 12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,15 +118,14 @@ class PairedSet:
     frames: int = field(init=False)
     height: int = field(init=False)
     width: int = field(init=False)
-    fps: float = field(init=False)
     rates: Sequence[float] = field(init=False)
     _numbers: dict[str, int] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("camera", "classes", "frames", "height", "width", "fps"):
+        for name in ("camera", "classes", "frames", "height", "width"):
             object.__setattr__(self, name, getattr(self.clips, name))
         object.__setattr__(self, "kind", "driving" if self.camera == "none" else "orbit")
-        object.__setattr__(self, "rates", (self.fps,))
+        object.__setattr__(self, "rates", (self.clips.fps,))
         object.__setattr__(self, "_numbers", {key: number for number, key in enumerate(_keys(self.clips))})
 
     @classmethod
@@ -185,25 +145,28 @@ class PairedSet:
         return tuple(self._numbers)
 
     def number(self, key: str, /) -> int:
-        """Of the clip with this name. Raises DataError for another."""
-        if key not in self._numbers:
-            raise DataError(
-                f"there is no clip {key}; there are {len(self._numbers)}, first {next(iter(self._numbers))}"
-            )
+        """Of the clip with this name, which there must be."""
         return self._numbers[key]
 
     def clip(self, key: str, /) -> HeldOutClip:
         """See EvaluationSet."""
         number = self.number(key)
-        clip = self.clips[number]
+        clip, classes = self.clips[number], bool(self.classes)
         goal = self.clips.trajectory(number).goal_delta
         world, scene = self.clips.scene(number)
         return HeldOutClip(
             key=key,
             scene=f"{world}-{scene:08d}",
-            seen=replace(source_side(self.clips, number, clip, self.declared), key=key),
+            seen=SourceClip(
+                source=clip.source,
+                source_depth=clip.source_depth,
+                source_classes=clip.source_classes if classes else None,
+                cameras=cameras_of(self.clips, number, self.declared),
+                fps=self.clips.fps,
+                key=key,
+            ),
             target=clip.target,
-            target_classes=clip.target_classes if self.classes else None,
+            target_classes=clip.target_classes if classes else None,
             visible=seen_too(clip, cameras_of(self.clips, number), picked=self.picked),
             change=None if goal is None else (goal.azimuth_deg, goal.elevation_deg, goal.radius_m),
         )
@@ -262,7 +225,7 @@ def identity_of(clips: PairedClips, declared: CameraMount | None = None) -> str:
         if path not in sums:
             sums[path] = _checksums(path)
         digest.update(f"{name}{sums[path].get(name)}".encode())
-    return digest.hexdigest()[:_DIGITS]
+    return digest.hexdigest()[:12]
 
 
 def _checksums(shard: Path) -> dict[str, list[int]]:
@@ -275,3 +238,161 @@ def _checksums(shard: Path) -> dict[str, list[int]]:
     except ZIP_FAULTS as error:
         raise DataError(f"{shard} is damaged ({error}); delete it and generate again") from error
     return sums
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSet:
+    """Clips of whole scenes by name: `scn02900.sample_00`, the scene and its control.
+
+    pairs: makes the pictures; it must tell what is visible, and class ids where `classes` are wanted. controls: which
+    clips there are. frames, height, width: T, H and W of the clips. semantic: class maps are wanted. kind, identity:
+    see EvaluationSet.
+    """
+
+    pairs: ViewPairs
+    controls: ClipControls
+    frames: int
+    height: int
+    width: int
+    kind: SetKind
+    identity: str
+    semantic: bool = False
+    _places: dict[str, tuple[str, str]] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        places = {
+            f"{scene}.{name}": (scene, name) for scene in self.dataset.scenes for name in self.controls.names(scene)
+        }
+        object.__setattr__(self, "_places", places)
+
+    @property
+    def dataset(self) -> Dataset4D:
+        """Where scenes are read from."""
+        return self.pairs.dataset
+
+    @property
+    def ontology(self) -> Ontology | None:
+        """Of the data set, where class maps are wanted."""
+        return self.dataset.ontology if self.semantic else None
+
+    @property
+    def keys(self) -> Sequence[str]:
+        """Names, scene by scene."""
+        return tuple(self._places)
+
+    @property
+    def rates(self) -> Sequence[float]:
+        """As networks are told them, from the strides of all scenes."""
+        strides = {stride for scene in self.dataset.scenes for stride in self.controls.strides(scene)}
+        each = [Control(name="", frame_start=0, frame_skip=stride) for stride in strides]
+        return sorted({control.fps(self.dataset.fps) for control in each}, reverse=True)
+
+    @property
+    def camera(self) -> CameraControl:
+        """How a network is told where the target camera goes: driving has one path."""
+        return "none" if self.kind == "driving" else "spherical"
+
+    @property
+    def classes(self) -> Sequence[SemanticClass]:
+        """See EvaluationSet."""
+        return self.ontology.classes if self.ontology is not None else ()
+
+    def clip(self, key: str, /) -> HeldOutClip:
+        """See EvaluationSet. Every picture is made anew from the scene's files."""
+        scene, name = self._places[key]
+        control = self.controls.control(scene, name, self.dataset.frames(scene))
+        sample = self.pairs.controlled(scene, control)
+        ids, ontology, deltas = sample.target_classes, self.ontology, sample.deltas
+        return HeldOutClip(
+            key=key,
+            scene=scene,
+            seen=self._source_side(key, sample),
+            target=sample.target,
+            target_classes=None if ids is None or ontology is None else ontology.places[ids],
+            visible=sample.visible,
+            change=None if deltas is None else msgspec.convert(deltas[-1].tolist(), tuple[float, float, float]),
+        )
+
+    def _source_side(self, key: str, sample: Sample) -> SourceClip:
+        seen_by = [self.dataset.source_camera]
+        views = [view for time in sample.frame_numbers for view in self.dataset.views(sample.scene, time, seen_by)]
+        views = [replace(view, classes=self._places_of(view.classes)) for view in views]
+        cameras = self._cameras(sample, views[0])
+        apart = (cameras.ground_from_source - torch.from_numpy(views[0].world_from_camera)).abs().max()
+        own = float(apart) < SAME_POSE
+        ids = [view.classes for view in views if own and view.classes is not None]
+        if own:
+            depth = self._stacked([view.depth for view in views])
+        else:  # from the points of all cameras
+            pose, lens = cameras.ground_from_source.numpy(), cameras.source
+            seen = (splat(self.dataset.views(sample.scene, time), pose, lens) for time in sample.frame_numbers)
+            depth = np.stack([each.depth.cpu().numpy() for each in seen])
+        return SourceClip(
+            source=sample.source,
+            source_depth=depth,
+            source_classes=self._stacked(ids) if ids else None,
+            cameras=cameras,
+            fps=sample.fps,
+            key=key,
+            others=partial(self._others, sample.scene, sample.frame_numbers),
+            points=partial(tuple[SceneView, ...], views) if own else None,
+        )
+
+    def _cameras(self, sample: Sample, first: SceneView) -> CameraPair:
+        """Both cameras, in the scene's world or, in driving, in the vehicle's frame."""
+        lens = render_lens(self.dataset.lens(sample.scene), self.width, self.height)
+        path = pose_trajectory(torch.from_numpy(sample.source_from_target))
+        if sample.start is None or sample.deltas is None:
+            return CameraPair(
+                ground_from_source=torch.from_numpy(first.world_from_camera),
+                source=trained_lens(first.lens, self.width, self.height),
+                target=lens,
+                trajectory=path,
+                mount=CameraMount(),
+            )
+        path = replace(path, delta=torch.from_numpy(sample.deltas), source=sample.start)
+        return CameraPair(ground_from_source=to_pose(sample.start), source=lens, target=lens, trajectory=path)
+
+    def _places_of(self, ids: Bytes | None) -> Bytes | None:
+        """Places in the ontology; of those that share a colour, or have none, as they come back from a picture."""
+        if ids is None or self.ontology is None:
+            return None
+        return self.ontology.places[self.ontology.decode(self.ontology.encode(ids))]
+
+    def _stacked(self, rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
+        return np.stack([nearest_resized(row, self.width, self.height) for row in rows])
+
+    def _others(self, scene: str, times: Sequence[int], count: int) -> Sequence[Sequence[SceneView]]:
+        """See SourceClip. The farthest from the source first, then always the one farthest from all before."""
+        names = [name for name in self.dataset.cameras if name != self.dataset.source_camera]
+        if not 0 <= count <= len(names):
+            raise DataError(
+                f"{scene} has {len(names)} cameras beside the source, a method wants {count}; give it fewer views"
+            )
+        first = self.dataset.views(scene, times[0], [self.dataset.source_camera, *names])
+        at, order = np.stack([view.world_from_camera[:3, 3] for view in first]), [0]
+        while len(order) <= count:
+            order.append(int(np.linalg.norm(at[:, None] - at[order], axis=-1).min(axis=1).argmax()))
+        chosen = [names[place - 1] for place in order[1:]]
+        each = [self.dataset.views(scene, time, chosen) for time in times] if chosen else []
+        return [[self._other(views[place]) for views in each] for place in range(count)]
+
+    def _other(self, view: SceneView) -> SceneView:
+        """At the clips' size."""
+        classes = self._places_of(view.classes)
+        return SceneView(
+            rgb=trained_picture(view.rgb, self.width, self.height),
+            depth=nearest_resized(view.depth, self.width, self.height),
+            classes=None if classes is None else nearest_resized(classes, self.width, self.height),
+            instances=None,
+            world_from_camera=view.world_from_camera,
+            lens=trained_lens(view.lens, self.width, self.height),
+        )
+
+
+def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:
+    """What must not be averaged, in the size and crop of `trained_picture`: [H, W] -> [height, width]."""
+    left, top, across, along = center_crop_box(values.shape[1], values.shape[0], width / height)
+    rows = top + ((np.arange(height) + 0.5) * along / height).astype(np.intp)
+    columns = left + ((np.arange(width) + 0.5) * across / width).astype(np.intp)
+    return values[rows[:, None], columns]

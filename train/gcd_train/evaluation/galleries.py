@@ -77,10 +77,13 @@ def write_rows(place: Path, prediction: Prediction, classes: Sequence[SemanticCl
 
     place: of both, without a suffix.
     """
+    made: dict[str, Pictures] = {}
     if prediction.classes is not None and classes:
-        write_whole(Path(f"{place}.classes.png"), png(_in_a_row(painted(prediction.classes, classes))))
+        made[".classes.png"] = painted(prediction.classes, classes)
     if prediction.video is not None:
-        write_whole(Path(f"{place}.png"), png(_in_a_row(to_bytes(prediction.video))))
+        made[".png"] = to_bytes(prediction.video)
+    for suffix, frames in made.items():
+        write_whole(Path(f"{place}{suffix}"), png(np.concatenate(list(frames[shown_frames(len(frames))]), axis=1)))
 
 
 def has_rows(place: Path, record: ClipRecord) -> bool:
@@ -101,10 +104,6 @@ def read_row(path: Path, width: int) -> Pictures:
 def shown_frames(count: int) -> list[int]:
     """Those of so many frames that a row of a sheet shows, evenly among them."""
     return np.linspace(0, count - 1, min(SHOWN_FRAMES, count)).round().astype(int).tolist()
-
-
-def _in_a_row(frames: Pictures) -> Pictures:
-    return np.concatenate([frames[t] for t in shown_frames(len(frames))], axis=1)
 
 
 def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:
@@ -159,8 +158,9 @@ def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tupl
 
 def strips(methods: Sequence[Method], key: str) -> tuple[Strip, ...]:
     """Source, each method that kept frames of this clip, target. Raises DataError for a damaged picture."""
-    made = [Strip(name=method.name, frames=_read(_folder(method, key) / "sample_0")) for method in methods]
-    seen = {side: _side(methods, key, side) for side in ("source", "target")}
+    folders = [_folder(method, key) for method in methods]
+    made = [Strip(name=of.name, frames=_read(at / "sample_0")) for of, at in zip(methods, folders, strict=True)]
+    seen = {side: next(filter(None, (_read(at / side) for at in folders)), {}) for side in ("source", "target")}
     every = [Strip(name="source", frames=seen["source"]), *made, Strip(name="target", frames=seen["target"])]
     return tuple(strip for strip in every if strip.frames)
 
@@ -218,18 +218,13 @@ def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
     moments = sorted(set.intersection(*(set(row.frames) for row in rows))) if rows else []
     if len(moments) < 2:
         return False
-    frames = [_beside(rows, moment) for moment in moments]
+    frames = [beside(rows, moment) for moment in moments]
     write_mp4([*frames, *frames[-1:] * round(HOLD_S * fps)], max(fps, 1.0), out)
     return True
 
 
 def _folder(method: Method, key: str) -> Path:
     return RunKeeper(method.folder).views(method.name, key)
-
-
-def _side(methods: Sequence[Method], key: str, side: str) -> dict[int, Pictures]:
-    """The source or the target, from whichever method it was kept beside."""
-    return next((found for method in methods if (found := _read(_folder(method, key) / side))), {})
 
 
 def _read(folder: Path) -> dict[int, Pictures]:
@@ -258,7 +253,7 @@ def _row(label: str, strip: Strip) -> Pictures:
     return np.concatenate([margin, *(each.astype(np.uint8) for each in framed)], axis=1)
 
 
-def _beside(rows: Sequence[Strip], moment: int) -> Pictures:
+def beside(rows: Sequence[Strip], moment: int) -> Pictures:
     """All rows' pictures of one moment with their names above, of even size as codecs want it."""
     pictures = [row.frames[moment] for row in rows]
     captions = [caption(row.name, each.shape[1]) for row, each in zip(rows, pictures, strict=True)]

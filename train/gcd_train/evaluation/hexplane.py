@@ -1,14 +1,16 @@
-"""A dynamic scene as six planes of features, in plain torch.
+"""A dynamic scene as six planes of features, learnt from videos and drawn from other cameras, in plain torch.
 
 After Cao and Johnson 2023, "HexPlane: A Fast Representation for Dynamic Scenes".
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from gcd_model.geometry import Intrinsics
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,18 +39,14 @@ class HexPlaneSettings:
     picture_width: int = 192
 
 
-_INNER = 0.5
-"""Half a side of the box drawn to scale, as a share of the farthest camera's distance from its middle."""
+_INNER = 0.5  # half a side of the box drawn to scale, as a share of the farthest camera's distance from its middle
+# Where rays begin, as a share of the nearest camera's distance from the middle: pictures painted on the air in front of
+# each camera explain all inputs and no other view.
 _BEGIN = 0.3
-"""Where rays begin, as a share of the nearest camera's distance from the middle. Pictures painted on the air in front
-of each camera explain all inputs and no other view."""
+# Where rays end, in halves of the cube beyond the middle as the farthest camera sees it: what lies farther off is seen
+# by one camera only, and each would paint its whole picture there.
 _END = 0.5
-"""Where rays end, in halves of the cube beyond the middle as the farthest camera sees it. What lies farther off is seen
-by one camera only, and with many cameras around a scene each would paint its whole picture there."""
-_PULL = 1e-3
-"""Weight of a guess, against one camera's axis, for cameras that look along parallel lines."""
-_GUESS_M = 10.0
-"""How far ahead of cameras with parallel axes the guess lies."""
+_PULL, _GUESS_M = 1e-3, 10.0  # for cameras with parallel axes: weight of a guess, and how far ahead it lies
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -109,9 +107,8 @@ def nearest_to_axes(world_from_camera: Tensor) -> Tensor:
 
 
 SPACE = ((0, 1), (0, 2), (1, 2))
-"""Planes xy, xz and yz; each meets the plane of time below it."""
 TIME = ((2, 3), (1, 3), (0, 3))
-"""Planes zt, yt and xt."""
+"""Planes xy, xz and yz; each meets a plane of time: zt, yt and xt."""
 
 
 class HexPlanes(nn.Module):
@@ -129,11 +126,6 @@ class HexPlanes(nn.Module):
         space = 0.1 + 0.4 * torch.rand(3, features, side, side, generator=generator)
         self.space = nn.Parameter(space)
         self.time = nn.Parameter(torch.ones(3, features, moments, side))  # nothing moves until pictures say so
-
-    @property
-    def features(self) -> int:
-        """Numbers at a point: three pairs of C."""
-        return 3 * self.space.shape[1]
 
     def forward(self, points: Tensor) -> Tensor:
         """points: [P, 4], x y z t, each in [-1, 1] -> [P, 3 C]."""
@@ -154,9 +146,10 @@ class HexPlanes(nn.Module):
     @torch.no_grad()
     def refine(self, side: int) -> None:
         """Give the planes more cells along the axes of space; what they hold between the old cells stays."""
-        moments = self.time.shape[2]
-        self.space = nn.Parameter(_resized(self.space, side, side))
-        self.time = nn.Parameter(_resized(self.time, moments, side))
+        for name, rows in (("space", side), ("time", self.time.shape[2])):
+            table: Tensor = getattr(self, name)
+            finer = F.interpolate(table, size=(rows, side), mode="bilinear", align_corners=True)
+            setattr(self, name, nn.Parameter(finer))
 
 
 def sampled(planes: Tensor, at: Tensor) -> Tensor:
@@ -168,16 +161,9 @@ def sampled(planes: Tensor, at: Tensor) -> Tensor:
     return F.grid_sample(planes, grid, align_corners=True, padding_mode="border")[:, :, 0]
 
 
-def _resized(planes: Tensor, rows: int, columns: int) -> Tensor:
-    return F.interpolate(planes, size=(rows, columns), mode="bilinear", align_corners=True)
-
-
-_THIN = -1.0
-"""Added to the density before it is made positive, so that space is a fog at first that lets half of the light pass."""
+_THIN = -1.0  # added to the density, so that space is a fog at first that lets half of the light pass
 _HARMONICS = 9
-_HEIGHT_WAVES = (2.0, 4.0, 8.0, 16.0)
-"""Waves over the vertical part of a direction, in radians of phase, for a sharp horizon all around."""
-
+_HEIGHT_WAVES = (2.0, 4.0, 8.0, 16.0)  # over the vertical part of a direction, radians, for a sharp horizon all around
 _BACKGROUND_WIDTH = 32
 
 
@@ -196,7 +182,7 @@ class HexField(nn.Module):
         super().__init__()
         self.bounds = bounds
         self.planes = HexPlanes(features=settings.features, side=settings.sides[0], moments=frames, generator=generator)
-        self.trunk = _linear(self.planes.features, settings.hidden, generator)
+        self.trunk = _linear(3 * settings.features, settings.hidden, generator)
         self.density_head = _linear(settings.hidden, 1, generator)
         self.colour_head = nn.Sequential(
             _linear(settings.hidden, settings.hidden, generator),
@@ -240,44 +226,23 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     return layer
 
 
-_SPREAD = 0.01
-"""Weight that every stretch of a ray gets before samples are drawn, so that no surface is missed for good."""
+_SPREAD = (
+    0.01  # weight that every stretch of a ray gets before samples are drawn, so that no surface is missed for good
+)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Rays:
-    """P rays. origins: [P, 3] and directions: [P, 3] of length 1, world, metres. times: [P], -1 first frame, 1 last."""
-
-    origins: Tensor
-    directions: Tensor
-    times: Tensor
-
-    def to(self, device: torch.device | str) -> "Rays":
-        """The same rays on a device of torch."""
-        return Rays(origins=self.origins.to(device), directions=self.directions.to(device), times=self.times.to(device))
-
-    def __getitem__(self, chosen: Tensor | slice) -> "Rays":
-        return Rays(origins=self.origins[chosen], directions=self.directions[chosen], times=self.times[chosen])
-
-    @classmethod
-    def together(cls, some: Sequence["Rays"]) -> "Rays":
-        """All of them."""
-        return cls(
-            origins=torch.cat([each.origins for each in some]),
-            directions=torch.cat([each.directions for each in some]),
-            times=torch.cat([each.times for each in some]),
-        )
-
-
-def render(field: HexField, rays: Rays, *, coarse: int, fine: int, generator: torch.Generator | None = None) -> Tensor:
+def render(
+    field: HexField, rays: Tensor, *, coarse: int, fine: int, generator: torch.Generator | None = None
+) -> Tensor:
     """Colours of rays, [P, 3] in [0, 1], with gradients to the field.
 
     Args:
+        rays: float32 [P, 7]: origin and direction of length 1 in the world, metres; time, -1 first frame, 1 last.
         coarse, fine: samples that look for surfaces, and samples there that make the colour.
         generator: moves the samples at random; None leaves them in the middle of their stretches.
     Source: Mildenhall et al. 2020 (NeRF), sections 4 and 5.2, with one field for both passes.
     """
-    even = torch.linspace(0.0, 1.0, coarse + 1, device=rays.origins.device).expand(len(rays.origins), -1)
+    even = torch.linspace(0.0, 1.0, coarse + 1, device=rays.device).expand(len(rays), -1)
     with torch.no_grad():
         searched = _jittered(even, generator)
         features, lengths = _along(field, rays, searched)
@@ -287,7 +252,7 @@ def render(field: HexField, rays: Rays, *, coarse: int, fine: int, generator: to
     share = weights(field.density(features).view_as(lengths) * lengths)
     passed = 1.0 - share.sum(dim=1, keepdim=True)
     seen = (share[..., None] * field.colour(features).view(*share.shape, 3)).sum(dim=1)
-    return seen + passed * field.background(rays.directions)
+    return seen + passed * field.background(rays[:, 3:6])
 
 
 def weights(optical_depth: Tensor) -> Tensor:
@@ -331,10 +296,103 @@ def _jittered(edges: Tensor, generator: torch.Generator | None) -> Tensor:
     return edges + step * moved
 
 
-def _along(field: HexField, rays: Rays, edges: Tensor) -> tuple[Tensor, Tensor]:
+def _along(field: HexField, rays: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
     """Features in the middle of stretches, [P * N, D], and the stretches' lengths in metres, [P, N]."""
     distances = field.bounds.to_distance(edges)
     middle = (distances[:, 1:] + distances[:, :-1]) / 2.0
-    points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
-    times = rays.times[:, None].expand_as(middle)
+    points = rays[:, None, :3] + middle[..., None] * rays[:, None, 3:6]
+    times = rays[:, 6:].expand_as(middle)
     return field(points.flatten(0, 1), times.flatten()), distances.diff(dim=-1)
+
+
+_RAYS_AT_ONCE = 4096  # drawn together without gradients: 4096 rays of 48 samples with 48 features are 38 MB
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Camera:
+    """Where and when a picture is taken.
+
+    world_from_camera: float [4, 4], metres. time: -1 for the first frame of the clip, 1 for the last.
+    """
+
+    lens: Intrinsics
+    world_from_camera: Tensor
+    time: float
+
+    def rays(self) -> Tensor:
+        """Through the middle of every pixel, row by row, as `render` wants them."""
+        u = (torch.arange(self.lens.width) + 0.5 - self.lens.cx) / self.lens.fx
+        v = (torch.arange(self.lens.height) + 0.5 - self.lens.cy) / self.lens.fy
+        down, right = torch.meshgrid(v, u, indexing="ij")
+        ahead = F.normalize(torch.stack([right, down, torch.ones_like(right)], dim=-1).view(-1, 3), dim=-1)
+        pose = self.world_from_camera.float()
+        time = ahead.new_full((len(ahead), 1), self.time)
+        return torch.cat([pose[:3, 3].expand(len(ahead), 3), ahead @ pose[:3, :3].T, time], dim=1)
+
+    def narrowed(self, width: int) -> "Camera":
+        """The camera of the same picture at most this wide."""
+        if self.lens.width <= width:
+            return self
+        height = max(1, round(self.lens.height * width / self.lens.width))
+        return replace(self, lens=self.lens.resized(width, height))
+
+
+def learn(
+    pictures: Sequence[tuple[Tensor, Camera]],
+    bounds: SceneBounds,
+    settings: HexPlaneSettings,
+    *,
+    frames: int,
+    seed: int = 0,
+    device: str = "auto",
+) -> HexField:
+    """The field that shows the pictures again.
+
+    Args:
+        pictures: of one scene, float32 [3, H, W] in [0, 1], with their cameras.
+        frames: T of the clip. seed: of weights, rays and samples.
+        device: "auto" (CUDA where there is one), or as torch names it; the field stays there.
+    Returns:
+        On the CPU the same field for the same pictures, settings, seed and number of threads.
+    """
+    auto = "cuda" if torch.cuda.is_available() else "cpu"
+    place, generator = torch.device(auto if device == "auto" else device), torch.Generator().manual_seed(seed)
+    narrow = [camera.narrowed(settings.picture_width) for _, camera in pictures]  # so that learning costs less
+    rays = torch.cat([camera.rays() for camera in narrow]).to(place)
+    sizes = [(camera.lens.height, camera.lens.width) for camera in narrow]
+    shown = [F.interpolate(of[None], size=size, mode="area") for (of, _), size in zip(pictures, sizes, strict=True)]
+    colours = torch.cat([each[0].flatten(1).T for each in shown]).to(place)
+    field = HexField(bounds, frames, settings, generator).to(place)
+    heads = [weight for name, weight in field.named_parameters() if not name.startswith("planes.")]
+    done = 0
+    for stage, side in enumerate(settings.sides, start=1):
+        field.planes.refine(side)
+        rates = (settings.plane_rate, settings.head_rate)
+        groups = [{"params": list(field.planes.parameters())}, {"params": heads}]
+        optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        end = settings.updates * stage // len(settings.sides)
+        for number in range(done, end):
+            for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                group["lr"] = rate * 0.1 ** (number / settings.updates)  # to a tenth at the end
+            chosen = torch.randint(len(colours), (settings.rays,), generator=generator).to(place)
+            made = render(field, rays[chosen], coarse=settings.coarse, fine=settings.fine, generator=generator)
+            error = F.mse_loss(made, colours[chosen])
+            optimiser.zero_grad(set_to_none=True)
+            (error + settings.smoothness * field.planes.roughness()).backward()
+            optimiser.step()
+        done = end
+    return field.eval()
+
+
+@torch.no_grad()
+def draw(field: HexField, camera: Camera, settings: HexPlaneSettings) -> Tensor:
+    """The picture of a camera, float32 [3, H, W] on the CPU, in [0, 1], in the size of its lens."""
+    narrow = camera.narrowed(settings.picture_width)
+    rays, rows = narrow.rays(), list[Tensor]()
+    for start in range(0, len(rays), _RAYS_AT_ONCE):
+        some = rays[start : start + _RAYS_AT_ONCE].to(field.planes.space.device)
+        rows.append(render(field, some, coarse=settings.coarse, fine=settings.fine).cpu())
+    picture, size = torch.cat(rows).T.reshape(3, narrow.lens.height, -1), (camera.lens.height, camera.lens.width)
+    if narrow is camera:
+        return picture
+    return F.interpolate(picture[None], size=size, mode="bicubic", align_corners=False)[0].clamp(0.0, 1.0)

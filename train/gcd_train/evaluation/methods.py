@@ -4,8 +4,9 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeAlias
 
 import torch
 from torch import Tensor
@@ -25,14 +26,19 @@ from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings, build, described, hexplane_views, usual_baselines
-from gcd_train.evaluation.clips import ClipFacts, names_of
+from gcd_train.evaluation.baselines import (
+    VANILLA_SVD,
+    BaselineSettings,
+    build,
+    described,
+    hexplane_views,
+    usual_baselines,
+)
+from gcd_train.evaluation.clips import EvaluationSet, names_of
+from gcd_train.evaluation.measure import Maker
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SourceClip
-from gcd_train.evaluation.runner import Maker
-from gcd_train.evaluation.saved_frames import SavedFrames
+from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SavedFrames, SourceClip
 from gcd_train.evaluation.store import FRAMES_IN
-from gcd_train.evaluation.svd import VANILLA_SVD
 
 _SAME_PATH_M = 1e-3
 """Largest difference between the entries of two poses that count as one; more is another path."""
@@ -54,17 +60,14 @@ class SynthesizedViews:
     privileged: bool = False
 
     @classmethod
-    def of(cls, synthesizer: ViewSynthesizer, clips: ClipFacts, options: RenderOptions | None = None) -> Self:
+    def of(cls, synthesizer: ViewSynthesizer, clips: EvaluationSet, options: RenderOptions | None = None) -> Self:
         """A model that is measured on these clips.
 
         Raises DataError where model and clips do not fit together.
         """
         _require_fit(synthesizer, clips)
-        made = cls(
-            synthesizer=synthesizer,
-            options=RenderOptions() if options is None else options,
-            classes=len(clips.classes) or None,
-        )
+        options = RenderOptions() if options is None else options
+        made = cls(synthesizer=synthesizer, options=options, classes=len(clips.classes) or None)
         if not made.paints_classes or synthesizer.traits.classes:
             return made
         if not clips.classes:
@@ -142,7 +145,7 @@ def told_of(options: RenderOptions) -> str:
     return ", ".join(told)
 
 
-def _require_fit(synthesizer: ViewSynthesizer, clips: ClipFacts) -> None:
+def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
     traits = synthesizer.traits
     wanted = (traits.config.frames, traits.config.height, traits.config.width)
     given = (clips.frames, clips.height, clips.width)
@@ -158,11 +161,6 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: ClipFacts) -> None:
         raise DataError(f"{traits.name} has classes {names_of(traits.classes)}, the clips {names_of(clips.classes)}")
 
 
-_SVD = "svd"
-"""The family of image-to-video weights."""
-_DIGITS = 12
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Method:
     """One row of a table. make: the method itself, in any process. told: what it is, for `run.json`."""
@@ -172,20 +170,19 @@ class Method:
     told: dict[str, str]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Weights:
-    """Weights by name or path, and where they compute; see `load_synthesizer`."""
-
-    path: str
-    device: str = "auto"
-    dtype: str | None = None
-
-    def open(self) -> ViewSynthesizer:
-        """The model, opened once in each process. Raises CheckpointError."""
-        return _opened(self)
+OpenedWeights: TypeAlias = Callable[[], ViewSynthesizer]
+"""Gives a model, opened once in each process: `partial` of `open_weights`. Raises CheckpointError."""
 
 
-def of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions, steps: Sequence[int]) -> tuple[Method, ...]:
+@lru_cache(maxsize=1)
+def open_weights(path: str, device: str, dtype: str | None) -> ViewSynthesizer:
+    """Weights by name or path; see `load_synthesizer`."""
+    return load_synthesizer(path, device=device, dtype=dtype)
+
+
+def of_weights(
+    weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions, steps: Sequence[int]
+) -> tuple[Method, ...]:
     """The weights as they ship, then with each other number of steps.
 
     Args:
@@ -193,44 +190,35 @@ def of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions, steps
     Raises:
         DataError: the weights do not fit the clips. CheckpointError: they cannot be opened.
     """
-    shipped = weights.open().traits.config.sampling.steps
+    shipped = weights().traits.config.sampling.steps
     others = [number for number in dict.fromkeys(steps) if number != shipped]
     return tuple(_of_weights(weights, clips, replace(options, steps=number)) for number in (None, *others))
 
 
-def of_baselines(names: Sequence[str] | None, settings: BaselineSettings, trained_on: str) -> tuple[Method, ...]:
+def of_baselines(
+    names: Sequence[str] | None, settings: BaselineSettings, *, trained_on: str, others: int
+) -> tuple[Method, ...]:
     """Baselines by name; those that need nothing but the data where none are named.
 
     Args:
-        trained_on: identity of the training clips, "nothing" without.
+        trained_on: identity of the training clips, "nothing" without. others: cameras beside the source.
     Raises:
         RecipeError: there is none of a name, or it lacks what it needs.
     """
     chosen = usual_baselines(settings) if names is None else names
-    if VANILLA_SVD in chosen and settings.svd is not None:
-        _require_image_to_video(settings.svd)
     for name in chosen:
-        if name != VANILLA_SVD or settings.svd is None:
-            build(name, settings)  # to refuse at once; weights are opened where they are used
-    return tuple(
-        Method(
-            name=name,
-            make=partial(build, name, settings),
-            told=described(name, settings, trained_on),
-        )
-        for name in chosen
-    )
-
-
-def require_views(names: Sequence[str], others: int) -> None:
-    """Raises RecipeError where a HexPlane wants more views than there are. others: cameras beside the source."""
-    for name in names:
-        views = hexplane_views(name)
-        if views is not None and views > others + 1:
+        if (hexplane_views(name) or 0) > others + 1:
             there = f"{others} beside the source" if others else "the source alone"
             raise RecipeError(
-                f"{name} wants {views} cameras, and these clips have {there}; give hexplane_{others + 1} or less"
+                f"{name} wants {hexplane_views(name)} cameras, and these clips have {there}; give "
+                f"hexplane_{others + 1} or less"
             )
+        if name == VANILLA_SVD and settings.svd is not None:  # weights are opened where they are used
+            _require_image_to_video(settings.svd)
+        else:
+            build(name, settings)  # to refuse at once
+    told = {name: described(name, settings, trained_on) for name in chosen}
+    return tuple(Method(name=name, make=partial(build, name, settings), told=told[name]) for name in chosen)
 
 
 def of_saved_frames(
@@ -259,8 +247,8 @@ def of_saved_frames(
 def _require_image_to_video(weights: str) -> None:
     """Raises RecipeError for weights that say they do something else; CheckpointError if they cannot be opened."""
     kind, _, name = weights.partition(":")
-    family = name if kind == "random" else inspect_weights(weights_path(weights)).family or _SVD
-    if family != _SVD:
+    family = name if kind == "random" else inspect_weights(weights_path(weights)).family or "svd"
+    if family != "svd":
         raise RecipeError(
             f"{VANILLA_SVD} wants weights that make a video out of a picture, {weights} is of the family {family}; "
             "give svd.safetensors"
@@ -269,16 +257,16 @@ def _require_image_to_video(weights: str) -> None:
 
 def require_names_apart(methods: Sequence[Method]) -> None:
     """Raises RecipeError where two methods have one name."""
-    names = [method.name for method in methods]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise RecipeError(
-            f"each method needs a name of its own, got {twice[0]} twice; rename the frames of --predictions"
-        )
+    names = sorted(method.name for method in methods)
+    for first, second in pairwise(names):
+        if first == second:
+            raise RecipeError(
+                f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
+            )
 
 
-def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> Method:
-    made = SynthesizedViews.of(weights.open(), clips, options)
+def _of_weights(weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions) -> Method:
+    made = SynthesizedViews.of(weights(), clips, options)
     traits = made.synthesizer.traits
     used = sampler_of(traits.config.sampling, options)
     told = {
@@ -297,14 +285,9 @@ def _of_weights(weights: Weights, clips: ClipFacts, options: RenderOptions) -> M
 
 
 def _synthesized(
-    weights: Weights, options: RenderOptions, painted: tuple[SemanticClass, ...], classes: int | None
+    weights: OpenedWeights, options: RenderOptions, painted: tuple[SemanticClass, ...], classes: int | None
 ) -> Predictor:
-    return SynthesizedViews(synthesizer=weights.open(), options=options, painted=painted, classes=classes)
-
-
-@lru_cache(maxsize=1)
-def _opened(weights: Weights) -> ViewSynthesizer:
-    return load_synthesizer(weights.path, device=weights.device, dtype=weights.dtype)
+    return SynthesizedViews(synthesizer=weights(), options=options, painted=painted, classes=classes)
 
 
 def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...], privileged: Sequence[str]) -> Method:
@@ -329,4 +312,4 @@ def _listing(folder: Path) -> str:
                 digest.update(f"{path.relative_to(folder)} {content}\n".encode())
     except OSError as error:
         raise DataError(f"{folder} cannot be read ({error}); give NAME=FOLDER") from error
-    return digest.hexdigest()[:_DIGITS]
+    return digest.hexdigest()[:12]

@@ -3,7 +3,7 @@
 import difflib
 import hashlib
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +23,7 @@ from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read_scene_list, read_split
 from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.clips import EvaluationSet, PairedSet, chosen
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
 from gcd_train.evaluation.protocol import (
     AS_PLANNED,
     SAMPLES,
@@ -37,9 +37,7 @@ from gcd_train.evaluation.protocol import (
     released_controls,
     require_cameras,
     scene_number,
-    usual_clips,
 )
-from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 
@@ -67,29 +65,27 @@ class PublicSplit:
         return sum(map(len, self.runs))
 
 
-def public_split_names() -> tuple[str, ...]:
-    """All there are, by name."""
-    return tuple(sorted(f"{stem}-{part}" for stem, world in _worlds().items() for part in world.parts))
-
-
-def _worlds() -> dict[str, _World]:
-    """By the name of their file."""
-    found = [file for file in (files("gcd_train") / "splits_public").iterdir() if file.name.endswith(".json")]
-    return {file.name.removesuffix(".json"): msgspec.json.decode(file.read_bytes(), type=_World) for file in found}
+def public_splits() -> dict[str, PublicSplit]:
+    """All there are by name, such as `driving-test`."""
+    found: dict[str, PublicSplit] = {}
+    for file in (files("gcd_train") / "splits_public").iterdir():
+        if file.name.endswith(".json"):
+            told = msgspec.json.decode(file.read_bytes(), type=_World)
+            for part, runs in told.parts.items():
+                name = f"{file.name.removesuffix('.json')}-{part}"
+                each = tuple(range(first, first + count) for first, count in runs)
+                found[name] = PublicSplit(name=name, world=told.world, runs=each)
+    return dict(sorted(found.items()))
 
 
 def public_split(name: str) -> PublicSplit:
     """The part of that name. Raises RecipeError for another."""
-    if name not in public_split_names():
-        near = difflib.get_close_matches(name, public_split_names(), n=1)
+    every = public_splits()
+    if name not in every:
+        near = difflib.get_close_matches(name, every, n=1)
         meant = f"did you mean {near[0]}? " if near else ""
-        raise RecipeError(
-            f"no split is called {name!r}, and it is no file; {meant}there are {', '.join(public_split_names())}"
-        )
-    stem, _, part = name.rpartition("-")
-    world = _worlds()[stem]
-    runs = tuple(range(first, first + count) for first, count in world.parts[part])
-    return PublicSplit(name=name, world=world.world, runs=runs)
+        raise RecipeError(f"no split is called {name!r}, and it is no file; {meant}there are {', '.join(every)}")
+    return every[name]
 
 
 _PARTS: dict[str, Part] = {part: part for part in get_args(Part)}
@@ -105,20 +101,6 @@ class Choice:
     split: str | None = None
     listed: Path | None = None
     limit: int | None = None
-
-
-def pairs_of_split(name: str, scenes: Collection[tuple[str, int]], notes: Skips) -> set[tuple[str, int]]:
-    """Scenes of pairs, each a world and a seed, that are of a public split. notes: gets what is missing.
-
-    Raises: RecipeError for no such split, DataError where none of the scenes is of its world.
-    """
-    split = public_split(name)
-    worlds = sorted({world for world, _ in scenes})
-    if split.world not in worlds:
-        raise _of_another_world(split, f"these pairs are of {', '.join(worlds) or 'none'}")
-    wanted = {(world, seed) for world, seed in scenes if world == split.world and seed in split}
-    _note_missing(split, {seed for _, seed in wanted}, notes)
-    return wanted
 
 
 def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Skips) -> tuple[str, ...]:
@@ -140,13 +122,13 @@ def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Ski
     file = Path(place if part in _PARTS and place else choice.split)
     if file.is_file():
         return present(read_split(file, _PARTS.get(part, "test")), there, notes, file)
-    return _of_public_split(folder, there, public_split(choice.split), notes)
-
-
-def _of_public_split(folder: Path, there: Sequence[str], split: PublicSplit, notes: Skips) -> tuple[str, ...]:
+    split = public_split(choice.split)
     scenes = tuple(scene for scene in there if scene_number(scene) in split)
     for scene in scenes or there[:1]:
-        world = _world(folder / scene)
+        if (folder / scene / MANIFEST).is_file():
+            world = read_manifest(folder / scene).world
+        else:  # it was published, and counts as its layout
+            world = "kubric4d" if kubric4d.scene_number(scene) is not None else "parallel_domain4d"
         if world != split.world:
             raise _of_another_world(split, f"{folder / scene} is of {world}")
     _note_missing(split, {scene_number(scene) for scene in scenes}, notes)
@@ -155,13 +137,6 @@ def _of_public_split(folder: Path, there: Sequence[str], split: PublicSplit, not
 
 def _of_another_world(split: PublicSplit, came: str) -> DataError:
     return DataError(f"--split {split.name} is for the world {split.world}, but {came}; give another --split or --data")
-
-
-def _world(scene: Path) -> str:
-    """As its manifest says; a scene without one was published, and counts as its layout."""
-    if (scene / MANIFEST).is_file():
-        return read_manifest(scene).world
-    return "kubric4d" if kubric4d.scene_number(scene.name) is not None else "parallel_domain4d"
 
 
 def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
@@ -173,7 +148,6 @@ def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
 DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
 """What a folder holds."""
 
-_DIGITS = 12
 _SMALL_BYTES = 4 << 20
 
 
@@ -253,10 +227,19 @@ def open_pairs(
     if choice.listed is not None:
         raise RecipeError("--list names whole scenes, and these are pairs; give --split NAME, or leave it out")
     clips = PairedClips.open([folder.resolve() for folder in folders])  # processes may stand elsewhere
-    notes, scenes = Skips(logged=False), [clips.scene(number) for number in range(len(clips))]
-    wanted = None if choice.split is None else pairs_of_split(choice.split, scenes, notes)
+    notes, wanted = Skips(logged=False), None
+    if choice.split is not None:
+        split, scenes = public_split(choice.split), {clips.scene(number) for number in range(len(clips))}
+        worlds = sorted({world for world, _ in scenes})
+        if split.world not in worlds:
+            raise _of_another_world(split, f"these pairs are of {', '.join(worlds) or 'none'}")
+        wanted = {(world, seed) for world, seed in scenes if world == split.world and seed in split}
+        _note_missing(split, {seed for _, seed in wanted}, notes)
+    if clips.camera != "none" and mount is not None:
+        raise RecipeError("these clips have no vehicle to mount a camera on: leave out --declared-height and -tilt")
+    declared = mount or CameraMount() if clips.camera == "none" else None
     some = chosen(clips, scenes=wanted, limit=choice.limit)
-    return PairedSet.of(some, declared=_declared(mount, clips)), tuple(notes.plain_lines())
+    return PairedSet.of(some, declared=declared), tuple(notes.plain_lines())
 
 
 def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[EvaluationSet, tuple[str, ...]]:
@@ -303,15 +286,6 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
     return clips, (*notes.plain_lines(), *odd)
 
 
-def _declared(mount: CameraMount | None, clips: PairedClips) -> CameraMount | None:
-    """None where there is no vehicle."""
-    if clips.camera == "none":
-        return mount or CameraMount()
-    if mount is not None:
-        raise RecipeError("these clips have no vehicle to mount a camera on: leave out --declared-height and -tilt")
-    return None
-
-
 def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | ParallelDomain4D:
     names = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
     if not orbits:
@@ -322,7 +296,7 @@ def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | Paral
 
 
 def _controls(cuts: SceneCuts, scenes: Sequence[str], *, orbits: bool) -> ClipControls:
-    clips = usual_clips(cuts.protocol, orbit=orbits) if cuts.clips is None else cuts.clips
+    clips = cuts.clips or (4 if cuts.protocol == "paper" and orbits else 1)
     if cuts.controls is not None:
         if cuts.protocol == "paper" and cuts.bounds != AS_PLANNED:
             raise RecipeError(
@@ -356,7 +330,7 @@ def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
         digest.update(read_small(cuts.controls, MOST_BYTES).encode())
     for scene in scenes:
         digest.update(scene.encode() + fingerprint(folder / scene))
-    return digest.hexdigest()[:_DIGITS]
+    return digest.hexdigest()[:12]
 
 
 def fingerprint(folder: Path) -> bytes:

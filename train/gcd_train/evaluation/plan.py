@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from math import isnan
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -15,29 +16,26 @@ from gcd_model import Quality, RenderOptions, SolverName, Traits
 from gcd_model.geometry import CameraMount
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.splits import require_apart
-from gcd_train.errors import RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings
-from gcd_train.evaluation.clips import EvaluationSet, PairedSet, class_grid, identity_of, require_same_kind
-from gcd_train.evaluation.galleries import Strip, contact_rows, write_sheet
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings, build
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, identity_of, names_of
+from gcd_train.evaluation.galleries import contact_rows, write_sheet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
-from gcd_train.evaluation.lpips import Lpips
 from gcd_train.evaluation.methods import (
     Method,
-    Weights,
     of_baselines,
     of_saved_frames,
     of_weights,
+    open_weights,
     require_names_apart,
-    require_views,
 )
+from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
-from gcd_train.evaluation.predictors import TargetStatistics, fit_statistics
+from gcd_train.evaluation.predictors import fit_statistics
 from gcd_train.evaluation.protocol import FrameBounds, ProtocolName
-from gcd_train.evaluation.scene_clips import SceneSet
 from gcd_train.evaluation.statistics import FigureName, Selection
 from gcd_train.evaluation.store import LPIPS, ClipRecord, RunKeeper, RunNote
 from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, best_of, evaluation
-from gcd_train.evaluation.svd import VANILLA_SVD
 from gcd_train.layouts.manifest import package_version
 
 ProgressBar: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
@@ -117,8 +115,8 @@ class Plan:
 
     notes: what is odd about the clips, line by line. models, baselines, saved: methods, in the order of the table;
     baselines that want means cannot be used before `with_means`. model: what is known of the weights, None without.
-    training: pairs for means, of the identity `trained_on`. painted: targets are class maps in colours. lpips: digest
-    of its weights, None without.
+    settings: of the baselines. training: pairs for means. painted: targets are class maps in colours. lpips: digest of
+    its weights, None without.
     """
 
     options: EvaluateOptions
@@ -128,8 +126,8 @@ class Plan:
     baselines: tuple[Method, ...]
     saved: tuple[Method, ...]
     model: Traits | None
+    settings: BaselineSettings
     training: PairedClips | None
-    trained_on: str
     painted: bool
     lpips: str | None
 
@@ -147,9 +145,9 @@ class Plan:
             return self
         with bar("training clips", len(self.training)) as show:
             statistics = fit_statistics(self.training, progress=lambda done, _: show(done))
-        return replace(
-            self, baselines=_baselines(self.options, self.clips, statistics, self.trained_on, painted=self.painted)
-        )
+        settings = replace(self.settings, statistics=statistics)
+        made = tuple(replace(each, make=partial(build, each.name, settings)) for each in self.baselines)
+        return replace(self, baselines=made, settings=settings)
 
     def note(self, command: str) -> RunNote:
         """What the run says of itself. command: the line that began it."""
@@ -171,7 +169,7 @@ class Plan:
             frames=clips.frames,
             height=clips.height,
             width=clips.width,
-            fps=clips.fps,
+            fps=clips.rates[0],
             rates=tuple(clips.rates) if len(clips.rates) > 1 else (),
             seed=options.seed,
             classes=tuple(each.name for each in clips.classes),
@@ -194,7 +192,7 @@ class Plan:
                 shots=tuple(Shot.of(clips, record) for record in next(iter(rows.values()))),
                 frames=clips.frames,
                 size=(clips.height, clips.width),
-                grid=class_grid(clips),
+                grid=(clips.height // 2, clips.width // 2),
                 camera=clips.camera,
                 true_mount=MountNumbers.of(None if pairs is None else pairs.clips.mount),
                 declared_mount=MountNumbers.of(None if pairs is None else pairs.declared),
@@ -211,11 +209,12 @@ class Plan:
 
     def write_sheet(self, path: Path, summary: Summary, keys: Sequence[str], keeper: RunKeeper) -> None:
         """The contact sheet of the first clips of a summary. Raises RunError."""
-        clips: list[tuple[str, tuple[Strip, ...]]] = []
-        for each, key in zip(summary.conditions.shots, keys, strict=False):
-            methods = [(name, keeper.sheet_rows(name, key)) for name in _on_the_sheet(summary)]
-            clips.append((str(each), contact_rows(self.clips.clip(key), methods, self.clips.classes)))
-        write_sheet(clips, path)
+        shown, classes = _on_the_sheet(summary), self.clips.classes
+        rows = [
+            contact_rows(self.clips.clip(key), [(name, keeper.sheet_rows(name, key)) for name in shown], classes)
+            for key in keys
+        ]
+        write_sheet(list(zip(map(str, summary.conditions.shots), rows, strict=False)), path)
 
 
 def planned(options: EvaluateOptions) -> Plan:
@@ -228,24 +227,25 @@ def planned(options: EvaluateOptions) -> Plan:
     _require_used(options)
     lpips = None if options.lpips is None else Lpips.open(options.lpips).identity
     choice = Choice(split=options.split, listed=options.listed, limit=options.limit)
-    weights = None
+    weights, model, painted = None, None, False
     if options.weights is not None:
-        weights = Weights(path=_resolved(options.weights), device=options.device, dtype=options.dtype)
-    painted = False
+        weights = partial(open_weights, _resolved(options.weights), options.device, options.dtype)
+        model = weights().traits
     if data_kind(options.data) == "pairs":
         _require_pairs_options(options)
         clips, notes = open_pairs(options.data, choice, options.mount)
-        model = None if weights is None else weights.open().traits
     else:
-        model = None if weights is None else weights.open().traits
         cuts = _cuts(options, model)
         clips, notes = open_scenes(options.data[0], choice, cuts)
         painted = cuts.semantic
     training = _training(options, clips)
-    trained_on = "nothing" if training is None else identity_of(training)
     models = () if weights is None else of_weights(weights, clips, options.sampling, options.steps or ())
-    standing_in = None if training is None else _nothing_yet(clips)
-    baselines = _baselines(options, clips, standing_in, trained_on, painted=painted)
+    settings = _settings(options, clips, training, painted=painted)
+    trained_on = "nothing" if training is None else identity_of(training)
+    further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera
+    baselines = (
+        of_baselines(options.names, settings, trained_on=trained_on, others=further) if options.baselines else ()
+    )
     saved = of_saved_frames(
         options.predictions or (), clips.classes if painted else (), privileged=options.privileged or ()
     )
@@ -260,8 +260,8 @@ def planned(options: EvaluateOptions) -> Plan:
         baselines=baselines,
         saved=saved,
         model=model,
+        settings=settings,
         training=training,
-        trained_on=trained_on,
         painted=painted,
         lpips=lpips,
     )
@@ -318,30 +318,24 @@ def _training(options: EvaluateOptions, clips: EvaluationSet) -> PairedClips | N
     if not isinstance(clips, PairedSet):
         raise RecipeError("means are taken over pairs, and these are scenes: leave out --train")
     training = PairedClips.open(list(options.train), options.train_limit)
-    require_same_kind(training, clips.clips)
+    kinds = [
+        f"T, H, W = {(each.frames, each.height, each.width)}, classes {names_of(each.classes)}, camera control "
+        f"{each.camera!r}"
+        for each in (training, clips.clips)
+    ]
+    if kinds[0] != kinds[1]:
+        raise DataError(
+            f"training and held-out clips must be of one kind, got {kinds[0]} and {kinds[1]}; generate both alike"
+        )
     require_apart(training.scenes, clips.clips.scenes)
     return training
 
 
-def _nothing_yet(clips: EvaluationSet) -> TargetStatistics:
-    """What stands where means will be, in their shapes."""
-    frame = (clips.height, clips.width)
-    majority = torch.zeros(clips.frames, *frame, dtype=torch.uint8) if clips.classes else None
-    return TargetStatistics(mean=torch.zeros(clips.frames, 3, *frame), majority=majority)
-
-
-def _baselines(
-    options: EvaluateOptions,
-    clips: EvaluationSet,
-    statistics: TargetStatistics | None,
-    trained_on: str,
-    *,
-    painted: bool,
-) -> tuple[Method, ...]:
-    """Those that are wanted. statistics: of the training clips. Raises RecipeError as `of_baselines`."""
-    if not options.baselines:
-        return ()
-    if options.methods is None and statistics is None and isinstance(clips, PairedSet):
+def _settings(
+    options: EvaluateOptions, clips: EvaluationSet, training: PairedClips | None, *, painted: bool
+) -> BaselineSettings:
+    """With nothing in the places of means that are not known yet. Raises RecipeError where some want training clips."""
+    if options.baselines and options.methods is None and training is None and isinstance(clips, PairedSet):
         raise RecipeError(
             "baselines want training clips for their means: give --train FOLDER, name some that need none with "
             "--methods, or --no-baselines"
@@ -352,7 +346,6 @@ def _baselines(
         width=clips.width,
         classes=tuple(clips.classes),
         painted=painted,
-        statistics=statistics,
         svd=None if options.svd is None else _resolved(options.svd),
         device=options.device,
         dtype=options.dtype,
@@ -361,9 +354,7 @@ def _baselines(
         published=options.protocol == "release",
         hexplane=options.hexplane,
     )
-    further = len(clips.dataset.cameras) - 1 if isinstance(clips, SceneSet) else 0  # pairs have one camera
-    require_views(options.names or (), further)
-    return of_baselines(options.names, settings, trained_on)
+    return settings if training is None else replace(settings, statistics=settings.fill)
 
 
 def _on_the_sheet(summary: Summary) -> list[str]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
 from gcd_train.evaluation.runs import Method
@@ -44,13 +43,6 @@ def new_figure(width_in: float, height_in: float) -> "Figure":
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
-
-
-def to_pixels(figure: "Figure") -> NDArray[np.uint8]:
-    """A drawn figure as u8 [H, W, 3]."""
-    canvas = figure.canvas
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def save(figure: "Figure", out: Path) -> None:
@@ -114,15 +106,13 @@ def error_by_angle(measured: Measured) -> Plot:
 
     Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
     """
-    curves: list[Curve] = []
+    curves, last = list[Curve](), Selection(frames="last")
     for method in measured.of.methods:
         turned = [(record, abs(record.change[0])) for record in method.records if record.change is not None]
         groups: dict[float, list[ClipRecord]] = {}
         for (record, _), place in zip(turned, angle_bins([angle for _, angle in turned]), strict=True):
             groups.setdefault(place, []).append(record)
-        sums = {
-            place: bootstrap(groups[place], Selection(frames="last"), seed=measured.seed) for place in sorted(groups)
-        }
+        sums = {place: bootstrap(groups[place], last, seed=measured.seed) for place in sorted(groups)}
         points = [Point(x=x, y=each.interval("psnr_db"), clips=len(groups[x])) for x, each in sums.items()]
         curves.append(Curve.of(method.name, points))
     return Plot(

@@ -27,17 +27,10 @@ PAPER_ELEVATION_DEG = 5.0
 """How high the source camera stands in the paper's evaluation on Kubric-4D."""
 RELEASED_SOURCE = Spherical(azimuth_deg=20.0, elevation_deg=10.0, radius_m=15.0)
 """Where the released script's source camera stands without controls."""
-RELEASED_CHANGE = SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0, radius_m=0.0)
-"""Where it goes from there."""
-RELEASED_START, RELEASED_SKIP = 0, 2
-"""First frame and stride of the released script."""
+_RELEASED_CHANGE = SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0, radius_m=0.0)  # where it goes from there
+_RELEASED_START, _RELEASED_SKIP = 0, 2  # its first frame and stride
 SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2}
 """Draws of each clip of a scene; of pairs, which no protocol cuts, there is one."""
-
-
-def usual_clips(protocol: ProtocolName, *, orbit: bool) -> int:
-    """Clips of each scene."""
-    return 4 if protocol == "paper" and orbit else 1
 
 
 class ClipControls(Protocol):
@@ -97,8 +90,7 @@ class ListedControls:
 
     def strides(self, scene: str, /) -> Sequence[int]:
         """As listed, or as bound."""
-        names = self.names(scene)
-        return [self.bounds.of(each).frame_skip for each in self.controls.get(scene, ()) if each.name in names]
+        return [self.bounds.of(each).frame_skip for each in self.controls.get(scene, ())[: self.clips]]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -152,10 +144,10 @@ def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
     """The one clip of each scene that the released script makes without a control list. orbit: False in driving."""
     control = Control(
         name="sample_00",
-        frame_start=RELEASED_START,
-        frame_skip=RELEASED_SKIP,
+        frame_start=_RELEASED_START,
+        frame_skip=_RELEASED_SKIP,
         start=RELEASED_SOURCE if orbit else None,
-        goal=RELEASED_SOURCE + RELEASED_CHANGE if orbit else None,
+        goal=RELEASED_SOURCE + _RELEASED_CHANGE if orbit else None,
     )
     return dict.fromkeys(scenes, (control,))
 
@@ -196,21 +188,21 @@ def controlled(
 
 def require_cameras(data: Dataset4D) -> None:
     """Raises DataError, with the first fault, where no scene can be opened with all of its cameras."""
-    faults: list[DataError] = []
+    fault: DataError | None = None
     for scene in data.scenes:
         try:
             data.frames(scene)
-        except DataError as fault:
-            faults.append(fault)
+        except DataError as error:
+            fault = fault or error
         else:
             return
-    if faults:
-        few = len(data.cameras) <= _NAMED
-        cameras = f"the cameras {', '.join(data.cameras)}" if few else f"its {len(data.cameras)} cameras"
+    if fault is not None:
+        names, count = ", ".join(data.cameras), len(data.cameras)
+        cameras = f"the cameras {names}" if count <= _NAMED else f"its {count} cameras"
         raise DataError(
-            f"none of {len(faults)} scenes can be opened with {cameras}: {faults[0]}; name those there are with "
+            f"none of {len(data.scenes)} scenes can be opened with {cameras}: {fault}; name those there are with "
             "--camera"
-        ) from faults[0]
+        ) from fault
 
 
 def orbit_notes(controls: ListedControls, scenes: Sequence[str], listed: Path) -> tuple[str, ...]:

@@ -5,28 +5,33 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from gcd_train.errors import RecipeError, RunError
-from gcd_train.evaluation.comparison import (
-    Difference,
-    clips_csv,
-    differences,
-    differences_csv,
-    differences_markdown,
-    worst_clips,
-    worst_figure,
-    worst_markdown,
-)
 from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
-from gcd_train.evaluation.paper import is_model, tables_for
+from gcd_train.evaluation.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, is_model, tables_for
 from gcd_train.evaluation.plots import all_plots, curves_csv, draw, require_matplotlib
 from gcd_train.evaluation.runs import EvaluatedSet, Method, Run, gather, on_the_same_goals
-from gcd_train.evaluation.statistics import FEW_SCENES, Span
+from gcd_train.evaluation.statistics import (
+    FEW_SCENES,
+    FigureName,
+    Interval,
+    Selection,
+    Span,
+    common_clips,
+    difference,
+)
 from gcd_train.evaluation.store import folder_name
 from gcd_train.evaluation.tables import (
+    NOTHING,
     STAR_OF_FIGURE,
+    WORST_REGIONS,
+    Cell,
     Measured,
     Table,
     all_figures,
+    clips_csv,
+    csv_text,
     frames_csv,
     frames_told,
     main_tables,
@@ -38,8 +43,7 @@ from gcd_train.evaluation.tables import (
 from gcd_train.files import write_whole
 
 _SPANS: tuple[Span, ...] = ("2-last", "last")
-_RELEASED_SPANS: tuple[Span, ...] = ("all", *_SPANS)
-"""The released script's figures are over all frames, so they come first where a run used it."""
+"""Of tables; the released script's figures are over all frames, so these come first where a run used it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,8 +68,7 @@ def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = No
 
     Args:
         folders: of runs. command: the line that makes this report, for its first page.
-    Returns:
-        The path of `report.md`.
+    Returns: the path of `report.md`.
     Raises:
         RunError: a run cannot be read, two do not go together, or a file cannot be written.
         RecipeError: a row is none of the paper's tables that its method's clips belong in.
@@ -76,8 +79,7 @@ def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = No
         require_matplotlib()
     runs = tuple(Run.read(folder) for folder in folders)
     sets = gather(runs)
-    _require_known((*choices.leads, *choices.rows), sets)
-    _require_rows(choices.rows, sets)
+    _require_choices(choices, sets)
     pages = [_first_page(runs, command, choices)]
     for number, each in enumerate(sets, start=1):
         place = "." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}"
@@ -88,32 +90,19 @@ def make_report(folders: Sequence[Path], out: Path, choices: Choices | None = No
         pages.append("\n".join(writer.last_frames()))
     if notes:
         pages.append("\n".join(["## What is not compared\n", *(f"- {note}" for note in notes)]))
-    path = out / "report.md"
-    write_whole(path, ("\n".join(pages).rstrip() + "\n").encode())
-    return path
+    write_whole(out / "report.md", ("\n".join(pages).rstrip() + "\n").encode())
+    return out / "report.md"
 
 
-def leads(of: EvaluatedSet, choices: Choices) -> tuple[Method, ...]:
-    """The methods of a set that are compared with all its others; those of the choice that it has."""
-    if choices.leads:
-        return tuple(method for name in choices.leads for method in of.methods if method.name == name)
-    models = tuple(method for method in of.methods if is_model(method.name, method.details))
-    return models or of.methods[:1]
-
-
-def _require_known(names: Sequence[str], sets: Sequence[EvaluatedSet]) -> None:
-    """Raises RunError for a method that none of the sets has."""
+def _require_choices(choices: Choices, sets: Sequence[EvaluatedSet]) -> None:
+    """Raises RunError for a method that none of the sets has, RecipeError for a row that it cannot stand in."""
     known = dict.fromkeys(method.name for each in sets for method in each.methods)
-    unknown = [name for name in names if name not in known]
+    unknown = [name for name in (*choices.leads, *choices.rows) if name not in known]
     if unknown:
         raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
-
-
-def _require_rows(rows: Mapping[str, str], sets: Sequence[EvaluatedSet]) -> None:
-    """Raises RecipeError for a row that no table has which the method can stand in."""
-    for method, label in rows.items():
+    for method, label in choices.rows.items():
         its = [each for each in sets if any(known.name == method for known in each.methods)]
-        labels = dict.fromkeys(row.label for each in its for table in tables_for(each.note) for row in table.rows)
+        labels = dict.fromkeys(row for each in its for table in tables_for(each.note) for row in table.rows)
         if not labels:
             raise RecipeError(
                 f"--row says where {method} stands in the paper's tables, and none of them is for these clips; "
@@ -137,28 +126,23 @@ def _first_page(runs: Sequence[Run], command: str, choices: Choices) -> str:
 def _note_lines(run: Run) -> list[str]:
     note = run.note
     versions = ", ".join(f"{name} {version}" for name, version in note.versions.items())
-    facts = (
-        ("made", f"{note.made}, {versions}"),
-        ("clips", f"{', '.join(note.data)}, digest {note.data_identity}"),
-        ("protocol", f"{note.protocol}, seed {note.seed}"),
-        ("size", f"{note.frames} frames of {note.width}x{note.height} at {note.fps:g} fps"),
-    )
     clips = Counter(record.method for record in run.records)
     rows = [
         [name, str(clips[name]), ", ".join(f"{key} {value}" for key, value in told.items())]
         for name, told in note.methods.items()
     ]
     lines = [
-        *(f"- {name}: {told}" for name, told in facts),
+        f"- made: {note.made}, {versions}",
+        f"- clips: {', '.join(note.data)}, digest {note.data_identity}",
+        f"- protocol: {note.protocol}, seed {note.seed}",
+        f"- size: {note.frames} frames of {note.width}x{note.height} at {note.fps:g} fps",
         "",
         *markdown_rows(["method", "clips", "what it is"], rows),
     ]
     without = [name for name in note.methods if not clips[name]]
     if without:
-        lines += [
-            "",
-            f"**Failed: {', '.join(without)}. No clip was measured; the line of `gcd-train evaluate` says why.**",
-        ]
+        why = "No clip was measured; the line of `gcd-train evaluate` says why."
+        lines += ["", f"**Failed: {', '.join(without)}. {why}**"]
     return lines
 
 
@@ -172,35 +156,43 @@ class _Writer:
     choices: Choices
 
     @property
-    def spans(self) -> tuple[Span, ...]:
-        """Frames that tables are over."""
-        return _RELEASED_SPANS if self.of.note.protocol == "release" else _SPANS
+    def measured(self) -> Measured:
+        """The set with the sums of its methods."""
+        return Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
+
+    @property
+    def leads(self) -> tuple[Method, ...]:
+        """The methods that are compared with all others; those of the choice that the set has."""
+        if self.choices.leads:
+            return tuple(method for name in self.choices.leads for method in self.of.methods if method.name == name)
+        models = tuple(method for method in self.of.methods if is_model(method.name, method.details))
+        return models or self.of.methods[:1]
 
     def sections(self) -> Iterator[str]:
-        measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
-        first = leads(self.of, self.choices)
+        measured = self.measured
+        spans: tuple[Span, ...] = ("all", *_SPANS) if self.of.note.protocol == "release" else _SPANS
         yield f"## {self.of.title}\n"
-        yield from self._tables(measured)
-        yield from self._differences(measured, first, self.spans)
+        yield from self._tables(measured, spans)
+        yield from self._differences(measured, spans)
         yield from self._plots(measured)
         yield from self._gallery()
-        yield from self._failures(measured, first)
+        yield from self._failures(measured)
 
     def last_frames(self) -> Iterator[str]:
         """Only what the last frame tells, of methods that go there in different ways."""
-        measured = Measured(of=self.of, seed=self.choices.seed, rows=self.choices.rows)
+        measured = self.measured
         yield f"## The last frame together: {self.of.title}\n"
         yield "Clips of the same names end at the same goals here, so their last frames are comparable and no others.\n"
         yield from map(self._table, main_tables(measured, ("last",)))
-        yield from self._differences(measured, leads(self.of, self.choices), ("last",))
+        yield from self._differences(measured, ("last",))
 
     def _table(self, table: Table) -> str:
         self._write(f"tables/{table.name}.csv", to_csv(table))
         return f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
 
-    def _tables(self, measured: Measured) -> Iterator[str]:
-        yield from map(self._table, main_tables(measured, self.spans))
-        yield self._table(region_table(measured, self.spans[0]))
+    def _tables(self, measured: Measured, spans: Sequence[Span]) -> Iterator[str]:
+        yield from map(self._table, main_tables(measured, spans))
+        yield self._table(region_table(measured, spans[0]))
         self._write("tables/figures.csv", all_figures(measured))
         self._write("tables/frames.csv", frames_csv(measured))
         self._write("tables/clips.csv", clips_csv(measured))
@@ -210,11 +202,11 @@ class _Writer:
             f"clip by clip: {self._link('tables/clips.csv')}.\n"
         )
 
-    def _differences(self, measured: Measured, first: Sequence[Method], spans: Sequence[Span]) -> Iterator[str]:
+    def _differences(self, measured: Measured, spans: Sequence[Span]) -> Iterator[str]:
         every: list[Difference] = []
         for frames in spans:
             told = frames_told(self.of, frames)
-            for lead in first:
+            for lead in self.leads:
                 found = differences(measured, lead, frames)
                 every += found
                 if found:
@@ -234,8 +226,8 @@ class _Writer:
     def _plots(self, measured: Measured) -> Iterator[str]:
         for plot in all_plots(measured):
             self._write(f"plots/{plot.name}.csv", curves_csv(plot))
-            told = f"{plot.up} by {plot.across}"
             if self.choices.drawn:
+                told = f"{plot.up} by {plot.across}"
                 draw(plot, self._path(f"plots/{plot.name}.png"))
                 yield f"### {plot.title}: {told}\n\n![{told}]({self._name(f'plots/{plot.name}.png')})\n"
             yield f"The numbers: {self._link(f'plots/{plot.name}.csv')}\n"
@@ -244,14 +236,14 @@ class _Writer:
         if not self.choices.clips:
             return
         keys = shown_clips(self.of, self.of.methods, self.choices.clips)
-        if keys:
-            yield "### Gallery\n"
-            yield from self._shown("gallery", keys)
-        else:
+        if not keys:
             yield "No frames were kept, so there is no gallery: evaluate with `--views all`.\n"
+            return
+        yield "### Gallery\n"
+        yield from self._shown("gallery", keys)
 
-    def _failures(self, measured: Measured, first: Sequence[Method]) -> Iterator[str]:
-        for lead in first if self.choices.worst else ():
+    def _failures(self, measured: Measured) -> Iterator[str]:
+        for lead in self.leads if self.choices.worst else ():
             found = worst_clips(measured, lead, self.choices.worst)
             yield f"### Worst clips of {lead.name}\n"
             yield worst_markdown(worst_figure(lead), found)
@@ -265,12 +257,9 @@ class _Writer:
         clips = [(key, strips(self.of.methods, key)) for key in keys]
         write_sheet(clips, self._path(f"{folder}/sheet.png"))
         yield f"![{', '.join(keys)}]({self._name(f'{folder}/sheet.png')})\n"
-        names = [f"{folder}/{folder_name(key)}.mp4" for key in keys]
-        made = [
-            write_video(rows, self.of.fps(key), self._path(name))
-            for name, (key, rows) in zip(names, clips, strict=True)
-        ]
-        videos = [self._link(name) for name, done in zip(names, made, strict=True) if done]
+        names = {key: f"{folder}/{folder_name(key)}.mp4" for key in keys}
+        made = {names[key]: write_video(rows, self.of.fps(key), self._path(names[key])) for key, rows in clips}
+        videos = [self._link(name) for name, done in made.items() if done]
         if videos:
             yield f"Videos: {', '.join(videos)}\n"
 
@@ -285,3 +274,127 @@ class _Writer:
 
     def _write(self, name: str, text: str) -> None:
         write_whole(self._path(name), text.encode())
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How far one method lies above another in one figure. clips: that both have.
+
+    starred: one of them was given more for this figure than for its others, see `Method.copies_classes`.
+    """
+
+    first: str
+    other: str
+    column: Column
+    frames: Span
+    clips: int
+    apart: Interval
+    starred: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """ "better" or "worse" where zero lies outside the interval, "open" where it does not."""
+        if not self.apart.off_zero:
+            return "open"
+        return "better" if (self.apart.value > 0) != (self.column.figure == "lpips") else "worse"
+
+
+def differences(measured: Measured, first: Method, frames: Span = "2-last") -> tuple[Difference, ...]:
+    """A method against every other one, in all columns that both have figures in, on the clips that both have."""
+    found: list[Difference] = []
+    for other in measured.of.methods:
+        ours, theirs = common_clips(first.records, other.records)
+        for column in (*PICTURE_COLUMNS, *CLASS_COLUMNS) if ours and other.name != first.name else ():
+            chosen = Selection(frames=frames, region=column.region)
+            apart = difference(measured.sums(first, chosen, ours), measured.sums(other, chosen, theirs), column.figure)
+            starred = (first.copies_classes or other.copies_classes) and column.of_classes
+            if apart.known:
+                found.append(Difference(first.name, other.name, column, frames, len(ours), apart, starred))
+    return tuple(found)
+
+
+def differences_csv(found: Sequence[Difference]) -> str:
+    """One difference a line."""
+    lines = [
+        [e.first, e.other, e.frames, e.column.heading, *Cell(figure=e.apart).numbers(), str(e.clips), e.verdict]
+        for e in found
+    ]
+    return csv_text(["first", "other", "frames", "figure", "first ahead", "low", "high", "clips", "verdict"], lines)
+
+
+def differences_markdown(found: Sequence[Difference], of: EvaluatedSet) -> str:
+    """A row for each other method, a column for each figure; bold where zero lies outside the interval."""
+    headings = list(dict.fromkeys(each.column.heading for each in found))
+    cells = {(each.other, each.column.heading): _told(each) for each in found}
+    others = list(dict.fromkeys(each.other for each in found))
+    rows = [[of.method(name).starred, *(cells.get((name, head), NOTHING) for head in headings)] for name in others]
+    return "\n".join(markdown_rows(["", *headings], rows)) + "\n"
+
+
+def _told(each: Difference) -> str:
+    value, low, high = (
+        f"{number:+.{each.column.digits}f}" for number in (each.apart.value, each.apart.low, each.apart.high)
+    )
+    star = " *" if each.starred else ""
+    if np.isnan(each.apart.low):  # one scene tells nothing of it
+        return value + star
+    text = f"{value} [{low}, {high}]"
+    return (text if each.verdict == "open" else f"**{text}** {each.verdict}") + star
+
+
+@dataclass(frozen=True, slots=True)
+class WorstClip:
+    """One clip of a method. occluded: the figure there; NaN for none. best, best_value: of the other methods on it.
+
+    best is starred where it was given more for this figure than the source video.
+    """
+
+    key: str
+    value: float
+    occluded: float
+    best: str
+    best_value: float
+    change: tuple[float, float, float] | None
+
+
+def worst_figure(method: Method) -> FigureName:
+    """What clips are ordered by: PSNR, or mIoU of a method without pictures."""
+    return "psnr_db" if method.makes_pictures else "miou_full"
+
+
+def worst_clips(measured: Measured, method: Method, count: int) -> tuple[WorstClip, ...]:
+    """So many clips, the worst first, in frames 2 to the last; what has no figure comes last."""
+    name = worst_figure(method)
+    values, occluded = (measured.by_clip(method, region, name) for region in WORST_REGIONS)
+    rivals = [
+        (
+            f"{other.name} *" if other.copies_classes and name != "psnr_db" else other.starred,
+            dict(zip(other.keys, measured.by_clip(other, "all", name).tolist(), strict=True)),
+        )
+        for other in measured.of.methods
+        if other.name != method.name
+    ]
+    found: list[WorstClip] = []
+    for place in np.argsort(np.nan_to_num(values, nan=np.inf), kind="stable")[:count]:
+        record = method.records[place]
+        theirs = [(by_key.get(record.key, np.nan), rival) for rival, by_key in rivals]
+        best_value, best = max((pair for pair in theirs if np.isfinite(pair[0])), default=(float("nan"), ""))
+        of_method = (float(values[place]), float(occluded[place]))
+        found.append(WorstClip(record.key, *of_method, best, best_value, record.change))
+    return tuple(found)
+
+
+def worst_markdown(name: FigureName, found: Sequence[WorstClip]) -> str:
+    """A row for each clip."""
+    heading, digits = ("PSNR dB", 2) if name == "psnr_db" else ("mIoU", 3)
+
+    def shown(value: float) -> str:
+        return NOTHING if np.isnan(value) else f"{value:.{digits}f}"
+
+    rows: list[list[str]] = []
+    for each in found:
+        change = NOTHING if each.change is None else ", ".join(f"{part:+.1f}" for part in each.change)
+        figures = [shown(each.value), shown(each.occluded), each.best or NOTHING, shown(each.best_value)]
+        rows.append([each.key, change, *figures])
+    headings = ["clip", "azimuth, elevation, radius", heading, f"{heading} occluded", "best other", f"its {heading}"]
+    return "\n".join(markdown_rows(headings, rows)) + "\n"

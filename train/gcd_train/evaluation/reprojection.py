@@ -1,4 +1,4 @@
-"""The source camera's points moved to where they really were: privileged, as the exact depth is given."""
+"""The source moved to where it is seen by the target camera: as flat ground, or, privileged, by its exact depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +16,7 @@ from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
     FAR_M,
+    CameraPair,
     Prediction,
     SourceClip,
     TargetStatistics,
@@ -102,6 +103,60 @@ def _footprints(points: Tensor, camera: Intrinsics) -> tuple[Tensor, Tensor, Ten
             pairs.append(((at[kept, 1] * camera.width + at[kept, 0]).long(), weight[kept], ahead[kept]))
     pixels, weights, owners = zip(*pairs, strict=True)
     return torch.cat(pixels), torch.cat(weights), torch.cat(owners)
+
+
+_NEAREST_SOURCE_M = 0.1  # in front of the source camera
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GroundHomography:
+    """The source picture and its class map as the target camera sees them if all of it lies on the ground.
+
+    fill: what is shown where the target camera looks above the horizon or the source camera does not see the ground.
+    """
+
+    fill: TargetStatistics
+    name: str = "ground_homography"
+    privileged: bool = False
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. The class map is warped from the source's exact one."""
+        grid, seen = ground_grid(clip.cameras)
+        video = F.grid_sample(to_pictures(clip.source), grid, padding_mode="border", align_corners=False)
+        return Prediction(
+            video=torch.where(seen[:, None], video, self.fill.mean),
+            classes=self._classes(to_labels(clip.source_classes), grid, seen),
+        )
+
+    def _classes(self, labels: Tensor | None, grid: Tensor, seen: Tensor) -> Tensor | None:
+        if labels is None or self.fill.majority is None:
+            return None
+        moved = F.grid_sample(labels[:, None].float(), grid, mode="nearest", padding_mode="border", align_corners=False)
+        return torch.where(seen, moved[:, 0].to(torch.uint8), self.fill.majority)
+
+
+def ground_grid(cameras: CameraPair) -> tuple[Tensor, Tensor]:
+    """Sampling grid float32 [T, H, W, 2] and where it is meant, bool [T, H, W].
+
+        H = R + t n^T / d        for the plane n . x = d in the target camera's axes
+
+    takes rays of the target camera to rays of the source camera that meet the same point of the ground; H r is the
+    point itself over the multiple of r at which r meets the plane.
+    Source: Hartley and Zisserman 2004, result 13.1, with the opposite sign of d.
+    """
+    ground_from_target = cameras.ground_from_source @ cameras.source_from_target
+    normal = -ground_from_target[:, 2, :3]  # downwards, in the target camera's axes
+    height_m = ground_from_target[:, 2, 3]  # above the ground
+    turn, step = cameras.source_from_target[:, :3, :3], cameras.source_from_target[:, :3, 3]
+    homography = turn + step[:, :, None] * normal[:, None, :] / height_m[:, None, None]
+    rays = pixel_rays(cameras.target)
+    points = torch.einsum("tij,hwj->thwi", homography, rays)
+    below = torch.einsum("ti,hwi->thw", normal, rays) / height_m[:, None, None]  # 1 / reach, positive on the ground
+    ahead = points[..., 2] > _NEAREST_SOURCE_M * below.clamp(min=0.0)
+    size = points.new_tensor([cameras.source.width, cameras.source.height])
+    grid = to_pixels(points, cameras.source) * 2 / size - 1
+    seen = (below > 0) & ahead & (grid.abs() <= 1).all(dim=-1)
+    return grid.nan_to_num().clamp(-2.0, 2.0).float(), seen
 
 
 REPROJECT_RGBD = "reproject_rgbd"

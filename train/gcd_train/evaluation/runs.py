@@ -10,7 +10,7 @@ import numpy as np
 from gcd_train.errors import RunError
 from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.statistics import Selection, Span
-from gcd_train.evaluation.store import FRAMES_IN, LPIPS, REGIONS, ClipRecord, Counted, Frames, Region, RunNote, read_run
+from gcd_train.evaluation.store import FRAMES_IN, LPIPS, REGIONS, ClipRecord, Frames, Region, RunNote, read_run
 
 COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "fps", "classes")
 """What the notes of two runs must have alike before any of their figures are compared."""
@@ -220,14 +220,16 @@ def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> tuple[tuple[EvaluatedSet,
     notes: list[str] = []
     for each in sets:
         _place(each, groups, notes)
-    together = [_put_together(group, notes) for group in groups if len(group) > 1]
-    return tuple(together), tuple(notes)
+    return tuple(_put_together(group, notes) for group in groups if len(group) > 1), tuple(notes)
 
 
 def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str]) -> None:
     """Into the first group that it has goals in common with, or into one of its own."""
     for group in groups:
-        why = _compared(group[0], each)
+        if any(getattr(group[0].note, name) != getattr(each.note, name) for name in COMPARABLE):
+            continue
+        ours, theirs = _goals(group[0]), _goals(each)
+        why = {key: goal.apart_from(theirs[key]) for key, goal in ours.items() if key in theirs}
         apart = {key: reason for key, reason in why.items() if reason}
         if apart:
             first, other = (", ".join(dict.fromkeys(str(run.folder) for run in of.runs)) for of in (group[0], each))
@@ -244,19 +246,8 @@ def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str
     groups.append([each])
 
 
-def _compared(first: EvaluatedSet, other: EvaluatedSet) -> dict[str, str]:
-    """For each clip that both have by name why it is not the same; empty for sets that are made in other ways."""
-    if any(getattr(first.note, name) != getattr(other.note, name) for name in COMPARABLE):
-        return {}
-    ours, theirs = _goals(first), _goals(other)
-    return {key: goal.apart_from(theirs[key]) for key, goal in ours.items() if key in theirs}
-
-
 def _goals(of: EvaluatedSet) -> dict[str, Goal]:
-    by_key: dict[str, list[ClipRecord]] = {}
-    for record in (record for method in of.methods for record in method.records):
-        by_key.setdefault(record.key, []).append(record)
-    return {key: Goal.of(records) for key, records in by_key.items()}
+    return {key: Goal.of([r for method in of.methods for r in method.records if r.key == key]) for key in of.keys}
 
 
 def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSet:
@@ -285,13 +276,9 @@ def _of_target(record: ClipRecord) -> dict[str, Frames]:
         if region.gradient_target is not None:
             found[f"{name} gradient"] = region.gradient_target
         if region.confusion is not None:
-            found[f"{name} classes"] = tuple(_mean_class(counted) for counted in region.confusion)
+            each = [np.array(counted).reshape(-1, 3) for counted in region.confusion]
+            found[f"{name} classes"] = tuple((t @ n) / n.sum() if n.size else None for t, _, n in (e.T for e in each))
     return found
-
-
-def _mean_class(counted: Counted) -> float | None:
-    pixels = sum(count for _, _, count in counted)
-    return sum(true * count for true, _, count in counted) / pixels if pixels else None
 
 
 def _told(change: tuple[float, float, float] | None) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.store import REGIONS, ClipRecord, Counted, Frames, Region, RegionRecord
+from gcd_train.evaluation.store import REGIONS, ClipRecord, Counted, Frames, Region
 
 FIRST_MEASURED = 1
 """Frames before this one, counted from 0, are left out: a gradual path begins where the source camera stands."""
@@ -209,19 +209,15 @@ def _clip_mean(values: Sequence[Frames] | None, frames: slice) -> float:
 
 
 def _ratios(record: ClipRecord, selection: Selection) -> list[tuple[float, float]]:
-    region, flicker = record.regions.get(selection.region), (0.0, 0.0)
+    """Gradients, each frame by the region's share of it (without such pixels it adds nothing), and flicker."""
+    region, gradients, flicker = record.regions.get(selection.region), (0.0, 0.0), (0.0, 0.0)
+    if region is not None and region.gradient is not None and region.gradient_target is not None:
+        share = _array(region.pixels)
+        views, targets = (np.nan_to_num(_array(each)) * share for each in (region.gradient, region.gradient_target))
+        gradients = _ratio(views, targets, selection.frame_slice())
     if selection.region == "all" and record.step is not None:
         flicker = _ratio(_array(record.step), _array(record.step_target), selection.step_slice())
-    return [_gradients(region, selection.frame_slice()), flicker]
-
-
-def _gradients(region: RegionRecord | None, frames: slice) -> tuple[float, float]:
-    """Of views and targets, each frame by the region's share of it; a frame without such pixels adds nothing."""
-    if region is None or region.gradient is None or region.gradient_target is None:
-        return 0.0, 0.0
-    share = _array(region.pixels)
-    views, targets = (np.nan_to_num(_array(each)) * share for each in (region.gradient, region.gradient_target))
-    return _ratio(views, targets, frames)
+    return [gradients, flicker]
 
 
 def _ratio(views: Array, targets: Array, chosen: slice) -> tuple[float, float]:

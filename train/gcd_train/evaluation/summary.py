@@ -1,7 +1,7 @@
 """From the records of a run to what `evaluate` prints and writes: tables and JSON."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -319,37 +319,31 @@ def _steps(shipped: Evaluation, *others: Evaluation) -> list[str]:
 
 def _classes(summary: Summary) -> list[str]:
     shown = [each for each in summary.evaluations if not math.isnan(each.value("miou"))]
-    columns = [
-        ["-" if cell == "- (-)" else cell for cell in map(_with_full, each.class_iou(), each.class_iou(full=True))]
-        for each in shown
-    ]
+    columns = [list(map(_with_full, each.class_iou(), each.class_iou(full=True))) for each in shown]
     every = [[name, *cells] for name, *cells in zip(summary.classes, *columns, strict=False)]
     rows = [row for row in every if set(row[1:]) != {"-"}]  # a class that is neither true nor said, as void
     return ["IoU of each class:", "", *markdown_rows(["class", *(each.name for each in shown)], rows)]
 
 
 def _with_full(iou: float, full: float) -> str:
-    return "{} ({})".format(*("-" if math.isnan(value) else f"{value:.2f}" for value in (iou, full)))
+    both = ("-" if math.isnan(value) else f"{value:.2f}" for value in (iou, full))
+    return "-" if math.isnan(iou) and math.isnan(full) else "{} ({})".format(*both)
 
 
 def _clips(summary: Summary) -> list[str]:
     """Every clip by name, and where the model is ahead of the best baseline and where not."""
-    columns = list(_clip_columns(summary))
-    names = [str(shot) for shot in summary.conditions.shots]
-    rows = [list(row) for row in zip(names, *(cells for _, cells in columns), strict=True)]
-    return ["Clips:", "", *markdown_rows(["clip", *(heading for heading, _ in columns)], rows)]
-
-
-def _clip_columns(summary: Summary) -> Iterator[tuple[str, list[str]]]:
-    model = summary.model[0]
+    columns = [["clip", *map(str, summary.conditions.shots)]]
     for column in (_PSNR, _MIOU):
-        if math.isnan(model.value(column.figure)):
+        if math.isnan(summary.model[0].value(column.figure)):
             continue
-        own, best = model.clips.figure(column.figure), best_of(summary.baselines, column.figure)
-        yield column.heading, [_with_error(value, math.nan, column.digits) for value in own]
+        own, best = summary.model[0].clips.figure(column.figure), best_of(summary.baselines, column.figure)
+        columns.append([column.heading, *(_with_error(value, math.nan, column.digits) for value in own)])
         if best is not None:
             apart = own - best.clips.figure(column.figure)
-            yield f"over {best.name}", [_with_error(value, math.nan, column.digits, "+") for value in apart]
+            cells = (_with_error(value, math.nan, column.digits, "+") for value in apart)
+            columns.append([f"over {best.name}", *cells])
+    headings, *rows = zip(*columns, strict=True)
+    return ["Clips:", "", *markdown_rows(headings, rows)]
 
 
 def _with_error(value: float, error: float, digits: int, sign: str = "") -> str:

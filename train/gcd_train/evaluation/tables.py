@@ -4,16 +4,18 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product, zip_longest
 from math import isnan, nan
 from statistics import fmean
-from typing import Any
+from typing import Any, TypeAlias
+
+import numpy as np
 
 from gcd_train.evaluation.paper import (
     CLASS_COLUMNS,
     PICTURE_COLUMNS,
     Column,
     Gain,
-    PaperRow,
     PaperTable,
     row_label,
     tables_for,
@@ -223,7 +225,7 @@ def _own_table(
         name=name,
         title=title,
         headings=tuple(column.heading for column in columns),
-        rows=tuple(_row(measured, method, columns, frames, PaperRow(label="")) for method in measured.of.methods),
+        rows=tuple(_row(measured, method, columns, frames) for method in measured.of.methods),
         notes=(*_notes(measured.of, columns, frames), *notes),
     )
 
@@ -233,13 +235,13 @@ def _paper_table(measured: Measured, table: PaperTable) -> Table:
     for method in measured.of.methods:
         label = measured.rows.get(method.name) or row_label(method.name, method.details, table)
         placed.setdefault(label or "", []).append(method)
-    rows: list[Row] = []
-    for row in table.rows:
-        found = placed.pop(row.label, [])
-        rows += [_row(measured, each, table.columns, table.frames, row) for each in found]
-        rows += [] if found else [Row(label=row.label, cells=_not_run(row, table.columns))]
-    below = [
-        _row(measured, each, table.columns, table.frames, PaperRow(label=_below(label)))
+    rows, columns, frames = list[Row](), table.columns, table.frames
+    for label, printed in table.rows.items():
+        found = placed.pop(label, [])
+        rows += [_row(measured, each, columns, frames, label, printed) for each in found]
+        rows += [] if found else [Row(label=label, cells=_not_run(printed, columns))]
+    below = [  # label: of a row in another of the paper's tables, or empty
+        _row(measured, each, columns, frames, f"{label}, not in this table" if label else "not in the paper")
         for label, methods in placed.items()
         for each in methods
     ]
@@ -266,12 +268,17 @@ def _gain(rows: Sequence[Row], gain: Gain, columns: Sequence[Column]) -> Row:
     )
 
 
-def _below(label: str) -> str:
-    """How a method is called below the paper's rows. label: of its row in another of the paper's tables, or empty."""
-    return f"{label}, not in this table" if label else "not in the paper"
+Printed: TypeAlias = Sequence[float | None]
 
 
-def _row(measured: Measured, method: Method, columns: Sequence[Column], frames: Span, row: PaperRow) -> Row:
+def _row(
+    measured: Measured,
+    method: Method,
+    columns: Sequence[Column],
+    frames: Span,
+    label: str = "",
+    printed: Printed = (),
+) -> Row:
     """A method's figures, beside what the paper prints in its row."""
     cells = tuple(
         Cell(
@@ -281,15 +288,14 @@ def _row(measured: Measured, method: Method, columns: Sequence[Column], frames: 
             paper=blank.paper,
             starred=method.copies_classes and column.of_classes,
         )
-        for column, blank in zip(columns, _not_run(row, columns), strict=True)
+        for column, blank in zip(columns, _not_run(printed, columns), strict=True)
     )
     clips = f"{len(method.records)} of {len(measured.of.keys)}"
-    return Row(label=row.label, method=method.starred, clips=clips, cells=cells)
+    return Row(label=label, method=method.starred, clips=clips, cells=cells)
 
 
-def _not_run(row: PaperRow, columns: Sequence[Column]) -> tuple[Cell, ...]:
-    printed = (*row.printed, *(None,) * len(columns))
-    return tuple(Cell(note=NOT_RUN, paper=paper) for _, paper in zip(columns, printed, strict=False))
+def _not_run(printed: Printed, columns: Sequence[Column]) -> tuple[Cell, ...]:
+    return tuple(Cell(note=NOT_RUN, paper=paper) for _, paper in zip_longest(columns, printed))
 
 
 def _why_not(of: EvaluatedSet, method: Method, column: Column) -> str:
@@ -341,30 +347,48 @@ def _has(of: EvaluatedSet, column: Column) -> bool:
 def all_figures(measured: Measured) -> str:
     """Every figure of every method, frames and pixels with its interval, as CSV: one figure a line."""
     lines: list[list[str]] = []
-    for method in measured.of.methods:
-        for frames in _SPANS:
-            for region in measured.of.regions:
-                sums = measured.sums(method, Selection(frames=frames, region=region))
-                cells = {name: Cell(figure=sums.interval(name)).numbers() for name in FIGURE_NAMES}
-                clips = str(len(method.records))
-                lines += [[method.name, frames, region, name, *cell, clips] for name, cell in cells.items() if cell[0]]
+    for method, frames, region in product(measured.of.methods, _SPANS, measured.of.regions):
+        sums, clips = measured.sums(method, Selection(frames=frames, region=region)), str(len(method.records))
+        cells = {name: Cell(figure=sums.interval(name)).numbers() for name in FIGURE_NAMES}
+        lines += [[method.name, frames, region, name, *cell, clips] for name, cell in cells.items() if cell[0]]
     return csv_text(["method", "frames", "pixels", "figure", "value", "low", "high", "clips"], lines)
 
 
 _BY_FRAME: tuple[FigureName, ...] = (
-    *("psnr_db", "ssim", "lpips", "diversity"),
-    *("gradient_energy", "flicker", "miou_common"),
+    "psnr_db",
+    "ssim",
+    "lpips",
+    "diversity",
+    "gradient_energy",
+    "flicker",
+    "miou_common",
 )
 
 
 def frames_csv(measured: Measured) -> str:
     """Every figure of every method in each frame from the second on: one figure a line, without intervals."""
+    lines, every = list[list[str]](), range(FIRST_MEASURED + 1, measured.of.note.frames + 1)
+    for method, frame, region in product(measured.of.methods, every, measured.of.regions):
+        sums = measured.sums(method, Selection(frames=frame, region=region))
+        values = {name: f"{sums.value(name):.6g}" for name in _BY_FRAME}
+        lines += [[method.name, str(frame), region, name, text] for name, text in values.items() if text != "nan"]
+    return csv_text(["method", "frame", "pixels", "figure", "value"], lines)
+
+
+WORST_REGIONS: tuple[Region, ...] = ("all", "occluded")
+"""That clips are looked at in one by one."""
+_BY_CLIP: tuple[FigureName, ...] = ("psnr_db", "ssim", "miou_full")
+
+
+def clips_csv(measured: Measured) -> str:
+    """Every method on every clip: one line each, frames 2 to the last."""
+    columns: list[tuple[FigureName, Region]] = [(name, region) for region in WORST_REGIONS for name in _BY_CLIP]
     lines: list[list[str]] = []
     for method in measured.of.methods:
-        for frame in range(FIRST_MEASURED + 1, measured.of.note.frames + 1):
-            for region in measured.of.regions:
-                sums = measured.sums(method, Selection(frames=frame, region=region))
-                values = {name: sums.value(name) for name in _BY_FRAME}
-                of_frame = [method.name, str(frame), region]
-                lines += [[*of_frame, name, f"{value:.6g}"] for name, value in values.items() if not isnan(value)]
-    return csv_text(["method", "frame", "pixels", "figure", "value"], lines)
+        by_clip = np.stack([measured.by_clip(method, region, name) for name, region in columns], axis=1)
+        for record, values in zip(method.records, by_clip.tolist(), strict=True):
+            change = ("", "", "") if record.change is None else tuple(f"{part:g}" for part in record.change)
+            cells = ["" if np.isnan(value) else f"{value:.6g}" for value in values]
+            lines.append([method.name, record.key, record.scene, *change, *cells, f"{record.seconds:.4g}"])
+    named = [f"{name} {region}" for name, region in columns]
+    return csv_text(["method", "clip", "scene", "azimuth", "elevation", "radius", *named, "seconds"], lines)

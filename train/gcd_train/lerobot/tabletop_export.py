@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -50,14 +51,21 @@ def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
     poses = _base_from_cameras(export.cameras)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out} is there already; choose another folder, or remove it")
+    names = {_POSE_FEATURE: [f"base_from_camera_{row}{column}" for row in range(4) for column in range(4)]}
+    options = ExportOptions(robot="tabletop primitive", fps=round(FPS), names=names)
     with (
         new_folder(out.absolute().parent, out.name) as folder,
         Renderer(export.width, export.height, oversample=export.oversample) as renderer,
-        LeRobotWriter(folder, _calibrations(export, poses), _options(export)) as writer,
+        LeRobotWriter(folder, _calibrations(export, poses), options) as writer,
     ):
         for done, seed in enumerate(export.seeds, start=1):
             episode = tabletop_episode(seed, frames=export.frames, skipped_s=0.0)
-            writer.add(_logged(episode, export), _pictures(renderer, episode, poses, export))
+            features = {"observation.state": episode.motion.state, "action": episode.motion.action}
+            if WRIST in export.cameras:
+                base_from_wrist = np.linalg.inv(episode.world_from_base) @ episode.wrist
+                features[_POSE_FEATURE] = _in_metres(base_from_wrist).reshape(-1, 16)
+            logged = LoggedEpisode(features=features, task=episode.task)
+            writer.add(logged, _pictures(renderer, episode, poses, export))
             yield done
 
 
@@ -77,7 +85,7 @@ def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[s
     lens = Intrinsics.from_hfov(HFOV_DEG, export.width, export.height)
     made: dict[str, CameraCalibration] = {}
     for name in export.cameras:
-        rows = None if name == WRIST else tuple(tuple(row) for row in _in_metres(poses[name]).tolist())
+        rows = None if name == WRIST else tuple(map(tuple, _in_metres(poses[name]).tolist()))
         made[_IMAGES + name] = CameraCalibration(
             width=lens.width,
             height=lens.height,
@@ -91,19 +99,6 @@ def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[s
     return made
 
 
-def _options(export: TabletopExport) -> ExportOptions:
-    names = {_POSE_FEATURE: [f"base_from_camera_{row}{column}" for row in range(4) for column in range(4)]}
-    return ExportOptions(robot="tabletop primitive", fps=round(FPS), names=names)
-
-
-def _logged(episode: Episode, export: TabletopExport) -> LoggedEpisode:
-    features = {"observation.state": episode.state, "action": episode.action}
-    if WRIST in export.cameras:
-        base_from_wrist = np.linalg.inv(episode.world_from_base) @ episode.wrist
-        features[_POSE_FEATURE] = _in_metres(base_from_wrist).reshape(-1, 16)
-    return LoggedEpisode(features=features, task=episode.task)
-
-
 def _pictures(
     renderer: Renderer, episode: Episode, poses: Mapping[str, Floats], export: TabletopExport
 ) -> Iterator[Mapping[str, NDArray[np.uint8]]]:
@@ -111,12 +106,9 @@ def _pictures(
     cameras = {name: np.tile(episode.world_from_base @ pose, (export.frames, 1, 1)) for name, pose in poses.items()}
     if WRIST in export.cameras:
         cameras[WRIST] = episode.wrist
-    seen: dict[str, NDArray[np.uint8]] = {}
-    for _, name, rendering in renderer.views(freeze(episode.scene), cameras):
-        seen[_IMAGES + name] = rendering.rgb
-        if len(seen) == len(cameras):
-            yield seen
-            seen = {}
+    views = renderer.views(freeze(episode.scene), cameras)
+    while seen := list(islice(views, len(cameras))):
+        yield {_IMAGES + name: rendering.rgb for _, name, rendering in seen}
 
 
 def _in_metres(poses: Floats) -> Floats:

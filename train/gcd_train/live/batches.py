@@ -16,8 +16,8 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
-from gcd_model.live.depth_net import pixel_rays, plane_depth
-from gcd_model.live.sweep import LONGEST, Reference, References, sweep_costs
+from gcd_model.live.depth_net import Reference, pixel_rays, plane_depth, sweep_costs
+from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
 from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
 from gcd_train.live.draws import Poses

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model.live.depth_net import DepthOutput, depth_inputs, read_depth
-from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.paint_net import filled
+from gcd_model.networks import LiveNetworks
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import some_of, to_video, with_true_references
 from gcd_train.live.clips import read_clip

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from gcd_model.live.config import SKY_M
-from gcd_model.live.ontology import LIVE_CLASSES
+from gcd_model.live.config import LIVE_CLASSES, SKY_M
 from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError, RenderError
 from gcd_train.files import whole

@@ -18,12 +18,12 @@ from gcd_model.layers import zeroed
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.eyes import Eyes, Floor, FrameGeometry
-from gcd_model.live.networks import COVERED, LiveNetworks
 from gcd_model.live.paint_net import filled, seen_of
+from gcd_model.live.painter import COVERED, LiveView
 from gcd_model.live.splat import splat, unproject
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.live.view import LiveView
 from gcd_model.loading import load_synthesizer
+from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.live.batches import Pictures, pictures_of, training_paths
 from gcd_train.live.clips import LiveClip, evenly, read_clip

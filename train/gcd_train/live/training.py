@@ -15,9 +15,9 @@ import msgspec
 import torch
 
 from gcd_model.live.depth_net import DepthNet
-from gcd_model.live.networks import LiveNetworks
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.loading import load_synthesizer
+from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.live.batches import PART_SEED, training_paths
 from gcd_train.live.calibration import calibrate

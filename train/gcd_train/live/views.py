@@ -21,8 +21,8 @@ from torch.nn.functional import avg_pool2d, interpolate
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, plane_depth, read_depth
+from gcd_model.live.memory import SeenWorld
 from gcd_model.live.paint_net import Painted, Seen, camera_features
-from gcd_model.live.seen_world import SeenWorld
 from gcd_model.live.splat import Splat, splat, unproject
 from gcd_train.files import whole
 from gcd_train.live.batches import (

@@ -21,12 +21,13 @@ from gcd_model import (
     ViewSynthesizer,
 )
 from gcd_model.errors import OptionError
+from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import to_network
 from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
 from gcd_train.files import write_whole
 from gcd_train.look.real_video import Bytes, Windowed
 
-DEFAULT_ANGLES = (SphericalDelta(azimuth_deg=30.0, elevation_deg=10.0), SphericalDelta(azimuth_deg=-30.0))
+_ANGLES = (SphericalDelta(azimuth_deg=30.0, elevation_deg=10.0), SphericalDelta(azimuth_deg=-30.0))
 """Where steered models look from unless somebody says: to the right and from above, and to the left."""
 
 
@@ -72,73 +73,70 @@ def paths(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None = None) -> 
         raise OptionError(f"{traits.name} has no use for --source-elevation-deg and --source-radius; leave them out")
     if traits.config.camera == "none" and not recipe.angles:
         return (("view", traits.plan_view(mount=mount)),)
-    angles = recipe.angles or DEFAULT_ANGLES
-    return tuple((_told(each), traits.plan_view(each, source=recipe.source, mount=mount)) for each in angles)
+    angles = recipe.angles or _ANGLES
+    return tuple(
+        (
+            f"az {each.azimuth_deg:+g} el {each.elevation_deg:+g} r {each.radius_m:+g}",
+            traits.plan_view(each, source=recipe.source, mount=mount),
+        )
+        for each in angles
+    )
 
 
 def mounted(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None) -> CameraMount | None:
     """How the camera sits on its vehicle, for the live model where somebody says it; else None."""
     if not traits.live or (recipe.height_m is None and recipe.tilt_deg is None):
         return None
-    usual = CameraMount()
-    return replace(
-        usual,
-        height_m=usual.height_m if recipe.height_m is None else recipe.height_m,
-        tilt_deg=usual.tilt_deg if recipe.tilt_deg is None else recipe.tilt_deg,
-        hfov_deg=usual.hfov_deg if hfov_deg is None else hfov_deg,
-    )
+    given = {"height_m": recipe.height_m, "tilt_deg": recipe.tilt_deg, "hfov_deg": hfov_deg}
+    return replace(CameraMount(), **{name: number for name, number in given.items() if number is not None})
 
 
 def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewRecipe) -> Viewed:
     """Encode a window once and render every goal. Raises: ModelError and its kind."""
     traits = synthesizer.traits
     mount = mounted(traits, recipe, window.hfov_deg)
-    features = synthesizer.encode(Clip(video=to_network(window.pictures), fps=window.fps, mount=mount))
+    lens, (high, wide) = None, window.pictures.shape[1:3]
+    if traits.live and window.hfov_deg is not None:
+        lens = Intrinsics.from_hfov(window.hfov_deg, wide, high)
+    features = synthesizer.encode(Clip(video=to_network(window.pictures), fps=window.fps, mount=mount, lens=lens))
     options = RenderOptions(samples=recipe.samples, steps=recipe.steps, seed=recipe.seed)
     strips = [Strip.of("input", window.pictures)]
-    for told, path in paths(traits, recipe, window.hfov_deg):
+    for name, path in paths(traits, recipe, window.hfov_deg):
         (view,) = synthesizer.render(features, [path], options)
-        strips += _view_strips(traits, told, view)
-    return Viewed(window=window, strips=tuple(strips), notes=_notes(window, traits.name))
+        strips += _view_strips(traits, name, view)
+    width, height = window.size
+    rate = "" if window.trained_rate else f", a rate {traits.name} was not trained with"
+    notes = (
+        f"from {window.start_s:.1f} s, {len(window.pictures)} frames at {window.fps:g} a second{rate}",
+        f"cut from {width} x {height} to {wide} x {high}",
+    )
+    return Viewed(window=window, strips=tuple(strips), notes=notes)
 
 
 def write_viewed(viewed: Viewed, folder: Path) -> None:
     """`NAME.png`, the sheet, and `NAME.mp4`, all rows side by side. Raises RunError if they cannot be written."""
-    told = f"{viewed.window.video} from {viewed.window.start_s:.1f} s"
-    write_sheet([(told, viewed.strips)], folder / f"{viewed.window.name}.png")
-    write_video(viewed.strips, viewed.window.fps, folder / f"{viewed.window.name}.mp4")
+    window = viewed.window
+    write_sheet([(f"{window.video} from {window.start_s:.1f} s", viewed.strips)], folder / f"{window.name}.png")
+    write_video(viewed.strips, window.fps, folder / f"{window.name}.mp4")
 
 
-def _view_strips(traits: Traits, told: str, view: View) -> list[Strip]:
+def _view_strips(traits: Traits, name: str, view: View) -> list[Strip]:
     strips = [
-        Strip.of(told if number == 0 else f"{told} sample {number + 1}", to_bytes(sample))
+        Strip.of(name if number == 0 else f"{name} sample {number + 1}", to_bytes(sample))
         for number, sample in enumerate(view.samples)
     ]
     deviation, word = (view.uncertainty, "uncertainty") if view.uncertainty is not None else (view.std, "deviation")
     if deviation is not None:
-        strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", heat(deviation.numpy())))
+        strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", _heat(deviation.numpy())))
     if view.classes is not None:
         strips.append(Strip.of("classes", painted(view.classes[0], traits.classes)))
     return strips
 
 
-def heat(values: NDArray[np.float32]) -> Bytes:
+def _heat(values: NDArray[np.float32]) -> Bytes:
     """Numbers [T, H, W] as pictures [T, H, W, 3]: black is 0, the brightest is their largest."""
     grey = np.rint(values / max(float(values.max()), 1e-6) * 255).clip(0, 255).astype(np.uint8)
     return np.stack([np.asarray(cv2.applyColorMap(each, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8) for each in grey])
-
-
-def _told(delta: SphericalDelta) -> str:
-    return f"az {delta.azimuth_deg:+g} el {delta.elevation_deg:+g} r {delta.radius_m:+g}"
-
-
-def _notes(window: Windowed, model: str) -> tuple[str, ...]:
-    width, height = window.size
-    rate = "" if window.trained_rate else f", a rate {model} was not trained with"
-    return (
-        f"from {window.start_s:.1f} s, {len(window.pictures)} frames at {window.fps:g} a second{rate}",
-        f"cut from {width} x {height} to {window.pictures.shape[2]} x {window.pictures.shape[1]}",
-    )
 
 
 _STYLE = (

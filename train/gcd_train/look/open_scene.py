@@ -1,115 +1,56 @@
-"""From a path to what is shown: which layout it is, and which clip; clips of pair shards."""
+"""From a path to the clip that is shown: of a scene in one of the published layouts, or of pair shards."""
 
 import zipfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics
-from gcd_model.small_files import decode_json
-from gcd_train.data.dataset4d import read_ontology
-from gcd_train.data.files import ZIP_FAULTS, read_member
+from gcd_model.errors import FileError
+from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics, from_pose, spherical_trajectory
+from gcd_model.small_files import decode_json, read_json
+from gcd_train.data.dataset4d import Dataset4D, OntologyItem, read_ontology
+from gcd_train.data.files import MOST_TEXT, ZIP_FAULTS, bytes_read, read_member
 from gcd_train.data.kubric4d import Kubric4D
-from gcd_train.data.pairs import PairedClip, PairedClips
+from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.paths import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
+from gcd_train.data.pictures import frames_of, geometry_poses, renderer_kind, trained_picture
 from gcd_train.data.sample import SceneView
-from gcd_train.errors import DataError, RecipeError
+from gcd_train.errors import DataError, RecipeError, RenderError
+from gcd_train.evaluation.clips import nearest_resized
 from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.look.clip import SKY_M, Footage, LabelName, instance_colour, splatted
-from gcd_train.look.scene_clip import ShowOptions, dataset_clip
-from gcd_train.pointcloud import depth_visibility
+from gcd_train.layouts.manifest import GEOMETRY, read_manifest
+from gcd_train.look.clip import Bytes, Footage, Poses, instance_colour
+from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, splat, visibility
+
+_WIDTH = 384
+_SHAPE = 1.5  # of the trained pictures
+_STAGE, _VEHICLE = "world: z up, ground at z = 0", "vehicle: x ahead, y left, z up, ground at z = 0"
 
 
-def pair_clip(folder: Path, seed: int | None) -> Footage:
-    """The clip of a seed, by default the first. Raises: DataError naming the shard, RecipeError for an unknown seed."""
-    clips = PairedClips.open(folder)
-    seeds = [clips.seed(number) for number in range(len(clips))]
-    if seed is not None and seed not in seeds:
-        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(seeds)}, {seeds[0]} to {seeds[-1]}")
-    index = 0 if seed is None else seeds.index(seed)
-    clip = clips[index]
-    poses, hfov_deg = _told(*clips.places[index])
-    lens = Intrinsics.from_hfov(hfov_deg, clips.width, clips.height)
-    views = [
-        SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=pose, lens=lens)
-        for rgb, depth, pose in zip(clip.source, clip.source_depth, poses["source"], strict=True)
-    ]
-    targets = list(zip(views, clip.target_depth, poses["target"], strict=True))
-    scale = " (1 m here is 1 dm)" if clips.world.name.startswith("tabletop") else ""
-    shown = Footage(
-        title=f"pair shard, {clips.world.name} world{scale}, seed {clip.seed}",
-        layout=str(clips.places[index][0]),
-        path="the driving path, up and back\nat a sine pace",
-        frame_numbers=tuple(range(clips.frames)),
-        fps=clips.fps,
-        scene_frames=clips.frames,
-        scene_fps=clips.fps * clips.world.stride,
-        cameras=tuple(poses),
-        source_camera="source",
-        hfov_deg=lens.hfov_deg,
-        source=clip.source,
-        target=clip.target,
-        target_is="rendered exactly",
-        splat=np.stack([splatted(view, pose, lens) for view, _, pose in targets]),
-        visible=np.stack([depth_visibility(view, depth, pose, lens) for view, depth, pose in targets]),
-        visible_is="depths agree within 2 %",
-        surface=(clip.target_depth > 0) & (clip.target_depth < SKY_M),
-        labels=(clip.source_classes if clips.classes else clip.source_instances).astype(np.int32),
-        kind="class" if clips.classes else "instance",
-        names=_names(clips, clip),
-        depth=clip.source_depth,
-        world_from_source=poses["source"],
-        world_from_target=poses["target"],
-        look_at=LOOK_AT if clips.mount is None else DRIVING_GOAL_TARGET,
-        world="world: z up, ground at z = 0",
-    )
-    if clips.mount is not None:
-        vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
-        return replace(
-            shown,
-            world_from_source=np.repeat(vehicle_from_source[None], clips.frames, axis=0),
-            world_from_target=vehicle_from_source @ np.linalg.inv(poses["source"]) @ poses["target"],
-            world="vehicle: x ahead, y left, z up, ground at z = 0",
-        )
-    orbit = clips.orbit(index)
-    azimuth_deg, elevation_deg, radius_m = orbit.change
-    return replace(
-        shown,
-        path=f"{azimuth_deg:+.1f}\N{DEGREE SIGN} azimuth, {elevation_deg:+.1f}\N{DEGREE SIGN} elevation,\n"
-        f"{radius_m:+.1f} m radius, gradual",
-        frame_numbers=orbit.frame_numbers,
-        scene_frames=orbit.frame_numbers[-1] + 1,
-    )
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ShowOptions:
+    """Which clip. start, stride: frames of the scene, drawn with the seed where None. seed: of clip and camera path.
+
+    exact: draw the target from a scene's kept geometry where there is one, else always from points. clip: seed of the
+    clip, in pair shards only.
+    """
+
+    start: int | None = None
+    stride: int | None = None
+    seed: int = 0
+    exact: bool = True
+    clip: int | None = None
 
 
-def _names(clips: PairedClips, clip: PairedClip) -> tuple[LabelName, ...]:
-    if clips.classes:
-        return tuple(LabelName(id=i, name=kind.name, colour=kind.colour) for i, kind in enumerate(clips.classes))
-    numbers = np.unique(clip.source_instances).tolist()
-    told = {0: "background"}
-    return tuple(LabelName(id=i, name=told.get(i, f"instance {i}"), colour=instance_colour(i)) for i in numbers)
-
-
-def _told(shard: Path, name: str) -> tuple[dict[str, NDArray[np.float64]], float]:
-    """Poses [T, 4, 4] by camera, and the horizontal field of view, of a clip's `scene.json`."""
-    try:
-        with zipfile.ZipFile(shard) as archive:
-            told = decode_json(read_member(archive, f"{name}/scene.json"), dict[str, Any])
-        poses = {camera: np.array(rows, np.float64) for camera, rows in told["world_from_camera"].items()}
-        return {camera: poses[camera] for camera in ("source", "target")}, float(told["facts"]["hfov_deg"])
-    except (*ZIP_FAULTS, TypeError, AttributeError) as error:
-        raise DataError(
-            f"{shard}: {name}/scene.json is damaged ({error}); delete the shard, generate it again"
-        ) from error
-
-
-def open_scene(path: Path, options: ShowOptions, clip_seed: int | None = None) -> Footage:
+def open_scene(path: Path, options: ShowOptions) -> Footage:
     """The clip of a scene folder, or of a folder of pair shards.
 
-    clip_seed: of which clip, in pair shards only.
     Raises: DataError if there is no such folder or it is of no known layout, FileFault (a DataError) naming the file
     that cannot be read, RecipeError for options that do not fit.
     """
@@ -119,50 +60,284 @@ def open_scene(path: Path, options: ShowOptions, clip_seed: int | None = None) -
             raise RecipeError(
                 "pair shards hold finished clips: leave out --start and --stride, or name one with --clip"
             )
-        return pair_clip(path.parent if path.suffix == ".zip" else path, _seed_of(path, clip_seed))
-    if clip_seed is not None:
+        return _pair_clip(path, options.clip)
+    if options.clip is not None:
         raise RecipeError("--clip names a clip of pair shards; choose one of a scene with --start, --stride and --seed")
     if not path.is_dir():
         raise DataError(f"{path} is no folder; give a scene such as scn00000 or scene_000000, or pair shards")
+    return _scene_clip(_data_set(path), path.name, options)
+
+
+def _data_set(path: Path) -> Dataset4D:
+    """Of one scene, with the cameras that are there: to look at it not all are needed. Raises DataError, FileFault."""
     if kubric4d.scene_number(path.name) is not None:
-        # with the views that are there: to look at a scene not all are needed
         every = enumerate(kubric4d.CAMERAS)
         views = [camera for view, camera in every if kubric4d.metadata_path(path, view).exists()]
-        orbits = Kubric4D(path.parent, [path.name], cameras=views or kubric4d.CAMERAS, instances=True)
-        return dataset_clip(orbits, path.name, options)
+        return Kubric4D(path.parent, [path.name], cameras=views or kubric4d.CAMERAS, instances=True)
     if parallel_domain4d.scene_number(path.name) is not None:
         cameras = [camera for camera in parallel_domain4d.CAMERAS if (path / "rgb" / camera).is_dir()]
         classes = (path / "semantic_segmentation_2d").is_dir()
-        drives = ParallelDomain4D(
+        return ParallelDomain4D(
             path.parent,
             [path.name],
             cameras=cameras or parallel_domain4d.CAMERAS,
             classes=classes,
             ontology=read_ontology(parallel_domain4d.ontology_folder(path)) if classes else None,
         )
-        return dataset_clip(drives, path.name, options)
-    raise DataError(_guess(path))
-
-
-def _seed_of(path: Path, clip_seed: int | None) -> int | None:
-    """The clip to show: as asked, or the first of a shard that was named itself."""
-    if clip_seed is not None or path.suffix != ".zip":
-        return clip_seed
-    number = path.stem.split("-")[1:2]
-    return int(number[0]) if number and number[0].isdecimal() else None
-
-
-def _guess(path: Path) -> str:
-    """What to give instead of a folder that is no scene."""
+    layouts = (kubric4d, parallel_domain4d)
     inside = sorted(child.name for child in path.iterdir() if child.is_dir())
-    scenes = [
-        name
-        for name in inside
-        if kubric4d.scene_number(name) is not None or parallel_domain4d.scene_number(name) is not None
-    ]
+    scenes = [name for name in inside if any(layout.scene_number(name) is not None for layout in layouts)]
     if scenes:
-        return f"{path} is a set of {len(scenes)} scenes; show one, such as {path / scenes[0]}"
-    return (
+        raise DataError(f"{path} is a set of {len(scenes)} scenes; show one, such as {path / scenes[0]}")
+    raise DataError(
         f"{path} is no scene: its name is neither scnNNNNN (Kubric-4D) nor scene_NNNNNN (ParallelDomain-4D), and it "
         "has no world.json (pair shards); give the folder of one scene, with its own name"
     )
+
+
+def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
+    """A clip of a scene. Raises: FileFault naming the file that cannot be read, RecipeError for frames that are not."""
+    before = bytes_read()
+    on_sphere = isinstance(data, Kubric4D)
+    numbers, stride = _frame_numbers(data.frames(scene), KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, options)
+    views = [data.views(scene, number, [data.source_camera])[0] for number in numbers]
+    width = min(_WIDTH, views[0].lens.width)
+    size = (width, round(width / _SHAPE))
+    lens = render_lens(views[0].lens, *size)
+    pose = views[0].world_from_camera
+    still, poses, path = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
+    target, target_depth, target_is = _target(data, scene, numbers, poses, lens, exact=options.exact)
+    labels, kind, names = _labels(data, scene, views, size)
+    return Footage(
+        title=_title(data.folder(scene), "Kubric-4D" if on_sphere else "ParallelDomain-4D"),
+        layout=str(data.folder(scene)),
+        path=path,
+        frame_numbers=numbers,
+        fps=data.fps / stride,
+        scene_frames=data.frames(scene),
+        scene_fps=data.fps,
+        cameras=tuple(data.cameras),
+        source_camera=data.source_camera,
+        hfov_deg=lens.hfov_deg,
+        source=np.stack([trained_picture(view.rgb, *size) for view in views]),
+        target=target,
+        target_is=target_is,
+        target_depth=target_depth,
+        splat=_splatted(views, poses, lens),
+        visible=_visible(views, target_depth, poses, lens),
+        labels=labels,
+        kind=kind,
+        names=names,
+        depth=np.stack([nearest_resized(view.depth, *size) for view in views]),
+        world_from_source=np.repeat(still[None], len(numbers), axis=0),
+        world_from_target=poses,
+        look_at=LOOK_AT if on_sphere else DRIVING_GOAL_TARGET,
+        world=_STAGE if on_sphere else _VEHICLE,
+        bytes_read=bytes_read() - before,
+    )
+
+
+def _frame_numbers(frames: int, sampling: FrameSampling, options: ShowOptions) -> tuple[tuple[int, ...], int]:
+    """The clip's frames and stride; of a scene that is too short all of its frames."""
+    clip = sampling.clip
+    strides = sampling.strides if options.stride is None else (options.stride,)
+    if options.stride is None and options.start is None and sampling.last_start(frames, 1) < 0:
+        return tuple(range(min(frames, clip))), 1
+    reaching = replace(sampling, strides=strides, reach_last=True, reverse=0.0, latest_start=None)
+    if options.start is None:
+        numbers, stride, _ = reaching.draw(generator(options.seed, 0), frames)
+        return numbers, stride
+    stride = options.stride or 1
+    last = reaching.last_start(frames, stride)
+    if not 0 <= options.start <= last:
+        raise RecipeError(
+            f"the scene has {frames} frames: with stride {stride} a clip of {clip} may start at 0 to {last}, got "
+            f"{options.start}; change --start or --stride"
+        )
+    return tuple(range(options.start, options.start + clip * stride, stride)), stride
+
+
+def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> tuple[Poses, Poses, str]:
+    """The source's pose, the target's and the path in words: as training draws it (max90, gradual)."""
+    start = from_pose(torch.from_numpy(world_from_source))
+    change = MAX90.change(generator(seed, 1), start)
+    path = spherical_trajectory(start, change, frames=frames, move_time=frames - 1)
+    words = (
+        f"azimuth {change.azimuth_deg:+.1f}°, elevation {change.elevation_deg:+.1f}°,\n"
+        f"radius {change.radius_m:+.1f} m, from {start.azimuth_deg:.0f}°, {start.elevation_deg:.0f}°, "
+        f"{start.radius_m:.1f} m"
+    )
+    return world_from_source, world_from_source @ path.source_from_target.numpy(), words
+
+
+def _drive(frames: int) -> tuple[Poses, Poses, str]:
+    """The same of ParallelDomain-4D's path, gradual."""
+    draw = replace(DRIVING, frames=FrameSampling(clip=frames, reach_last=True)).draw(generator(0, 0), frames, 1.0)
+    from_x, _, from_z = draw.world_from_target[0, :3, 3]
+    to_x, _, to_z = draw.world_from_target[-1, :3, 3]
+    words = f"up and back at a sine pace\nx {from_x:.1f} to {to_x:.1f} m, z {from_z:.2f} to {to_z:.2f} m"
+    return draw.world_from_source, draw.world_from_target, words
+
+
+def _target(
+    data: Dataset4D, scene: str, numbers: tuple[int, ...], poses: Poses, lens: Intrinsics, *, exact: bool
+) -> tuple[Bytes, NDArray[np.float32] | None, str]:
+    """Colour [T, H, W, 3], depth [T, H, W] where it is known, and how they were made. Raises DataError, FileFault."""
+    folder = data.folder(scene)
+    if exact and (folder / GEOMETRY).exists():
+        try:
+            still = frames_of(folder, list(numbers), lens)
+            cameras = {"target": geometry_poses(folder, numbers) @ poses}
+            with renderer_kind()(lens.width, lens.height, oversample=1) as renderer:
+                views = [view for _, _, view in renderer.views(still, cameras)]
+            colour, depth = np.stack([view.rgb for view in views]), np.stack([view.depth for view in views])
+            return colour, depth, "rendered from the\nscene's geometry"
+        except RenderError:
+            pass  # no renderer on this machine; points need none
+    every = [
+        published_picture(data.views(scene, number), at, lens, width=lens.width, height=lens.height)
+        for number, at in zip(numbers, poses, strict=True)
+    ]
+    return np.stack(every), None, f"points of all\n{len(data.cameras)} cameras"
+
+
+def _splatted(views: list[SceneView], poses: Poses, lens: Intrinsics) -> Bytes:
+    """Each view's points alone as the target camera sees them, u8 [T, H, W, 3]."""
+    drawn = [splat([view], at, lens).colour for view, at in zip(views, poses, strict=True)]
+    return (torch.stack(drawn) * 255).round().byte().numpy()
+
+
+def _visible(
+    views: list[SceneView], target_depth: NDArray[np.float32] | None, poses: Poses, lens: Intrinsics
+) -> NDArray[np.bool_]:
+    """What the source camera saw: the very surface where the target's depth is known, else by the published rule."""
+    if target_depth is None:
+        seen = [
+            visibility(view, at, lens, width=lens.width, height=lens.height)
+            for view, at in zip(views, poses, strict=True)
+        ]
+        return np.stack(seen)
+    each = zip(views, target_depth, poses, strict=True)
+    return np.stack([depth_visibility(view, depth, at, lens) for view, depth, at in each])
+
+
+def _title(folder: Path, layout: str) -> str:
+    """Scene, layout and, of our own scenes, the world it was made in."""
+    try:
+        return f"{folder.name}, {_world_name(read_manifest(folder).world)}, {layout} layout"
+    except DataError:
+        return f"{folder.name}, {layout} layout"
+
+
+def _world_name(world: str) -> str:
+    return f"{world} world" + (" (1 m here is 1 dm)" if world.startswith("tabletop") else "")
+
+
+class _Asset(msgspec.Struct, frozen=True):
+    asset_id: str = ""
+
+
+class _Assets(msgspec.Struct, frozen=True):
+    instances: tuple[_Asset, ...] = ()
+
+
+def _labels(
+    data: Dataset4D, scene: str, views: list[SceneView], size: tuple[int, int]
+) -> tuple[NDArray[np.int32] | None, str, tuple[OntologyItem, ...]]:
+    """Ids over time, whether they are classes or instances, and their names."""
+    classes = [view.classes for view in views if view.classes is not None]
+    if data.ontology is not None and len(classes) == len(views):
+        return np.stack([nearest_resized(ids, *size) for ids in classes]).astype(np.int32), "class", data.ontology.items
+    found = [view.instances for view in views if view.instances is not None]
+    if len(found) < len(views):
+        return None, "class", ()
+    labels = np.stack([nearest_resized(ids, *size) for ids in found]).astype(np.int32)
+    path = kubric4d.metadata_path(data.folder(scene), int(data.source_camera.removeprefix("view") or 0))
+    try:
+        assets = read_json(path, _Assets, MOST_TEXT).instances
+    except FileError:
+        assets = ()  # names are decoration; the reader has checked what matters in this file
+    names = {i: f"{asset.asset_id} ({i})" for i, asset in enumerate(assets, 1) if asset.asset_id}
+    return labels, "instance", _instances(labels, names)
+
+
+def _instances(labels: NDArray[Any], names: dict[int, str]) -> tuple[OntologyItem, ...]:
+    """Those that are seen; 0 is the background."""
+    names = {0: "background"} | names
+    return tuple(
+        OntologyItem(id=i, name=names.get(i, f"instance {i}"), colour=instance_colour(i))
+        for i in np.unique(labels).tolist()
+    )
+
+
+def _pair_clip(path: Path, seed: int | None) -> Footage:
+    """The clip of a seed, by default the first of the shard or folder.
+
+    Raises: DataError naming the shard, RecipeError for an unknown seed.
+    """
+    folder = path.parent if path.suffix == ".zip" else path
+    if seed is None and path.suffix == ".zip" and (number := path.stem.split("-")[1:2]) and number[0].isdecimal():
+        seed = int(number[0])
+    clips = PairedClips.open(folder)
+    seeds = [clips.seed(number) for number in range(len(clips))]
+    if seed is not None and seed not in seeds:
+        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(seeds)}, {seeds[0]} to {seeds[-1]}")
+    index = 0 if seed is None else seeds.index(seed)
+    clip, shard, steps = clips[index], clips.places[index][0], tuple(range(clips.frames))
+    sources, targets = _pair_poses(*clips.places[index])
+    lens = Intrinsics.from_hfov(clips.world.hfov_deg, clips.width, clips.height)
+    views = [
+        SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=pose, lens=lens)
+        for rgb, depth, pose in zip(clip.source, clip.source_depth, sources, strict=True)
+    ]
+    labels = (clip.source_classes if clips.classes else clip.source_instances).astype(np.int32)
+    classes = (OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes))
+    shown = Footage(
+        title=f"pair shard, {_world_name(clips.world.name)}, seed {clip.seed}",
+        layout=str(shard),
+        path="the driving path, up and back\nat a sine pace",
+        frame_numbers=steps,
+        fps=clips.fps,
+        scene_frames=clips.frames,
+        scene_fps=clips.fps * clips.world.stride,
+        cameras=("source", "target"),
+        source_camera="source",
+        hfov_deg=lens.hfov_deg,
+        source=clip.source,
+        target=clip.target,
+        target_is="rendered exactly",
+        target_depth=clip.target_depth,
+        splat=_splatted(views, targets, lens),
+        visible=_visible(views, clip.target_depth, targets, lens),
+        labels=labels,
+        kind="class" if clips.classes else "instance",
+        names=tuple(classes) or _instances(labels, {}),
+        depth=clip.source_depth,
+        world_from_source=sources,
+        world_from_target=targets,
+        look_at=LOOK_AT if clips.mount is None else DRIVING_GOAL_TARGET,
+        world=_STAGE if clips.mount is None else _VEHICLE,
+    )
+    if clips.mount is not None:
+        vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
+        return replace(
+            shown,
+            world_from_source=np.repeat(vehicle_from_source[None], clips.frames, axis=0),
+            world_from_target=vehicle_from_source @ np.linalg.inv(sources) @ targets,
+        )
+    orbit = clips.orbit(index)
+    azimuth_deg, elevation_deg, radius_m = orbit.change
+    words = f"{azimuth_deg:+.1f}° azimuth, {elevation_deg:+.1f}° elevation,\n{radius_m:+.1f} m radius, gradual"
+    return replace(shown, path=words, frame_numbers=orbit.frame_numbers, scene_frames=orbit.frame_numbers[-1] + 1)
+
+
+def _pair_poses(shard: Path, name: str) -> tuple[Poses, Poses]:
+    """Of source and target, [T, 4, 4] each, from a clip's `scene.json`."""
+    try:
+        with zipfile.ZipFile(shard) as archive:
+            poses = decode_json(read_member(archive, f"{name}/scene.json"), dict[str, Any])["world_from_camera"]
+        return np.array(poses["source"], np.float64), np.array(poses["target"], np.float64)
+    except (*ZIP_FAULTS, TypeError) as error:
+        raise DataError(
+            f"{shard}: {name}/scene.json is damaged ({error}); delete the shard, generate it again"
+        ) from error

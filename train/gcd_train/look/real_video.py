@@ -62,11 +62,13 @@ class RealVideo:
     def frames(self) -> Iterator[Bytes]:
         """Every frame as RGB u8 [H, W, 3]. Raises DataError for what is no video or picture."""
         if self.pictures:
-            yield from (_picture(path) for path in self.pictures)
+            for path in self.pictures:
+                picture = decoded(path, read(path), cv2.IMREAD_COLOR)
+                yield np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
             return
         with _opened(self.path) as capture:
-            while (read := capture.read())[0]:
-                yield np.asarray(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB), np.uint8)
+            while (found := capture.read())[0]:
+                yield np.asarray(cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB), np.uint8)
 
     def measured(self) -> tuple[int, float | None]:
         """Frames, counted one by one as containers lie, and frames per second; None where the file does not tell."""
@@ -108,10 +110,9 @@ def find_videos(paths: Sequence[Path]) -> tuple[RealVideo, ...]:
 
     Raises: DataError for a path that is not there, or a folder with neither.
     """
-    places = [place for path in paths for place in _videos_at(path)]
     times = Counter[str]()
     found: list[RealVideo] = []
-    for path, pictures in places:
+    for path, pictures in (place for given in paths for place in _videos_at(given)):
         stem = folder_name(path.stem)
         times[stem] += 1
         name = stem if times[stem] == 1 else f"{stem}.{times[stem]}"
@@ -130,7 +131,8 @@ def read_windows(video: RealVideo, traits: Traits, choice: WindowChoice) -> tupl
     own = choice.rate or stated
     if own is None:
         raise DataError(f"{video.path} does not tell its frame rate; give it with --rate")
-    fps, trained = _rate(own, traits.rates)
+    reachable = [rate for rate in traits.rates if rate <= own * _RATE_TOLERANCE]
+    fps = max(reachable, default=own)
     starts = _starts(video.path, count, own, fps, traits.config.frames, choice)
     wanted = [[start + math.floor(i * own / fps + 0.5) for i in range(traits.config.frames)] for start in starts]
     chosen, size = _chosen(video, {number for each in wanted for number in each}, traits, choice.hfov_deg)
@@ -142,43 +144,26 @@ def read_windows(video: RealVideo, traits: Traits, choice: WindowChoice) -> tupl
             start_s=start / own,
             pictures=np.stack([chosen[frame] for frame in frames]),
             fps=fps,
-            trained_rate=trained,
+            trained_rate=bool(reachable) or not traits.rates,
             size=size,
-            hfov_deg=_cut_angle(choice.hfov_deg, size, traits),
+            hfov_deg=_kept(size, traits, choice.hfov_deg)[1],
         )
         for number, (start, frames) in enumerate(zip(starts, wanted, strict=True))
     )
 
 
-def fitted(picture: Bytes, width: int, height: int, share: float = 1.0) -> Bytes:
-    """The middle of a picture in a network's shape and size. share: of the width that is kept, 1 is all."""
-    left, top, wide, high = _box((picture.shape[1], picture.shape[0]), width / height, share)
-    part = picture[top : top + high, left : left + wide]
-    how = cv2.INTER_AREA if wide > width else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(part, (width, height), interpolation=how), np.uint8)
+def _kept(size: tuple[int, int], traits: Traits, hfov_deg: float | None) -> tuple[list[int], float | None]:
+    """What of a picture this wide and high the network takes: left, top, width and height, and its field of view.
 
-
-def kept_share(hfov_deg: float | None, trained_deg: float | None) -> float:
-    """Share of the width that shows no more than the trained field of view; 1 where either is not known."""
-    if hfov_deg is None or trained_deg is None or hfov_deg <= trained_deg:
-        return 1.0
-    return math.tan(math.radians(trained_deg / 2)) / math.tan(math.radians(hfov_deg / 2))
-
-
-def _box(size: tuple[int, int], aspect: float, share: float) -> tuple[int, int, int, int]:
-    """Left, top, width and height of what is kept, pixels."""
+    As much of the middle as has the network's shape and shows no more than it was trained with.
+    """
+    config, trained_deg = traits.config, None if traits.family is None else traits.family.hfov_deg
+    half = None if hfov_deg is None else math.tan(math.radians(hfov_deg / 2))
+    share = 1.0 if half is None or trained_deg is None else min(1.0, math.tan(math.radians(trained_deg / 2)) / half)
     beside = round(size[0] * (1 - share) / 2)
-    left, top, wide, high = center_crop_box(max(1, size[0] - 2 * beside), size[1], aspect)
-    return left + beside, top, wide, high
-
-
-def _cut_angle(hfov_deg: float | None, size: tuple[int, int], traits: Traits) -> float | None:
-    """Field of view of what is kept of pictures this wide."""
-    if hfov_deg is None:
-        return None
-    share = kept_share(hfov_deg, None if traits.family is None else traits.family.hfov_deg)
-    _, _, wide, _ = _box(size, traits.config.width / traits.config.height, share)
-    return math.degrees(2 * math.atan(math.tan(math.radians(hfov_deg / 2)) * wide / size[0]))
+    left, top, wide, high = center_crop_box(max(1, size[0] - 2 * beside), size[1], config.width / config.height)
+    angle = None if half is None else math.degrees(2 * math.atan(half * wide / size[0]))
+    return [left + beside, top, wide, high], angle
 
 
 def _videos_at(path: Path) -> list[tuple[Path, tuple[Path, ...]]]:
@@ -229,17 +214,6 @@ def _is_container(path: Path) -> bool:
     return head[4:8] in _BOXES or head[:4] == b"\x1a\x45\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
 
 
-def _picture(path: Path) -> Bytes:
-    picture = decoded(path, read(path), cv2.IMREAD_COLOR)
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
-
-
-def _rate(own: float, trained: Sequence[float]) -> tuple[float, bool]:
-    """The highest trained rate that the video can give, else its own; and whether it is a trained one."""
-    reachable = [rate for rate in trained if rate <= own * _RATE_TOLERANCE]
-    return (max(reachable), True) if reachable else (own, not trained)
-
-
 def _starts(path: Path, count: int, own: float, fps: float, frames: int, choice: WindowChoice) -> list[int]:
     """First frame of each window, evenly from `start_s` to the last that fits; windows do not overlap."""
     span = math.floor((frames - 1) * own / fps + 0.5) + 1
@@ -257,13 +231,16 @@ def _chosen(
     video: RealVideo, wanted: set[int], traits: Traits, hfov_deg: float | None
 ) -> tuple[Mapping[int, Bytes], tuple[int, int]]:
     """Frames by number in the network's size, and the size they had."""
-    share = kept_share(hfov_deg, None if traits.family is None else traits.family.hfov_deg)
+    wanted_size = (traits.config.width, traits.config.height)
     chosen: dict[int, Bytes] = {}
     size, number = (0, 0), -1
     for number, picture in enumerate(video.frames()):
         if number in wanted:
             size = (picture.shape[1], picture.shape[0])
-            chosen[number] = fitted(picture, traits.config.width, traits.config.height, share)
+            (left, top, wide, high), _ = _kept(size, traits, hfov_deg)
+            part = picture[top : top + high, left : left + wide]
+            how = cv2.INTER_AREA if wide > wanted_size[0] else cv2.INTER_LINEAR
+            chosen[number] = cv2.resize(part, wanted_size, interpolation=how).astype(np.uint8, copy=False)
         if len(chosen) == len(wanted):
             return chosen, size
     raise DataError(f"{video.path} ended after {number + 1} frames while it was read; is it still being written?")

@@ -9,42 +9,41 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.evaluation.galleries import HOLD_S, write_mp4
-from gcd_train.evaluation.plots import DPI, new_figure, save, to_pixels
-from gcd_train.look.clip import SKY_M, UNKNOWN, UNSEEN, Footage, depth_colours, depth_table, depth_ticks
+from gcd_train.evaluation.galleries import HOLD_S, Strip, beside, write_mp4
+from gcd_train.evaluation.plots import new_figure, save
+from gcd_train.look.clip import SKY_M, UNSEEN, Bytes, Footage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
     from mpl_toolkits.mplot3d import Axes3D
 
-
 Doubles = NDArray[np.float64]
-SOURCE_COLOUR, TARGET_COLOUR, POINT_COLOUR = "#12873f", "#1c4fd8", "#d42a2a"
+_SOURCE_COLOUR, _TARGET_COLOUR, _POINT_COLOUR = "#12873f", "#1c4fd8", "#d42a2a"
 _SHOWN = 6  # frusta along the path
 _POINTS, _CELLS = 6000, 84
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
-def draw_trajectory(axes: "Axes3D", footage: Footage) -> None:
+def _draw_trajectory(axes: "Axes3D", footage: Footage) -> None:
     """Fill 3D axes: source and target frusta, path, look-at point, and the input's points around them."""
     low, high = _box(footage)
     size = 0.085 * float((high - low)[:2].max())
     _points(axes, footage, low, high)
     for number in np.unique(np.linspace(0, footage.frames - 1, _SHOWN).round().astype(int)):
         strength = 0.35 + 0.65 * number / max(footage.frames - 1, 1)
-        _frustum(axes, footage, footage.world_from_target[number], size, TARGET_COLOUR, strength)
-    _frustum(axes, footage, footage.world_from_source[0], size, SOURCE_COLOUR, 1.0)
+        _frustum(axes, footage, footage.world_from_target[number], size, _TARGET_COLOUR, strength)
+    _frustum(axes, footage, footage.world_from_source[0], size, _SOURCE_COLOUR, 1.0)
     x, y, z = footage.world_from_target[:, :3, 3].T
-    axes.plot(x, y, z, color=TARGET_COLOUR, linewidth=2.0, label=f"target, {footage.frames} frames", zorder=5)
-    axes.scatter(*footage.world_from_target[-1, :3, 3], color=TARGET_COLOUR, s=20, zorder=5)
+    axes.plot(x, y, z, color=_TARGET_COLOUR, linewidth=2.0, label=f"target, {footage.frames} frames", zorder=5)
+    axes.scatter(*footage.world_from_target[-1, :3, 3], color=_TARGET_COLOUR, s=20, zorder=5)
     source = footage.world_from_source[0, :3, 3]
-    axes.scatter(*source, color=SOURCE_COLOUR, s=20, label=f"source ({footage.source_camera})", zorder=5)
+    axes.scatter(*source, color=_SOURCE_COLOUR, s=20, label=f"source ({footage.source_camera})", zorder=5)
     if footage.look_at is not None:
         x, y, z = footage.look_at
         label = f"look-at ({x:g}, {y:g}, {z:g}) m"
         point = np.array(footage.look_at)
-        axes.scatter(*point, color=POINT_COLOUR, marker="x", s=44, linewidths=2.0, label=label, zorder=6)
+        axes.scatter(*point, color=_POINT_COLOUR, marker="x", s=44, linewidths=2.0, label=label, zorder=6)
     _frame(axes, footage, low, high)
 
 
@@ -79,15 +78,7 @@ def _points(axes: "Axes3D", footage: Footage, low: Doubles, high: Doubles) -> No
     cells = ((points - low) / (high - low).max() * _CELLS).astype(np.int64) @ (1, _CELLS, _CELLS**2)
     chosen = np.unique(cells, return_index=True)[1]  # one a cell, or near surfaces hide the rest
     chosen = chosen[np.random.default_rng(0).permutation(len(chosen))[:_POINTS]]
-    axes.scatter(
-        *points[chosen].T,
-        c=colours[chosen],
-        s=5,
-        linewidths=0,
-        alpha=0.75,
-        depthshade=False,
-        zorder=1,
-    )
+    axes.scatter(*points[chosen].T, c=colours[chosen], s=5, linewidths=0, alpha=0.75, depthshade=False, zorder=1)
 
 
 def _box(footage: Footage) -> tuple[Doubles, Doubles]:
@@ -121,23 +112,25 @@ def _frame(axes: "Axes3D", footage: Footage, low: Doubles, high: Doubles) -> Non
     axes.set_ylabel("y [m]")
     axes.set_zlabel("z [m]")
     axes.computed_zorder = False
-    axes.view_init(elev=24, azim=_across_the_path(footage))
+    ahead = footage.world_from_source[0, :2, 2]  # looked at from behind the cameras and beside the path
+    axes.view_init(elev=24, azim=float(np.degrees(np.arctan2(-ahead[1], -ahead[0]))) + 50.0)
 
 
-def _across_the_path(footage: Footage) -> float:
-    """Azimuth to look from, degrees: behind the cameras and beside the path."""
-    ahead = footage.world_from_source[0, :2, 2]
-    return float(np.degrees(np.arctan2(-ahead[1], -ahead[0]))) + 50.0
-
-
-Bytes = NDArray[np.uint8]
-_COLUMNS = 5
-_LEGEND_ROWS = 14
-INK, FAINT = "#1b2530", "#5c6875"
+_COLUMNS, _LEGEND_ROWS = 5, 14
+_BADGE: dict[str, Any] = {
+    "xytext": (5, 6),
+    "textcoords": "offset points",
+    "bbox": {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
+}
+_INK, _FAINT = "#1b2530", "#5c6875"
+_UNKNOWN = (38, 38, 38)
+"""Colour of depth that is not known, and of sky."""
+_TURBO = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1].astype(np.uint8)
+"""RGB of 256 steps from far to near."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Row:
+class _Row:
     """One kind of picture. name, told: what it is. pictures: u8 [T, H, W, 3]."""
 
     name: str
@@ -145,36 +138,41 @@ class Row:
     pictures: Bytes
 
 
-def rows_of(footage: Footage) -> list[Row]:
+def _rows(footage: Footage) -> list[_Row]:
     """Everything there is to see of a clip, in the order of the sheet."""
-    near, far = footage.depth_range_m
+    depth = _depth_colours(footage.depth, *footage.depth_range_m)
     rows = [
-        Row(name="input", told=f"{footage.source_camera}, colour", pictures=footage.source),
-        Row(name="target", told=footage.target_is, pictures=footage.target),
-        Row(name="splat", told="the input's points from\nthe target; black: none", pictures=footage.splat),
-        Row(name="visibility", told="orange: surfaces\nthe input never saw", pictures=footage.seen()),
-        Row(
-            name="depth",
-            told="of the input, along\nthe optical axis",
-            pictures=depth_colours(footage.depth, near, far),
-        ),
+        _Row(name="input", told=f"{footage.source_camera}, colour", pictures=footage.source),
+        _Row(name="target", told=footage.target_is, pictures=footage.target),
+        _Row(name="splat", told="the input's points from\nthe target; black: none", pictures=footage.splat),
+        _Row(name="visibility", told="orange: surfaces\nthe input never saw", pictures=footage.seen()),
+        _Row(name="depth", told="of the input, along\nthe optical axis", pictures=depth),
     ]
     painted = footage.painted()
     if painted is not None:
-        rows.insert(4, Row(name=footage.kind_plural, told="of the input", pictures=painted))
+        rows.insert(4, _Row(name=footage.kind_plural, told="of the input", pictures=painted))
     return rows
 
 
-def write_sheet(footage: Footage, out: Path, facts: Sequence[tuple[str, str]]) -> None:
+def _depth_colours(depth: NDArray[np.float32], near_m: float, far_m: float) -> Bytes:
+    """Depth in metres [...] as RGB u8 [..., 3]: near is red, far is dark blue, in equal steps of the logarithm."""
+    known = (depth > 0) & (depth < SKY_M)
+    span = max(np.log(max(far_m, 1e-6) / max(near_m, 1e-6)), 1e-6)
+    share = np.log(np.maximum(depth, 1e-6) / max(near_m, 1e-6)) / span
+    coloured = _TURBO[(255 * (1 - share.clip(0, 1))).round().astype(np.uint8)]
+    return np.where(known[..., None], coloured, np.array(_UNKNOWN, np.uint8))
+
+
+def write_sheet(footage: Footage, out: Path) -> None:
     """One page as PNG. Raises: RenderError without matplotlib, RunError where it cannot be written."""
-    rows = rows_of(footage)
+    rows = _rows(footage)
     height, width = footage.source.shape[1:3]
     tall = 1.84 * height / width
     figure = new_figure(15.2, 0.78 + len(rows) * (tall + 0.045))
-    figure.text(0.012, 0.99, footage.title, fontsize=15, fontweight="bold", color=INK, va="top")
+    figure.text(0.012, 0.99, footage.title, fontsize=15, fontweight="bold", color=_INK, va="top")
     parts = figure.add_gridspec(1, 2, width_ratios=[3.05, 1.0], wspace=0.0)
     _draw_rows(figure.add_subfigure(parts[0]), footage, rows)
-    _draw_side(figure.add_subfigure(parts[1]), footage, facts)
+    _draw_side(figure.add_subfigure(parts[1]), footage)
     save(figure, out)
 
 
@@ -182,15 +180,15 @@ def write_trajectory(footage: Footage, out: Path) -> None:
     """The camera path alone, as PNG. Raises as `write_sheet`."""
     figure = new_figure(7.2, 5.6)
     axes: Axes3D = figure.add_axes((0.03, 0.03, 0.93, 0.84), projection="3d")  # pyright: ignore[reportAssignmentType]
-    draw_trajectory(axes, footage)
+    _draw_trajectory(axes, footage)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
-    figure.text(0.03, 0.95, f"{footage.title}: camera path", fontsize=12, fontweight="bold", color=INK)
-    figure.text(0.03, 0.92, footage.path.replace(",\n", ", ").replace("\n", ", "), fontsize=8.5, color=FAINT)
-    figure.text(0.03, 0.89, footage.world, fontsize=8.5, color=FAINT)
+    figure.text(0.03, 0.95, f"{footage.title}: camera path", fontsize=12, fontweight="bold", color=_INK)
+    figure.text(0.03, 0.92, footage.path.replace(",\n", ", ").replace("\n", ", "), fontsize=8.5, color=_FAINT)
+    figure.text(0.03, 0.89, footage.world, fontsize=8.5, color=_FAINT)
     save(figure, out)
 
 
-def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[Row]) -> None:
+def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[_Row]) -> None:
     """All pictures in one piece (thirty axes would take longer than all else), names and times around them.
 
     Always as wide as five moments, so that a shorter clip leaves white and no picture is stretched.
@@ -207,28 +205,22 @@ def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[Row]) -> None
             left = column * (width + gap)
             mosaic[top : top + height, left : left + width] = row.pictures[moment]
             if row.name == "visibility":
-                _badge(axes, left, top + height, f"{100 * footage.seen_shares[moment]:.0f} % seen")
-        _name_row(axes, -0.02 * width, top + 0.4 * height, 0.05 * height, row)
+                seen = f"{100 * footage.seen_shares[moment]:.0f} % seen"
+                axes.annotate(seen, (left, top + height), fontsize=8, color=_INK, **_BADGE)
+        x, y = -0.02 * width, top + 0.4 * height
+        axes.text(x, y, row.name, fontsize=11.5, fontweight="bold", color=_INK, va="center", ha="right")
+        y += 0.115 * height
+        axes.text(x, y, row.told, fontsize=7, color=_FAINT, va="top", ha="right", linespacing=1.15)
     for column, moment in enumerate(moments):
         time = f"t = {footage.seconds[moment]:.2f} s\nframe {footage.frame_numbers[moment]}"
         place = column * (width + gap) + width / 2
-        axes.text(place, -0.04 * height, time, fontsize=9, color=FAINT, ha="center", va="bottom")
+        axes.text(place, -0.04 * height, time, fontsize=9, color=_FAINT, ha="center", va="bottom")
     axes.imshow(mosaic, interpolation="antialiased", aspect="auto")
     share = height / len(mosaic)
-    depth_bar(axes.inset_axes((1.008, 0.02 * share, 0.012, 0.94 * share)), footage)
+    _depth_bar(axes.inset_axes((1.008, 0.02 * share, 0.012, 0.94 * share)), footage)
 
 
-def _name_row(axes: "Axes", x: float, y: float, step: float, row: Row) -> None:
-    axes.text(x, y, row.name, fontsize=11.5, fontweight="bold", color=INK, va="center", ha="right")
-    axes.text(x, y + 2.3 * step, row.told, fontsize=7, color=FAINT, va="top", ha="right", linespacing=1.15)
-
-
-def _badge(axes: "Axes", left: float, bottom: float, text: str) -> None:
-    box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    axes.annotate(text, (left, bottom), xytext=(5, 6), textcoords="offset points", fontsize=8, color=INK, bbox=box)
-
-
-def depth_bar(bar: "Axes", footage: Footage) -> None:
+def _depth_bar(bar: "Axes", footage: Footage) -> None:
     """Fill axes with the colours of depth, near at the bottom, ticks in metres."""
     near, far = footage.depth_range_m
     bar.set_xticks([])
@@ -237,23 +229,35 @@ def depth_bar(bar: "Axes", footage: Footage) -> None:
     if far <= near:
         bar.set_yticks([])
         return
-    bar.imshow(depth_table()[::-1][:, None], aspect="auto", origin="lower", extent=(0, 1, 0, 1))
-    ticks = depth_ticks(near, far)
+    bar.imshow(_TURBO[::-1][:, None], aspect="auto", origin="lower", extent=(0, 1, 0, 1))
+    ticks = _depth_ticks(near, far)
     bar.set_yticks([float(np.log(tick / near) / np.log(far / near)) for tick in ticks], [f"{t:g}" for t in ticks])
     bar.yaxis.tick_right()
-    bar.tick_params(labelsize=7, length=2, colors=FAINT)
-    bar.set_title("m", fontsize=8, color=FAINT, pad=2)
+    bar.tick_params(labelsize=7, length=2, colors=_FAINT)
+    bar.set_title("m", fontsize=8, color=_FAINT, pad=2)
 
 
-def _draw_side(side: "SubFigure", footage: Footage, facts: Sequence[tuple[str, str]]) -> None:
+def _depth_ticks(near_m: float, far_m: float) -> list[float]:
+    """Round numbers of metres between two depths, at most eight; in a narrow range evenly spaced."""
+    rounds = [digit * 10.0**power for power in range(-2, 5) for digit in (1, 2, 3, 5, 7)]
+    ticks = [number for number in rounds if near_m <= number <= far_m]
+    if len(ticks) > 8:
+        return [tick for tick in ticks if f"{tick:e}"[0] in "125"]
+    if len(ticks) >= 3 or far_m <= near_m:
+        return ticks
+    step = next(number for number in rounds if number >= (far_m - near_m) / 5)
+    return [round(number * step, 3) for number in range(int(near_m / step) + 1, int(far_m / step) + 1)]
+
+
+def _draw_side(side: "SubFigure", footage: Footage) -> None:
     axes: Axes3D = side.add_axes((0.02, 0.60, 0.96, 0.335), projection="3d")  # pyright: ignore[reportAssignmentType]
-    draw_trajectory(axes, footage)
+    _draw_trajectory(axes, footage)
     axes.tick_params(labelsize=6.5, pad=-1)
     axes.legend(loc="upper left", bbox_to_anchor=(0.02, 1.18), fontsize=7.5, frameon=False, ncol=1)
     top = 0.575
-    for name, value in facts:
-        side.text(0.03, top, name, fontsize=8, color=FAINT, va="top")
-        side.text(0.27, top, value, fontsize=8, color=INK, va="top", linespacing=1.2)
+    for name, value in footage.facts():
+        side.text(0.03, top, name, fontsize=8, color=_FAINT, va="top")
+        side.text(0.27, top, value, fontsize=8, color=_INK, va="top", linespacing=1.2)
         top -= 0.0195 + 0.0165 * value.count("\n")
     _legend(side, footage, top - 0.015)
 
@@ -262,18 +266,18 @@ def _legend(side: "SubFigure", footage: Footage, top: float) -> None:
     """Names, colours and pixel shares of what is most seen, then the colours that have no bar."""
     shares = footage.shares()
     if shares:
-        side.text(0.03, top, f"{footage.kind_plural}, share of the input's pixels", fontsize=8, color=FAINT, va="top")
+        side.text(0.03, top, f"{footage.kind_plural}, share of the input's pixels", fontsize=8, color=_FAINT, va="top")
         top -= 0.027
     for label, share in shares[:_LEGEND_ROWS]:
-        _swatch(side, top, label.colour, f"{label.name}", percent(share))
+        _swatch(side, top, label.colour, label.name, percent(share))
         top -= 0.0195
     if len(shares) > _LEGEND_ROWS:
         rest = percent(sum(share for _, share in shares[_LEGEND_ROWS:]))
-        side.text(0.09, top, f"and {len(shares) - _LEGEND_ROWS} more, {rest}", fontsize=7.5, color=FAINT, va="top")
+        side.text(0.09, top, f"and {len(shares) - _LEGEND_ROWS} more, {rest}", fontsize=7.5, color=_FAINT, va="top")
         top -= 0.0195
     top -= 0.008
     _swatch(side, top, UNSEEN, "surfaces the input never saw", "")
-    _swatch(side, top - 0.0195, UNKNOWN, "sky, or no depth", "")
+    _swatch(side, top - 0.0195, _UNKNOWN, "sky, or no depth", "")
 
 
 def percent(share: float) -> str:
@@ -286,64 +290,23 @@ def _swatch(side: "SubFigure", top: float, colour: tuple[int, int, int], name: s
     side.text(
         0.035, top, "      ", fontsize=6, va="top", bbox={"facecolor": face, "edgecolor": "#00000030", "pad": 1.2}
     )
-    side.text(0.09, top, name, fontsize=7.5, color=INK, va="top")
-    side.text(0.93, top, value, fontsize=7.5, color=INK, va="top", ha="right")
-
-
-_PANELS = 3
-_GAP, _NAME, _TOP, _BAR = 10, 26, 44, 44  # pixels
-_PLAYS = 2
+    side.text(0.09, top, name, fontsize=7.5, color=_INK, va="top")
+    side.text(0.93, top, value, fontsize=7.5, color=_INK, va="top", ha="right")
 
 
 def write_video(footage: Footage, out: Path) -> None:
-    """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2).
-
-    Raises: RenderError without matplotlib, RunError if the file cannot be written.
-    """
-    rows = rows_of(footage)
-    height, width = footage.source.shape[1:3]
-    places = [_place(number, width, height) for number in range(len(rows))]
-    page = _page(footage, rows, places)
-    moments = [*range(footage.frames), *[footage.frames - 1] * round(HOLD_S * footage.fps)] * _PLAYS
-    write_mp4((_video_frame(footage, rows, places, page, moment) for moment in moments), footage.fps, out)
+    """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2). Raises RunError if it cannot be written."""
+    strips = [Strip.of(row.name, row.pictures) for row in _rows(footage)]
+    moments = [*range(footage.frames), *[footage.frames - 1] * round(HOLD_S * footage.fps)] * 2
+    write_mp4((_video_frame(footage, strips, moment) for moment in moments), footage.fps, out)
 
 
-def _place(number: int, width: int, height: int) -> tuple[int, int]:
-    """Left upper corner of a panel, pixels."""
-    row, column = divmod(number, _PANELS)
-    return _GAP + column * (width + _GAP), _TOP + _NAME + row * (height + _NAME + _GAP)
-
-
-def _page(footage: Footage, rows: Sequence[Row], places: Sequence[tuple[int, int]]) -> Bytes:
-    """Everything that does not move, drawn once: u8 [H, W, 3], even sizes as codecs want them."""
-    height, width = footage.source.shape[1:3]
-    across = _PANELS * (width + _GAP) + _GAP + _BAR
-    down = max(top for _, top in places) + height + _GAP
-    across, down = across + across % 2, down + down % 2
-    figure = new_figure(across / DPI, down / DPI)
-    figure.text(_GAP / across, 1 - 13 / down, footage.title, fontsize=12, fontweight="bold", color=INK, va="top")
-    for row, (left, top) in zip(rows, places, strict=True):
-        at = (left / across, 1 - (top - 7) / down)
-        figure.text(*at, row.name, fontsize=9.5, fontweight="bold", color=INK)
-        told = row.told.replace("\n", " ")
-        figure.text((left + 92) / across, at[1], told, fontsize=7.5, color=FAINT)
-    left, top = places[-1]
-    depth_bar(
-        figure.add_axes(((left + width + 8) / across, 1 - (top + height) / down, 10 / across, (height - 14) / down)),
-        footage,
-    )
-    return to_pixels(figure)
-
-
-def _video_frame(
-    footage: Footage, rows: Sequence[Row], places: Sequence[tuple[int, int]], page: Bytes, moment: int
-) -> Bytes:
-    picture = page.copy()
-    height, width = footage.source.shape[1:3]
-    for row, (left, top) in zip(rows, places, strict=True):
-        picture[top : top + height, left : left + width] = row.pictures[moment]
-    seen = f"{100 * footage.seen_shares[moment]:.0f} % seen"
-    told = f"t = {footage.seconds[moment]:.2f} s   frame {footage.frame_numbers[moment]:3d}   {seen}"
-    at = (_GAP + _PANELS * (width + _GAP) - 340, 28)
-    cv2.putText(picture, told, at, cv2.FONT_HERSHEY_SIMPLEX, 0.52, (60, 70, 82), 1, cv2.LINE_AA)
-    return picture
+def _video_frame(footage: Footage, strips: Sequence[Strip], moment: int) -> Bytes:
+    """Two lines of pictures with their names; below them the time, and how much the input camera saw."""
+    upper, lower = beside(strips[:3], moment), beside(strips[3:], moment)
+    missing = upper.shape[1] - lower.shape[1]
+    page = np.concatenate([upper, np.pad(lower, ((0, 24), (0, missing), (0, 0)), constant_values=255)])
+    seen, at = f"{100 * footage.seen_shares[moment]:.0f} % seen", (2, len(page) - 8)
+    words = f"t = {footage.seconds[moment]:.2f} s, frame {footage.frame_numbers[moment]}, {seen}"
+    cv2.putText(page, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+    return page

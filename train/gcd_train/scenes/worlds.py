@@ -58,7 +58,7 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
     "tabletop": SceneWorld(name="tabletop", make=_tabletop),
     "driving": SceneWorld(
         name="driving",
-        make=lambda seed, frames: driving_drive(seed, frames=frames),
+        make=driving_drive,
         edition=2,  # the first is that of the pairs
         layout="parallel_domain4d",
         frames=parallel_domain4d.FRAMES,

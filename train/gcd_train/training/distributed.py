@@ -198,7 +198,7 @@ def compile_blocks(module: nn.Module) -> None:
     # all blocks are one function to the compiler, which gives up after 8 versions of a function
     dynamo.recompile_limit = max(dynamo.recompile_limit, 4 * len(stages))
     for stage in stages:
-        stage.forward = torch.compile(stage.forward)
+        stage.forward = torch.compile(stage.forward, dynamic=False)
 
 
 def recompute_blocks(module: nn.Module, every: int) -> None:

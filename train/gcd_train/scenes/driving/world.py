@@ -61,7 +61,7 @@ the rig sees 99.9 % of what the path sees within 150 m, and 98 % of what is seen
 """
 
 
-def driving_drive(seed: int, *, frames: int = 50) -> Scene:
+def driving_drive(seed: int, frames: int = 50) -> Scene:
     """One drive through a grown world. Its cameras are named as the data set names them (see `vehicle_from_camera`).
 
     Args:

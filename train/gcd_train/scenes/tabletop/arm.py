@@ -1,46 +1,31 @@
-"""The arm: six hinges and a parallel gripper, made of boxes, cylinders and capsules, as MuJoCo wants it."""
+"""The arm, six hinges and a parallel gripper, and the physics: arm, table and things as one MuJoCo model, in metres."""
 
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Colour
+from gcd_train.errors import RenderError
+from gcd_train.scenes.description import Colour, Part, Point, rotations
+from gcd_train.scenes.tabletop.furniture import FLOOR_M
+from gcd_train.scenes.tabletop.things import Placed, Setting, TabletopClass, Thing
 
+BASE = (-0.36, 0.0, 0.0)
+"""Where the arm is bolted to the table, metres from the middle of its surface."""
+JOINTS = ("yaw", "shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll")
+FINGERS = ("slide_left", "slide_right")
+"""Names in the model; every joint and finger has the position actuator of its name."""
+HOME = (0.0, 0.0, 1.6, 0.0, float(np.pi - 1.6), 0.0)
+"""Angles of a pose above the table with the tool down, radians."""
+OPEN_M = 0.052
+"""How far a finger goes from the middle."""
+REACH_M = (0.27, 0.55)
+"""Nearest and farthest distance from the base at which the arm grasps from above."""
+STEP_S = 1 / 480
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Arm:
-    """An arm as pieces of MJCF, and what the controller must know of it.
-
-    body, equality, actuators: the XML inside the elements of those names; the body stands at the origin, x ahead,
-    metres, and its site "tool" is the point between the fingertips, z out of the hand, y from finger to finger.
-    joints, fingers: names, as in the model; every joint has the position actuator of its name. home: [J] radians, a
-    pose above the table with the tool down. open_m: how far a finger goes from the middle. reach_m: nearest and
-    farthest distance from the base at which it grasps from above. links: body name -> spoken name, gripper last; the
-    last `gripper_links` of them are the gripper.
-    """
-
-    body: str
-    actuators: str
-    equality: str
-    joints: tuple[str, ...]
-    fingers: tuple[str, str]
-    home: tuple[float, ...]
-    open_m: float
-    reach_m: tuple[float, float]
-    links: dict[str, str]
-    gripper_links: int
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Style:
-    shell: Colour
-    joint: Colour
-    upper: float
-    fore: float
-    thick: float
-
-
-_STYLES: tuple[tuple[Colour, Colour], ...] = (
+_LIVERIES: tuple[tuple[Colour, Colour], ...] = (
     ((0.93, 0.93, 0.91), (0.16, 0.17, 0.19)),
     ((0.95, 0.47, 0.08), (0.13, 0.13, 0.14)),
     ((0.95, 0.80, 0.12), (0.18, 0.18, 0.20)),
@@ -48,53 +33,56 @@ _STYLES: tuple[tuple[Colour, Colour], ...] = (
     ((0.30, 0.31, 0.33), (0.75, 0.20, 0.14)),
     ((0.80, 0.83, 0.86), (0.12, 0.38, 0.52)),
 )
-OPEN_M = 0.052
+"""Of shell and joints."""
 _LINKS = {
     "base": "base",
     "turret": "shoulder",
-    "upper": "upper arm",
+    "upper": "upper_arm",
     "fore": "forearm",
-    "roll": "wrist roll",
+    "roll": "wrist_roll",
     "wrist": "wrist",
     "palm": "palm",
-    "finger_left": "left finger",
-    "finger_right": "right finger",
+    "finger_left": "left_finger",
+    "finger_right": "right_finger",
 }
-_JOINTS = ("yaw", "shoulder", "elbow", "forearm_roll", "wrist_pitch", "tool_roll")
+"""Bodies of the model, and what they are called."""
+_GRIPPER = ("palm", "finger_left", "finger_right")
+_OPTIONS = f"""
+<option timestep="{STEP_S}" cone="elliptic" impratio="10" integrator="implicitfast" noslip_iterations="2"/>
+<compiler angle="radian" autolimits="true"/>
+<size memory="32M"/>"""
+_DEFAULTS = """
+<geom solref="0.006 1" solimp="0.95 0.99 0.001"/>
+<default class="arm">
+  <joint type="hinge" armature="0.1" damping="1"/>
+  <geom contype="2" conaffinity="1" friction="0.8 0.01 0.001"/>
+  <position kp="4000" dampratio="1" forcerange="-400 400"/>
+</default>
+<default class="wrist">
+  <joint type="hinge" armature="0.03" damping="0.5"/>
+  <position kp="800" dampratio="1" forcerange="-80 80"/>
+</default>
+<default class="finger">
+  <joint type="slide" range="0 0.052" armature="0.1" damping="5"/>
+  <position kp="1500" kv="30" forcerange="-22 22"/>
+</default>
+<default class="pad">
+  <geom contype="2" conaffinity="1" condim="4" friction="1.2 0.02 0.001" mass="0.02"/>
+</default>
+<default class="thing"><geom contype="1" conaffinity="3" condim="4"/></default>
+<default class="still"><geom contype="1" conaffinity="3" condim="3" friction="0.6 0.01 0.001"/></default>"""
+_MOVED_ALIKE = '<joint joint1="slide_right" joint2="slide_left" polycoef="0 1 0 0 0" solref="0.005 1"/>'
 
 
-def random_arm(random: np.random.Generator) -> Arm:
-    """An arm in one of several liveries and slightly varied in length and girth."""
-    shell, joint = _STYLES[int(random.integers(len(_STYLES)))]
-    style = _Style(
-        shell=shell,
-        joint=joint,
-        upper=float(random.uniform(0.33, 0.37)),
-        fore=float(random.uniform(0.30, 0.34)),
-        thick=float(random.uniform(0.9, 1.15)),
-    )
-    return Arm(
-        body=_body(style),
-        actuators=_actuators(),
-        equality='<joint joint1="slide_right" joint2="slide_left" polycoef="0 1 0 0 0" solref="0.005 1"/>',
-        joints=_JOINTS,
-        fingers=("slide_left", "slide_right"),
-        home=(0.0, 0.0, 1.6, 0.0, float(np.pi - 1.6), 0.0),
-        open_m=OPEN_M,
-        reach_m=(0.27, 0.55),
-        links=_LINKS,
-        gripper_links=3,
-    )
+def random_arm(random: np.random.Generator) -> str:
+    """An arm in one of several liveries and slightly varied in length and girth, as MJCF.
 
-
-def _rgba(colour: Colour) -> str:
-    return f'rgba="{colour[0]} {colour[1]} {colour[2]} 1"'
-
-
-def _body(style: _Style) -> str:
-    """Nested bodies from the base to the fingers; the tool points along +z of the palm."""
-    r, s, j = 0.045 * style.thick, _rgba(style.shell), _rgba(style.joint)
-    up, fore = style.upper, style.fore
+    Its body stands at the origin, x ahead; its site "tool" is the point between the fingertips, z out of the hand, y
+    from finger to finger.
+    """
+    shell, joint = _LIVERIES[int(random.integers(len(_LIVERIES)))]
+    upper, fore = float(random.uniform(0.33, 0.37)), float(random.uniform(0.30, 0.34))
+    r, s, j = 0.045 * float(random.uniform(0.9, 1.15)), _rgba(shell), _rgba(joint)
     return f"""
 <body name="base" gravcomp="1">
   <geom class="arm" type="cylinder" size="{2.1 * r} 0.018" pos="0 0 0.018" {j}/>
@@ -105,10 +93,10 @@ def _body(style: _Style) -> str:
     <geom class="arm" type="cylinder" size="{1.25 * r} {1.75 * r}" pos="0 0 0.10" quat="0.7071 0.7071 0 0" {j}/>
     <body name="upper" pos="0 0 0.10" gravcomp="1">
       <joint name="shoulder" class="arm" axis="0 1 0" range="-2 2.3"/>
-      <geom class="arm" type="capsule" size="{r}" fromto="0 {1.1 * r} 0.02 0 {0.55 * r} {up - 0.02}" {s}/>
-      <geom class="arm" type="capsule" size="{0.8 * r}" fromto="0 {-0.9 * r} 0 0 {-0.45 * r} {up}" {s}/>
-      <geom class="arm" type="cylinder" size="{1.15 * r} {1.5 * r}" pos="0 0 {up}" quat="0.7071 0.7071 0 0" {j}/>
-      <body name="fore" pos="0 0 {up}" gravcomp="1">
+      <geom class="arm" type="capsule" size="{r}" fromto="0 {1.1 * r} 0.02 0 {0.55 * r} {upper - 0.02}" {s}/>
+      <geom class="arm" type="capsule" size="{0.8 * r}" fromto="0 {-0.9 * r} 0 0 {-0.45 * r} {upper}" {s}/>
+      <geom class="arm" type="cylinder" size="{1.15 * r} {1.5 * r}" pos="0 0 {upper}" quat="0.7071 0.7071 0 0" {j}/>
+      <body name="fore" pos="0 0 {upper}" gravcomp="1">
         <joint name="elbow" class="arm" axis="0 1 0" range="-0.3 2.8"/>
         <geom class="arm" type="capsule" size="{0.85 * r}" fromto="0 0 0 0 0 {0.5 * fore}" {s}/>
         <geom class="arm" type="cylinder" size="{0.92 * r} 0.018" pos="0 0 {0.53 * fore}" {j}/>
@@ -128,6 +116,10 @@ def _body(style: _Style) -> str:
     </body>
   </body>
 </body>"""
+
+
+def _rgba(colour: Colour) -> str:
+    return f'rgba="{colour[0]} {colour[1]} {colour[2]} 1"'
 
 
 def _palm(shell: str, joint: str) -> str:
@@ -156,8 +148,140 @@ def _finger(side: str, sign: int, shell: str) -> str:
 </body>"""
 
 
-def _actuators() -> str:
-    rows = [f'<position name="{name}" joint="{name}" class="arm"/>' for name in _JOINTS[:3]]
-    rows += [f'<position name="{name}" joint="{name}" class="wrist"/>' for name in _JOINTS[3:]]
-    rows += [f'<position name="{name}" joint="{name}" class="finger"/>' for name in ("slide_left", "slide_right")]
-    return "\n".join(rows)
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Model:
+    """A compiled model and the numbers of what is in it.
+
+    joints, fingers: [J], [2] addresses in qpos; rates: of `joints` in qvel. controls, grips: their actuators.
+    things: body ids. site: the tool.
+    """
+
+    mujoco: Any
+    model: Any
+    joints: NDArray[np.int64]
+    rates: NDArray[np.int64]
+    fingers: NDArray[np.int64]
+    controls: NDArray[np.int64]
+    grips: NDArray[np.int64]
+    things: tuple[int, ...]
+    site: int
+
+
+def build_model(setting: Setting) -> Model:
+    """Compile everything. Raises RenderError without MuJoCo."""
+    try:
+        mujoco: Any = import_module("mujoco")  # an optional dependency: only generating needs it
+    except ImportError as error:
+        raise RenderError("the tabletop world needs the extra `scenes`: pip install 'gcd-node[scenes]'") from error
+    model = mujoco.MjModel.from_xml_string(_xml(setting))
+    return Model(
+        mujoco=mujoco,
+        model=model,
+        joints=np.array([model.joint(name).qposadr[0] for name in JOINTS]),
+        rates=np.array([model.joint(name).dofadr[0] for name in JOINTS]),
+        fingers=np.array([model.joint(name).qposadr[0] for name in FINGERS]),
+        controls=np.array([model.actuator(name).id for name in JOINTS]),
+        grips=np.array([model.actuator(name).id for name in FINGERS]),
+        things=tuple(model.body(f"thing_{index}").id for index in range(len(setting.things))),
+        site=model.site("tool").id,
+    )
+
+
+def arm_links(model: Model) -> list[tuple[Thing, int, TabletopClass]]:
+    """The arm's links, the gripper's last, each with its body's number and its class.
+
+    Their names tell the class too, for layouts that keep no classes: robot_arm/upper_arm, gripper/palm.
+    """
+    found: list[tuple[Thing, int, TabletopClass]] = []
+    for body_name, name in _LINKS.items():
+        label = TabletopClass.GRIPPER if body_name in _GRIPPER else TabletopClass.ROBOT_ARM
+        body = model.model.body(body_name).id
+        parts = _parts_of_body(model, body, label)
+        middle, size = _bounding_box(parts)
+        mass_kg = float(model.model.body_mass[body])
+        name = f"{label.name.lower()}/{name}"
+        link = Thing(name=name, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
+        found.append((link, body, label))
+    return found
+
+
+def _parts_of_body(model: Model, body: int, label: TabletopClass) -> tuple[Part, ...]:
+    """The geoms of one body of a compiled model, as they are seen."""
+    kinds, compiled = model.mujoco.mjtGeom, model.model
+    shapes = {kinds.mjGEOM_BOX: "box", kinds.mjGEOM_CYLINDER: "cylinder", kinds.mjGEOM_CAPSULE: "capsule"}
+    first = compiled.body_geomadr[body]
+    found: list[Part] = []
+    for geom in range(first, first + compiled.body_geomnum[body]):
+        shape = shapes[kinds(compiled.geom_type[geom])]
+        x, y, z = (2 * compiled.geom_size[geom]).tolist()
+        part = Part(
+            shape=shape,
+            size=(x, y, z) if shape == "box" else (x, x, y),
+            centre=tuple(compiled.geom_pos[geom].tolist()),
+            turn=tuple(compiled.geom_quat[geom].tolist()),
+            colour=tuple(compiled.geom_rgba[geom][:3].tolist()),
+            gloss=0.25,
+            grain_m=0.05,
+            label=label,
+        )
+        found.append(part)
+    return tuple(found)
+
+
+def _bounding_box(parts: tuple[Part, ...]) -> tuple[Point, Point]:
+    """Middle and size of the box along the body's axes that holds all parts' own boxes, metres."""
+    corners: list[NDArray[np.float64]] = []
+    for part in parts:
+        x, y, z = part.size
+        own = np.array([x, y, z + x if part.shape == "capsule" else z])
+        half = np.abs(rotations(np.asarray(part.turn))) @ (own / 2)
+        corners += [np.asarray(part.centre) - half, np.asarray(part.centre) + half]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    return tuple(((low + high) / 2).tolist()), tuple((high - low).tolist())
+
+
+def _xml(setting: Setting) -> str:
+    floor = f'<geom class="still" type="plane" size="5 5 0.1" pos="0 0 {FLOOR_M}"/>'  # what falls off the table lands
+    still = floor + "\n".join(_geom(part, "still") for part in setting.table)
+    still += "\n".join(_body(placed, None) for placed in setting.clutter)
+    loose = "\n".join(_body(placed, index) for index, placed in enumerate(setting.things))
+    classes = ["arm"] * 3 + ["wrist"] * 3 + ["finger"] * 2
+    actuators = "".join(
+        f'<position name="{name}" joint="{name}" class="{kind}"/>'
+        for name, kind in zip((*JOINTS, *FINGERS), classes, strict=True)
+    )
+    return f"""<mujoco>{_OPTIONS}
+<default>{_DEFAULTS}</default>
+<worldbody>{still}<body name="mount" pos="{BASE[0]} {BASE[1]} {BASE[2]}">{setting.arm}</body>{loose}</worldbody>
+<equality>{_MOVED_ALIKE}</equality>
+<actuator>{actuators}</actuator>
+</mujoco>"""
+
+
+def _body(placed: Placed, index: int | None) -> str:
+    """A loose thing has a number, a free joint and mass; a still one has none of these."""
+    thing = placed.thing
+    x, y, z = placed.place
+    pose = f'pos="{x} {y} {z}" quat="{np.cos(placed.yaw / 2)} 0 0 {np.sin(placed.yaw / 2)}"'
+    if index is None:
+        return f"<body {pose}>{''.join(_geom(part, 'still') for part in thing.parts)}</body>"
+    touch = f'friction="{thing.friction} 0.01 {0.004 if thing.rolls else 0.0005}"' + ' condim="6"' * thing.rolls
+    # Shares of the mass, not quite by volume: with better ones every scene would be another.
+    weights = [float(np.prod(_half_sizes(part))) * (4.0 if part.shape == "sphere" else 1.0) for part in thing.parts]
+    inside = "".join(
+        _geom(part, "thing", f'mass="{thing.mass_kg * weight / sum(weights)}" {touch}')
+        for part, weight in zip(thing.parts, weights, strict=True)
+    )
+    return f'<body name="thing_{index}" {pose}><freejoint/>{inside}</body>'
+
+
+def _geom(part: Part, kind: str, more: str = "") -> str:
+    rows = (_half_sizes(part), part.centre, part.turn)
+    size, place, turn = (" ".join(f"{number:.6g}" for number in row) for row in rows)
+    return f'<geom class="{kind}" type="{part.shape}" size="{size}" pos="{place}" quat="{turn}" {more}/>'
+
+
+def _half_sizes(part: Part) -> tuple[float, ...]:
+    """As MuJoCo wants them: of a box; the radius of a sphere; radius and half length of what is round."""
+    x, y, z = (side / 2 for side in part.size)
+    return {"box": (x, y, z), "sphere": (x,)}.get(part.shape, (x, z))

@@ -5,25 +5,24 @@ the physics behind it runs in metres.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Extent, Scene, rotations
+from gcd_train.scenes.description import Extent, Part, Point, Scene, SceneObject, rotations
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.tabletop.arm import random_arm
-from gcd_train.scenes.tabletop.furniture import random_clutter, random_light, random_table, room
-from gcd_train.scenes.tabletop.layout import random_things
-from gcd_train.scenes.tabletop.model import BASE, Model, build_model
-from gcd_train.scenes.tabletop.objects import UNITS_A_METRE, Setting, moved, objects, parts
+from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model
+from gcd_train.scenes.tabletop.furniture import TABLE_Z_M, UNITS_A_METRE, random_light, room
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
-from gcd_train.scenes.tabletop.things import Placed
+from gcd_train.scenes.tabletop.tasks import random_setting
+from gcd_train.scenes.tabletop.things import Placed, Setting, TabletopClass, Thing
 
-TABLE_M = -0.12
-"""Height of the table's surface in the world, metres: arm and things are then in the middle of the pictures."""
 _EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
+_TABLE = 1
+"""The scene's body that carries table, clutter and, one number further each, the bodies of the physics model."""
 
 Floats = NDArray[np.float64]
 
@@ -32,19 +31,15 @@ Floats = NDArray[np.float64]
 class Episode:
     """A clip of the tabletop world with what a robot would have logged.
 
-    scene: in decimetres. joint_names, state, action: [T, J], radians and metres: where joints and fingers are and are
-    told to be. wrist: [T, 4, 4], world_from_camera of a camera in the hand, decimetres. world_from_base: [4, 4],
-    decimetres. task: in words. motion: in metres, in the frame of the table.
+    scene: in decimetres. motion: in metres, in the frame of the table. wrist: [T, 4, 4], world_from_camera of a camera
+    in the hand, decimetres. world_from_base: [4, 4], decimetres. task: in words.
     """
 
     scene: Scene
-    joint_names: tuple[str, ...]
-    state: Floats
-    action: Floats
+    motion: Motion
     wrist: Floats
     world_from_base: Floats
     task: str
-    motion: Motion
 
 
 def tabletop_scene(seed: int, *, frames: int = 60) -> Scene:
@@ -65,43 +60,116 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     skipped_s: how much of the work has passed when the clip begins; by default up to 1.4 s, drawn from the seed.
     """
     random = np.random.default_rng([seed, 0x7AB])
-    robot = random_arm(random)
-    table, clutter = random_table(random), random_clutter(random)
-    things = random_things(random, robot, clutter)
-    model = build_model(robot, table, clutter, things)
+    setting = random_setting(random)
+    model = build_model(setting)
     drawn_s, speed = float(random.uniform(0, 1.4)), float(random.uniform(0.5, 0.9))
-    motion = Simulation(model, things, random, speed).run(frames, drawn_s if skipped_s is None else skipped_s)
+    motion = Simulation(model, setting.things, random, speed).run(frames, drawn_s if skipped_s is None else skipped_s)
     world_from_table = _table_pose(float(random.uniform(-math.pi, math.pi)))
-    scene = _scene(seed, model, motion, world_from_table, Setting(table, clutter, things), random)
-    return Episode(
-        scene=scene,
-        joint_names=(*robot.joints, *robot.fingers),
-        state=motion.state,
-        action=motion.action,
-        wrist=_in_units(world_from_table @ motion.tool @ _hand_from_camera()),
-        world_from_base=_in_units(world_from_table @ _table_from_base()),
-        task=_in_words(motion, things),
-        motion=motion,
-    )
-
-
-def _scene(
-    seed: int, model: Model, motion: Motion, world_from_table: Floats, setting: Setting, random: np.random.Generator
-) -> Scene:
-    frames = len(motion.steps)
-    walls, sheets = room(random, TABLE_M, UNITS_A_METRE)
-    return Scene(
-        parts=(*walls, *parts(model, setting)),
+    walls, sheets = room(random)
+    task, counted = _in_words(motion, setting), _counted(model, setting)
+    scene = Scene(
+        parts=(*walls, *_parts(setting, counted)),
         sheets=sheets,
         poses=_poses(motion, world_from_table),
         focus=np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (frames, 1)),
         cameras=orbit_cameras(frames),
         hfov_deg=HFOV_DEG,
         light=random_light(random),
-        facts=_facts(seed, model, motion, setting),
-        objects=tuple(objects(model, motion, world_from_table, setting)),
+        facts=_facts(seed, setting, motion) | {"task": task},
+        objects=tuple(each.as_object(i, motion, world_from_table) for i, each in enumerate(counted, start=1)),
         extent=_EXTENT,
     )
+    return Episode(
+        scene=scene,
+        motion=motion,
+        wrist=_in_units(world_from_table @ motion.tool @ _hand_from_camera()),
+        world_from_base=_world_from_base(world_from_table),
+        task=task,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Counted:
+    """A thing, a link or a piece of clutter; its instance is its number from 1 on.
+
+    body: of the physics model. stands: where on the table, of clutter, which has no body of its own.
+    """
+
+    thing: Thing
+    label: TabletopClass
+    body: int
+    stands: Placed | None = None
+
+    def parts(self, instance: int) -> Iterator[Part]:
+        """Its parts, in scene units."""
+        for part in self.thing.parts:
+            for piece in _drawn(part):
+                counted = piece.of(instance=instance, body=_TABLE + self.body)
+                if self.stands is not None:
+                    x, y, z = _scaled(self.stands.place)
+                    counted = counted.placed(x, y, z, self.stands.yaw)
+                yield counted
+
+    def as_object(self, instance: int, motion: Motion, world_from_table: Floats) -> SceneObject:
+        """What metadata tells of it."""
+        turn = world_from_table[:3, :3]
+        if self.stands is None:
+            positions = _moved(world_from_table, motion.positions[:, self.body])
+            quaternions, velocities = motion.quaternions[:, self.body], motion.velocities[:, self.body] @ turn.T
+            angular_velocities = motion.angular_velocities[:, self.body] @ turn.T
+        else:
+            frames, half = len(motion.steps), self.stands.yaw / 2
+            positions = np.tile(_moved(world_from_table, np.asarray(self.stands.place)), (frames, 1))
+            quaternions = np.tile([math.cos(half), 0.0, 0.0, math.sin(half)], (frames, 1))
+            velocities = angular_velocities = np.zeros((frames, 3))
+        return SceneObject(
+            name=self.thing.name if self.stands is None else f"clutter/{self.thing.name}",
+            instance=instance,
+            body=_TABLE + self.body,
+            label=self.label,
+            size=_scaled(self.thing.size),
+            middle=_scaled(self.thing.middle),
+            dynamic=self.stands is None,
+            mass_kg=self.thing.mass_kg,
+            friction=self.thing.friction,
+            restitution=0.0,
+            positions=UNITS_A_METRE * positions,
+            quaternions=_turned(world_from_table, quaternions),
+            velocities=UNITS_A_METRE * velocities,
+            angular_velocities=angular_velocities,
+        )
+
+
+def _counted(model: Model, setting: Setting) -> list[_Counted]:
+    """Things, links and clutter."""
+    things = [
+        _Counted(placed.thing, TabletopClass.OBJECT, body)
+        for placed, body in zip(setting.things, model.things, strict=True)
+    ]
+    links = [_Counted(link, label, body) for link, body, label in arm_links(model)]
+    return [*things, *links, *(_Counted(each.thing, TabletopClass.CLUTTER, 0, each) for each in setting.clutter)]
+
+
+def _parts(setting: Setting, counted: list[_Counted]) -> Iterator[Part]:
+    """The table, and all that is counted, in scene units."""
+    for part in setting.table:
+        yield from (piece.of(instance=0, body=_TABLE) for piece in _drawn(part))
+    for instance, each in enumerate(counted, start=1):
+        yield from each.parts(instance)
+
+
+def _drawn(part: Part) -> Iterator[Part]:
+    """What is drawn of a part, in scene units; a capsule is a cylinder and two spheres."""
+    scaled = replace(part, centre=_scaled(part.centre), size=_scaled(part.size), grain_m=part.grain_m * UNITS_A_METRE)
+    if part.shape != "capsule":
+        yield scaled
+        return
+    yield replace(scaled, shape="cylinder")
+    centre, half = np.asarray(part.centre), part.size[2] / 2
+    along = rotations(np.asarray(part.turn))[:, 2]
+    for end in (centre - half * along, centre + half * along):
+        x, y, z = end.tolist()
+        yield replace(scaled, shape="sphere", centre=_scaled((x, y, z)), size=(scaled.size[0],) * 3)
 
 
 def _poses(motion: Motion, world_from_table: Floats) -> NDArray[np.float32]:
@@ -110,7 +178,7 @@ def _poses(motion: Motion, world_from_table: Floats) -> NDArray[np.float32]:
     poses = np.zeros((frames, 1 + bodies, 3, 4))
     poses[:, 0, :, :3] = np.eye(3)
     poses[:, 1:, :, :3] = world_from_table[:3, :3] @ rotations(motion.quaternions)
-    poses[:, 1:, :, 3] = UNITS_A_METRE * moved(world_from_table, motion.positions)
+    poses[:, 1:, :, 3] = UNITS_A_METRE * _moved(world_from_table, motion.positions)
     return poses.astype(np.float32)
 
 
@@ -118,26 +186,20 @@ def _table_pose(yaw: float) -> Floats:
     """world_from_table [4, 4]: turned about the vertical, metres."""
     turn = np.eye(4)
     turn[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    turn[2, 3] = TABLE_M
+    turn[2, 3] = TABLE_Z_M
     return turn
 
 
-def _table_from_base() -> Floats:
-    base = np.eye(4)
-    base[:3, 3] = BASE
-    return base
+def _world_from_base(world_from_table: Floats) -> Floats:
+    """[4, 4], decimetres."""
+    table_from_base = np.eye(4)
+    table_from_base[:3, 3] = BASE
+    return _in_units(world_from_table @ table_from_base)
 
 
 def upright_base() -> Floats:
     """world_from_base [4, 4] of an arm whose table is not turned, decimetres."""
-    return _in_units(_table_pose(0.0) @ _table_from_base())
-
-
-def _in_units(poses: Floats) -> Floats:
-    """Metres to decimetres."""
-    scaled = poses.copy()
-    scaled[..., :3, 3] *= UNITS_A_METRE
-    return scaled
+    return _world_from_base(_table_pose(0.0))
 
 
 def _hand_from_camera() -> Floats:
@@ -151,7 +213,31 @@ def _hand_from_camera() -> Floats:
     return pose
 
 
-def _facts(seed: int, model: Model, motion: Motion, setting: Setting) -> dict[str, float | str]:
+def _in_units(poses: Floats) -> Floats:
+    """Metres to decimetres."""
+    scaled = poses.copy()
+    scaled[..., :3, 3] *= UNITS_A_METRE
+    return scaled
+
+
+def _scaled(point: Point) -> Point:
+    return point[0] * UNITS_A_METRE, point[1] * UNITS_A_METRE, point[2] * UNITS_A_METRE
+
+
+def _moved(world_from_table: Floats, points: Floats) -> Floats:
+    """Points [..., 3] of the table's frame in the world."""
+    return points @ world_from_table[:3, :3].T + world_from_table[:3, 3]
+
+
+def _turned(world_from_table: Floats, quaternions: Floats) -> Floats:
+    """What each becomes after the table's turn; w, x, y, z."""
+    half = math.atan2(world_from_table[1, 0], world_from_table[0, 0]) / 2
+    c, s = math.cos(half), math.sin(half)
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
+
+
+def _facts(seed: int, setting: Setting, motion: Motion) -> dict[str, float | str]:
     return {
         "seed": seed,
         "arm": "primitive",
@@ -161,17 +247,11 @@ def _facts(seed: int, model: Model, motion: Motion, setting: Setting) -> dict[st
         "clutter": len(setting.clutter),
         "grasps": len(motion.grasps),
         "grasps_held": sum(grasp.held for grasp in motion.grasps),
-        "steps": " ".join(_runs(motion.steps)),
-        "task": _in_words(motion, setting.things),
+        "steps": " ".join(step for step, _ in groupby(motion.steps)),
     }
 
 
-def _runs(steps: Sequence[str]) -> list[str]:
-    """The steps in order, each once while it lasts."""
-    return [step for step, last in zip(steps, ("", *steps), strict=False) if step != last]
-
-
-def _in_words(motion: Motion, things: list[Placed]) -> str:
+def _in_words(motion: Motion, setting: Setting) -> str:
     verbs = {"lift": "pick up the {} and place it elsewhere", "push": "push the {} aside"}
-    told = [verbs[name].format(things[index].thing.name) for name, index in motion.tasks]
+    told = [verbs[name].format(setting.things[index].thing.name) for name, index in motion.tasks]
     return ", then ".join(told) or "move over the table"

@@ -3,12 +3,13 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.tabletop.model import BASE, STEP_S, Model
+from gcd_train.scenes.tabletop.arm import BASE, HOME, OPEN_M, STEP_S, Model
 from gcd_train.scenes.tabletop.tasks import Planner, Step
 from gcd_train.scenes.tabletop.things import Placed
 
@@ -29,13 +30,12 @@ class Grasp:
     """One attempt to hold a thing.
 
     thing: index. lifted: by how much it had risen at the end of the lift, metres. slip: the most by which it moved in
-    the hand until it was put down or the clip ended. closed: time since the clip began, seconds; negative for before.
+    the hand until it was put down or the clip ended.
     """
 
     thing: int
     lifted: float
     slip: float
-    closed: float
 
     @property
     def held(self) -> bool:
@@ -67,9 +67,9 @@ class Motion:
 class Simulation:
     """One run. `model`: built of `things`; `speed`: of the tool, metres a second."""
 
-    def __init__(self, model: Model, things: list[Placed], random: np.random.Generator, speed: float) -> None:
+    def __init__(self, model: Model, things: tuple[Placed, ...], random: np.random.Generator, speed: float) -> None:
         self._m, self._data = model, model.mujoco.MjData(model.model)
-        self._solver, self._joints = ToolSolver(model), np.asarray(model.arm.home, np.float64)
+        self._solver, self._joints = _ToolSolver(model), np.asarray(HOME)
         self._planner = Planner(model, self._data, things, random, speed)
         self._opening = 1.0
         self._watch = _Watch(model, self._data)
@@ -81,7 +81,10 @@ class Simulation:
 
         Raises: RenderError if the physics became unstable.
         """
-        self._settle()
+        m, data = self._m, self._data
+        data.qpos[m.joints], data.qpos[m.fingers] = self._joints, OPEN_M
+        self._command(self._joints)
+        m.mujoco.mj_step(m.model, data, round(_SETTLE_S / STEP_S))
         first = round(skipped_s / _TICK_S)
         self._watch.clock = -first * _TICK_S
         for tick, step in enumerate(self._followed()):
@@ -89,31 +92,16 @@ class Simulation:
                 self._keep(step)
             if len(self._names) == frames:
                 break
-            self._tick()
+            m.mujoco.mj_step(m.model, data, _STEPS_A_TICK)
+            self._watch.tick()
         self._watch.end()
-        self._require_sound()
-        kept = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
-        return Motion(
-            **kept, steps=tuple(self._names), grasps=tuple(self._watch.grasps), tasks=tuple(self._watch.tasks)
-        )
-
-    def _require_sound(self) -> None:
-        """MuJoCo starts a diverging simulation anew and only counts that."""
-        faults = self._m.mujoco.mjtWarning
+        faults = m.mujoco.mjtWarning  # MuJoCo starts a diverging simulation anew and only counts that
         kinds = (faults.mjWARN_BADQPOS, faults.mjWARN_BADQVEL, faults.mjWARN_BADQACC)
-        if any(self._data.warning[int(kind)].number for kind in kinds):
+        if any(data.warning[int(kind)].number for kind in kinds):
             raise RenderError("the physics of this tabletop scene became unstable; leave its seed out")
-
-    def _settle(self) -> None:
-        m, data = self._m, self._data
-        data.qpos[m.joints] = self._joints
-        data.qpos[m.fingers] = m.arm.open_m
-        self._command(self._joints)
-        m.mujoco.mj_step(m.model, data, round(_SETTLE_S / STEP_S))
-
-    def _tick(self) -> None:
-        self._m.mujoco.mj_step(self._m.model, self._data, _STEPS_A_TICK)
-        self._watch.tick(_TICK_S)
+        kept = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
+        grasps, tasks = tuple(self._watch.grasps), tuple(self._watch.tasks)
+        return Motion(**kept, steps=tuple(self._names), grasps=grasps, tasks=tasks)
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""
@@ -122,11 +110,12 @@ class Simulation:
         yaw = math.atan2(*self._data.site_xmat[m.site][[3, 0]].tolist())
         for step in self._planner.steps():
             self._watch.begin(step)
-            goal, turn = _polar(np.asarray(step.place)), _nearest_turn(step.yaw, yaw)
+            goal, turn = _polar(np.asarray(step.place)), yaw + (step.yaw - yaw + math.pi) % (2 * math.pi) - math.pi
             opening = self._opening
             ticks = max(1, math.ceil(step.seconds / _TICK_S))
             for tick in range(1, ticks + 1):
-                share = _smooth(tick / ticks)
+                share = tick / ticks
+                share = share**3 * (10 - 15 * share + 6 * share**2)  # minimum jerk: at rest at both ends
                 self._opening = opening + share * (step.opening - opening)
                 place = _from_polar(here + share * (goal - here))
                 before = self._joints
@@ -138,7 +127,7 @@ class Simulation:
     def _command(self, joints: Floats) -> None:
         m = self._m
         self._data.ctrl[m.controls] = joints
-        self._data.ctrl[m.grips] = self._opening * m.arm.open_m
+        self._data.ctrl[m.grips] = self._opening * OPEN_M
 
     def _keep(self, step: Step) -> None:
         m, data = self._m, self._data
@@ -166,19 +155,18 @@ class Simulation:
 class _Watch:
     """Looks at whether what was grasped follows the hand."""
 
-    def __init__(self, model: Model, data: object) -> None:
+    def __init__(self, model: Model, data: Any) -> None:
         self._m, self._data = model, data
         self.clock = 0.0
         self.grasps: list[Grasp] = []
         self.tasks: list[tuple[str, int]] = []
-        self._thing, self._closed = -1, 0.0
-        self._offset = np.zeros(3)
+        self._thing, self._offset = -1, np.zeros(3)
         self._low, self._lifted, self._slip = 0.0, math.nan, 0.0
 
     def begin(self, step: Step) -> None:
         """A step begins: at the lift the fingers have closed, at the opening the grasp ends."""
         if step.name == "lift":
-            self._thing, self._closed, self._slip, self._lifted = step.thing, self.clock, 0.0, math.nan
+            self._thing, self._slip, self._lifted = step.thing, 0.0, math.nan
             self._offset, self._low = self._in_hand(), self._height()
         if step.name == "carry":
             self._lifted = self._height() - self._low
@@ -187,36 +175,26 @@ class _Watch:
         if step.name == "open":
             self.end()
 
-    def tick(self, seconds: float) -> None:
-        """Time passes."""
-        self.clock += seconds
+    def tick(self) -> None:
+        """A tick has passed."""
+        self.clock += _TICK_S
         if self._thing >= 0:
             self._slip = max(self._slip, float(np.linalg.norm(self._in_hand() - self._offset)))
 
     def end(self) -> None:
         """The grasp is over; one that never got to the end of the lift does not count."""
         if self._thing >= 0 and not math.isnan(self._lifted):
-            grasp = Grasp(thing=self._thing, lifted=self._lifted, slip=self._slip, closed=self._closed)
-            self.grasps.append(grasp)
+            self.grasps.append(Grasp(thing=self._thing, lifted=self._lifted, slip=self._slip))
         self._thing = -1
 
     def _in_hand(self) -> Floats:
         """The thing's origin in the tool's frame."""
         data, site = self._data, self._m.site
-        turned = data.site_xmat[site].reshape(3, 3)  # pyright: ignore
-        return turned.T @ (data.xpos[self._m.things[self._thing]] - data.site_xpos[site])  # pyright: ignore
+        turned = data.site_xmat[site].reshape(3, 3)
+        return turned.T @ (data.xpos[self._m.things[self._thing]] - data.site_xpos[site])
 
     def _height(self) -> float:
-        return float(self._data.xpos[self._m.things[self._thing]][2])  # pyright: ignore
-
-
-def _smooth(share: float) -> float:
-    """Minimum jerk: at rest at both ends."""
-    return share**3 * (10 - 15 * share + 6 * share**2)
-
-
-def _nearest_turn(yaw: float, last: float) -> float:
-    return last + (yaw - last + math.pi) % (2 * math.pi) - math.pi
+        return float(self._data.xpos[self._m.things[self._thing]][2])
 
 
 def _polar(place: Floats) -> Floats:
@@ -230,10 +208,10 @@ def _from_polar(polar: Floats) -> Floats:
     return np.array([BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth), height])
 
 
-_DAMPING, _LARGEST_TURN, _HOMING = 0.03, 0.25, 0.02
+_ROUNDS, _DAMPING, _LARGEST_TURN, _HOMING = 2, 0.03, 0.25, 0.02
 
 
-class ToolSolver:
+class _ToolSolver:
     """Damped least squares on the arm's Jacobian, from wherever the joints were last.
 
     Source: Buss and Kim, "Selectively damped least squares for inverse kinematics" (2005), section 2: the plain damped
@@ -243,15 +221,14 @@ class ToolSolver:
     def __init__(self, model: Model) -> None:
         self._model = model
         self._data = model.mujoco.MjData(model.model)
-        self._home = np.asarray(model.arm.home)
+        self._home = np.asarray(HOME)
         self._limits = model.model.jnt_range[model.model.dof_jntid[model.rates]].T
 
-    def solve(
-        self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float, *, rounds: int = 2
-    ) -> NDArray[np.float64]:
+    def solve(self, joints: Floats, place: Floats, yaw: float) -> Floats:
         """Joint angles [J] nearer to the tool at `place` [3], pointing down, its x axis at `yaw` radians."""
-        wanted = _pointing_down(yaw)
-        for _ in range(rounds):
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        wanted = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])  # the tool's axes as columns
+        for _ in range(_ROUNDS):
             error, jacobian = self._seen_from(joints, place, wanted)
             square = jacobian @ jacobian.T + _DAMPING**2 * np.eye(6)
             pull = _HOMING * (self._home - joints)
@@ -259,9 +236,7 @@ class ToolSolver:
             joints = np.clip(joints + np.clip(move, -_LARGEST_TURN, _LARGEST_TURN), *self._limits)
         return joints
 
-    def _seen_from(
-        self, joints: NDArray[np.float64], place: NDArray[np.float64], wanted: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _seen_from(self, joints: Floats, place: Floats, wanted: Floats) -> tuple[Floats, Floats]:
         """What is missing in place and turn [6], and the Jacobian [6, J]."""
         m, model, data = self._model, self._model.model, self._data
         data.qpos[m.joints] = joints
@@ -272,9 +247,3 @@ class ToolSolver:
         turned = data.site_xmat[m.site].reshape(3, 3)
         twist = 0.5 * np.cross(turned, wanted, axis=0).sum(1)
         return np.concatenate([place - data.site_xpos[m.site], twist]), jacobian[:, m.rates]
-
-
-def _pointing_down(yaw: float) -> NDArray[np.float64]:
-    """Axes of the tool as columns: x at `yaw` in the level, z down."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])

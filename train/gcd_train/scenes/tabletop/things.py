@@ -1,49 +1,49 @@
-"""What lies on the table: things the gripper can take or push, and clutter that stays."""
+"""What a tabletop scene is made of: classes, things of parts, and the loose ones that the gripper can take or push.
+
+Everything here is in metres; `Part` is used as in every world, but a capsule's third size is that of its cylinder
+alone, as MuJoCo has it.
+"""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Pattern, Point, Quaternion
+from gcd_train.scenes.description import Colour, Part, Pattern, Point, Quaternion
 
-UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
+_Random = np.random.Generator
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Solid:
-    """One MuJoCo geom and how it is painted.
+class TabletopClass(IntEnum):
+    """What a pixel shows. Everything that carries the arm is ROBOT_ARM; palm and fingers are GRIPPER."""
 
-    kind: box, sphere, cylinder or capsule. size: MuJoCo's half sizes, metres. centre, turn: within the thing.
-    """
-
-    kind: str
-    size: tuple[float, ...]
-    centre: Point = (0.0, 0.0, 0.0)
-    turn: Quaternion = UPRIGHT
-    colour: Colour
-    accent: Colour = (0.5, 0.5, 0.5)
-    pattern: Pattern = Pattern.PLAIN
-    grain_m: float = 0.05
-    gloss: float = 0.1
+    SKY = 0
+    FLOOR = 1
+    WALL = 2
+    TABLE = 3
+    ROBOT_ARM = 4
+    GRIPPER = 5
+    OBJECT = 6
+    CLUTTER = 7
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Thing:
-    """Something made of solids; its origin is the middle of its bounding box.
+    """Something made of parts, in its own frame.
 
-    size: of the bounding box along its own axes, metres. grip_m: distance of the fingers that hold it, across its own y
-    axis, 0 if it is not to be grasped. grip_z: where on its own z axis. any_yaw: it may be grasped from any side.
+    size, middle: of the bounding box along its own axes, metres; `middle` is the origin but for links of the arm.
+    grip_z: where on its own z axis fingers hold it, across its y axis. any_yaw: it may be grasped from any side.
     rolls: it is stopped from rolling for ever.
     """
 
     name: str
-    solids: tuple[Solid, ...]
+    parts: tuple[Part, ...]
     size: Point
     mass_kg: float
     friction: float
-    grip_m: float = 0.0
+    middle: Point = (0.0, 0.0, 0.0)
     grip_z: float = 0.0
     any_yaw: bool = False
     rolls: bool = False
@@ -63,6 +63,34 @@ class Placed:
     yaw: float
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Setting:
+    """What a scene begins with. arm: its MJCF, see `random_arm`. table: parts in the table's frame."""
+
+    arm: str
+    table: tuple[Part, ...]
+    clutter: tuple[Placed, ...]
+    things: tuple[Placed, ...]
+
+
+def solid(
+    label: TabletopClass,
+    shape: str,
+    size: Point,
+    centre: Point = (0.0, 0.0, 0.0),
+    *,
+    colour: Colour,
+    gloss: float = 0.1,
+) -> Part:
+    """A part of one plain colour."""
+    return Part(shape=shape, centre=centre, size=size, colour=colour, gloss=gloss, grain_m=0.05, label=label)
+
+
+def shaped(paint: Part, shape: str, size: Point, centre: Point = (0.0, 0.0, 0.0)) -> Part:
+    """Another part that is painted as `paint` is."""
+    return replace(paint, shape=shape, size=size, centre=centre)
+
+
 _COLOURS: tuple[Colour, ...] = (
     (0.80, 0.16, 0.14),
     (0.92, 0.55, 0.12),
@@ -80,161 +108,104 @@ _COLOURS: tuple[Colour, ...] = (
 _PATTERNS = (Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.CHECKER, Pattern.DOTS, Pattern.CLOUDY, Pattern.WOOD)
 
 
-def _paint(random: np.random.Generator) -> "_Paint":
+def _paints(random: _Random) -> tuple[Part, Part]:
+    """Two paints of one thing, to be given to `shaped`: a patterned one, and its second colour alone."""
     first, second = random.choice(len(_COLOURS), 2, replace=False)
-    return _Paint(
-        colour=_tinted(_COLOURS[int(first)], random),
-        accent=_tinted(_COLOURS[int(second)], random),
-        pattern=Pattern(int(_PATTERNS[int(random.integers(len(_PATTERNS)))])),
-        grain_m=float(random.uniform(0.02, 0.06)),
-        gloss=float(random.uniform(0.0, 0.5)),
-    )
+    colour, accent = _tinted(_COLOURS[int(first)], random), _tinted(_COLOURS[int(second)], random)
+    pattern = _PATTERNS[int(random.integers(len(_PATTERNS)))]
+    grain_m, gloss = float(random.uniform(0.02, 0.06)), float(random.uniform(0.0, 0.5))
+    plain = solid(TabletopClass.OBJECT, "box", (1.0, 1.0, 1.0), colour=accent, gloss=gloss)
+    return replace(plain, colour=colour, accent=accent, pattern=pattern, grain_m=grain_m), plain
 
 
-@dataclass(frozen=True, slots=True)
-class _Paint:
-    colour: Colour
-    accent: Colour
-    pattern: Pattern
-    grain_m: float
-    gloss: float
-
-    def solid(self, kind: str, size: tuple[float, ...], centre: Point = (0, 0, 0), turn: Quaternion = UPRIGHT) -> Solid:
-        return Solid(
-            kind=kind,
-            size=size,
-            centre=centre,
-            turn=turn,
-            colour=self.colour,
-            accent=self.accent,
-            pattern=self.pattern,
-            grain_m=self.grain_m,
-            gloss=self.gloss,
-        )
-
-    def plain(self, kind: str, size: tuple[float, ...], centre: Point = (0, 0, 0), turn: Quaternion = UPRIGHT) -> Solid:
-        """In the second colour."""
-        return Solid(kind=kind, size=size, centre=centre, turn=turn, colour=self.accent, gloss=self.gloss)
-
-
-def _tinted(colour: Colour, random: np.random.Generator) -> Colour:
+def _tinted(colour: Colour, random: _Random) -> Colour:
     red, green, blue = (min(1.0, channel * float(random.uniform(0.85, 1.15))) for channel in colour)
     return red, green, blue
 
 
-def _block(random: np.random.Generator, widest: float) -> Thing:
+def random_thing(random: _Random, widest: float) -> Thing:
+    """A thing a gripper that opens a little more than `widest` metres can hold."""
+    return _MAKERS[int(random.integers(len(_MAKERS)))](random, widest)
+
+
+def _block(random: _Random, widest: float) -> Thing:
     """A block or a carton, at most `widest` across its y axis."""
     wide, deep = float(random.uniform(0.035, widest)), float(random.uniform(0.04, 0.12))
-    high = float(random.uniform(0.04, 0.15))
-    solid = _paint(random).solid("box", (deep / 2, wide / 2, high / 2))
-    mass = _mass(deep * wide * high, random)
-    return Thing(
-        name="block" if high < 0.08 else "carton",
-        solids=(solid,),
-        size=(deep, wide, high),
-        mass_kg=mass,
-        friction=float(random.uniform(0.6, 1.0)),
-        grip_m=wide,
-        grip_z=_below_top(high),
-    )
+    size = (deep, wide, float(random.uniform(0.04, 0.15)))
+    paint, _ = _paints(random)
+    name = "block" if size[2] < 0.08 else "carton"
+    return _loose(name, (shaped(paint, "box", size),), size, deep * wide * size[2], random, grip_z=_below_top(size[2]))
 
 
-def _can(random: np.random.Generator, widest: float) -> Thing:
+def _can(random: _Random, widest: float) -> Thing:
     radius, high = float(random.uniform(0.022, widest / 2)), float(random.uniform(0.05, 0.13))
-    paint = _paint(random)
-    rim = paint.plain("cylinder", (radius * 0.94, 0.004), (0, 0, high / 2 - 0.004))
-    solids = (paint.solid("cylinder", (radius, high / 2 - 0.003), (0, 0, -0.003)), rim)
-    return _round("can", solids, radius, high, random)
+    paint, plain = _paints(random)
+    body = _cylinder(paint, radius, high - 0.006, -0.003)
+    return _round("can", (body, _cylinder(plain, radius * 0.94, 0.008, high / 2 - 0.004)), radius, high, random)
 
 
-def _bottle(random: np.random.Generator, widest: float) -> Thing:
+def _bottle(random: _Random, widest: float) -> Thing:
     radius, high = float(random.uniform(0.022, min(widest / 2, 0.034))), float(random.uniform(0.13, 0.155))
-    paint = _paint(random)
-    body = paint.solid("cylinder", (radius, 0.31 * high), (0, 0, -0.19 * high))
-    shoulder = paint.solid("sphere", (radius * 0.985,), (0, 0, 0.12 * high))
-    neck = paint.plain("cylinder", (radius * 0.4, 0.19 * high), (0, 0, 0.31 * high))
+    paint, plain = _paints(random)
+    body = _cylinder(paint, radius, 0.62 * high, -0.19 * high)
+    shoulder = _sphere(paint, radius * 0.985, 0.12 * high)
+    neck = _cylinder(plain, radius * 0.4, 0.38 * high, 0.31 * high)
     bottle = _round("bottle", (body, shoulder, neck), radius, high, random)
     return replace(bottle, grip_z=0.12 * high - 0.010)
 
 
-def _mug(random: np.random.Generator, widest: float) -> Thing:
+def _mug(random: _Random, widest: float) -> Thing:
     """The handle points along x, so that the fingers come from the sides."""
     radius, high = float(random.uniform(0.42 * widest, widest / 2)), float(random.uniform(0.07, 0.10))
-    paint, reach = _paint(random), 0.026
+    (paint, plain), reach = _paints(random), 0.026
     x = radius + reach / 2
     handle = (
-        paint.solid("box", (reach / 2, 0.005, 0.006), (x, 0, 0.25 * high)),
-        paint.solid("box", (reach / 2, 0.005, 0.006), (x, 0, -0.25 * high)),
-        paint.solid("box", (0.005, 0.006, 0.25 * high + 0.006), (radius + reach, 0, 0)),
+        shaped(paint, "box", (reach, 0.01, 0.012), (x, 0, 0.25 * high)),
+        shaped(paint, "box", (reach, 0.01, 0.012), (x, 0, -0.25 * high)),
+        shaped(paint, "box", (0.01, 0.012, 2 * (0.25 * high + 0.006)), (radius + reach, 0, 0)),
     )
-    filled = paint.plain("cylinder", (radius * 0.85, 0.002), (0, 0, high / 2))
-    thing = _round("mug", (paint.solid("cylinder", (radius, high / 2)), filled, *handle), radius, high, random)
-    return replace(thing, size=(2 * (radius + reach), 2 * radius, high), any_yaw=False)
+    parts = (_cylinder(paint, radius, high), _cylinder(plain, radius * 0.85, 0.004, high / 2), *handle)
+    mug = _round("mug", parts, radius, high, random)
+    return replace(mug, size=(2 * (radius + reach), 2 * radius, high), any_yaw=False)
 
 
-def _ball(random: np.random.Generator, widest: float) -> Thing:
+def _ball(random: _Random, widest: float) -> Thing:
     radius = float(random.uniform(0.025, widest / 2))
-    return Thing(
-        name="ball",
-        solids=(_paint(random).solid("sphere", (radius,)),),
-        size=(2 * radius, 2 * radius, 2 * radius),
-        mass_kg=_mass(4 * radius**3, random),
-        friction=float(random.uniform(0.7, 1.0)),
-        grip_m=2 * radius,
-        grip_z=0.0,
-        any_yaw=True,
-        rolls=True,
-    )
+    ball = _sphere(_paints(random)[0], radius)
+    return _loose("ball", (ball,), ball.size, 4 * radius**3, random, any_yaw=True, rolls=True)
 
 
-def _bar(random: np.random.Generator, widest: float) -> Thing:
+def _bar(random: _Random, widest: float) -> Thing:
     """A thick stick that lies along x: a sausage, a marker, a roll."""
     radius, half = float(random.uniform(0.018, min(widest / 2, 0.03))), float(random.uniform(0.03, 0.07))
     lying: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
-    paint = _paint(random)
-    return Thing(
-        name="bar",
-        solids=(paint.solid("capsule", (radius, half), turn=lying),),
-        size=(2 * (half + radius), 2 * radius, 2 * radius),
-        mass_kg=_mass(6 * half * radius**2, random),
-        friction=float(random.uniform(0.7, 1.0)),
-        grip_m=2 * radius,
-        grip_z=0.0,
-        rolls=True,
-    )
+    stick = replace(shaped(_paints(random)[0], "capsule", (2 * radius, 2 * radius, 2 * half)), turn=lying)
+    size = (2 * (half + radius), 2 * radius, 2 * radius)
+    return _loose("bar", (stick,), size, 6 * half * radius**2, random, rolls=True)
 
 
-def _bridge(random: np.random.Generator, widest: float) -> Thing:
+def _bridge(random: _Random, widest: float) -> Thing:
     """A toy of three blocks: two feet and a beam."""
     wide, long, high = float(random.uniform(0.03, min(widest, 0.05))), float(random.uniform(0.09, 0.13)), 0.075
-    paint = _paint(random)
-    beam = paint.solid("box", (long / 2, wide / 2, 0.014), (0, 0, high / 2 - 0.014))
+    paint, plain = _paints(random)
+    beam = shaped(paint, "box", (long, wide, 0.028), (0, 0, high / 2 - 0.014))
     feet = [
-        paint.plain("box", (0.015, wide / 2, high / 2 - 0.014), (x, 0, -0.014))
+        shaped(plain, "box", (0.03, wide, 2 * (high / 2 - 0.014)), (x, 0, -0.014))
         for x in (0.015 - long / 2, long / 2 - 0.015)
     ]
-    return Thing(
-        name="bridge",
-        solids=(beam, *feet),
-        size=(long, wide, high),
-        mass_kg=_mass(long * wide * 0.05, random),
-        friction=float(random.uniform(0.6, 1.0)),
-        grip_m=wide,
-        grip_z=high / 2 - 0.018,
-    )
+    size = (long, wide, high)
+    return _loose("bridge", (beam, *feet), size, long * wide * 0.05, random, grip_z=high / 2 - 0.018)
 
 
-def _round(name: str, solids: tuple[Solid, ...], radius: float, high: float, random: np.random.Generator) -> Thing:
-    return Thing(
-        name=name,
-        solids=solids,
-        size=(2 * radius, 2 * radius, high),
-        mass_kg=_mass(math.pi * radius**2 * high, random),
-        friction=float(random.uniform(0.6, 1.0)),
-        grip_m=2 * radius,
-        grip_z=_below_top(high),
-        any_yaw=True,
-    )
+_MAKERS: tuple[Callable[[_Random, float], Thing], ...] = (_block, _block, _can, _bottle, _mug, _ball, _bar, _bridge)
+
+
+def _cylinder(paint: Part, radius: float, high: float, z: float = 0.0) -> Part:
+    return shaped(paint, "cylinder", (2 * radius, 2 * radius, high), (0, 0, z))
+
+
+def _sphere(paint: Part, radius: float, z: float = 0.0) -> Part:
+    return shaped(paint, "sphere", (2 * radius, 2 * radius, 2 * radius), (0, 0, z))
 
 
 def _below_top(high: float) -> float:
@@ -242,23 +213,30 @@ def _below_top(high: float) -> float:
     return max(0.0, high / 2 - 0.035)
 
 
-def _mass(volume: float, random: np.random.Generator) -> float:
-    """Between balsa and water."""
-    return max(0.02, volume * float(random.uniform(250, 800)))
+def _round(name: str, parts: tuple[Part, ...], radius: float, high: float, random: _Random) -> Thing:
+    size, volume = (2 * radius, 2 * radius, high), math.pi * radius**2 * high
+    return _loose(name, parts, size, volume, random, grip_z=_below_top(high), any_yaw=True)
 
 
-_MAKERS: tuple[Callable[[np.random.Generator, float], Thing], ...] = (
-    _block,
-    _block,
-    _can,
-    _bottle,
-    _mug,
-    _ball,
-    _bar,
-    _bridge,
-)
-
-
-def random_thing(random: np.random.Generator, widest: float) -> Thing:
-    """A thing a gripper that opens a little more than `widest` metres can hold."""
-    return _MAKERS[int(random.integers(len(_MAKERS)))](random, widest)
+def _loose(
+    name: str,
+    parts: tuple[Part, ...],
+    size: Point,
+    volume: float,
+    random: _Random,
+    *,
+    grip_z: float = 0.0,
+    any_yaw: bool = False,
+    rolls: bool = False,
+) -> Thing:
+    """A thing with a density between balsa and water. volume: m3, roughly."""
+    return Thing(
+        name=name,
+        parts=parts,
+        size=size,
+        mass_kg=max(0.02, volume * float(random.uniform(250, 800))),
+        friction=float(random.uniform(0.7 if rolls else 0.6, 1.0)),
+        grip_z=grip_z,
+        any_yaw=any_yaw,
+        rolls=rolls,
+    )

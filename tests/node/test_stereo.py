@@ -1,4 +1,4 @@
-"""Depth from elsewhere: the door, stereo against ray-cast scenes, and a real pair."""
+"""Depth of a stereo pair: against ray-cast scenes, and of a real one."""
 
 import json
 import math
@@ -9,43 +9,22 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from fakes import HEIGHT, WIDTH, live_traits
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics
-from gcd_node.calibration import LensModel
 from gcd_node.errors import ConfigError, DepthError
-from gcd_node.frame import Image
+from gcd_node.frame import Image, LensModel
+from gcd_node.image_io import write_video
+from gcd_node.offline import ClipRequest, read_clip
 from gcd_node.preprocess import project
-from gcd_node.sources.depth import StereoDepth, clean_depth
+from gcd_node.sources.stereo import StereoDepth
 
+FX, BASELINE_M, DISPARITY = 300.0, 0.09, 10
+PAIR_SIZE = (384, 256)
 REAL = Path(__file__).parents[2].parent / "shared" / "real" / "oak-stereo"
 SIZE = (320, 192)
 IDEAL = LensModel(width=320, height=192, fx=260.0, fy=260.0, cx=159.5, cy=95.5)
-
-
-def test_millimetres_become_metres_and_what_is_no_distance_a_hole_in_the_pictures_size() -> None:
-    cleaned = clean_depth(np.array([[1250, 0, 65535]], np.uint16), (1, 3))
-    assert cleaned == pytest.approx(np.array([[1.25, 0.0, 0.0]]))
-    depth = np.array([[1.5, np.nan, np.inf], [-np.inf, -2.0, 5.0]], np.float16)
-    cleaned = clean_depth(depth, (4, 6))
-    assert (cleaned.dtype, cleaned.shape, set(np.unique(cleaned))) == (np.float32, (4, 6), {0.0, 1.5, 5.0})
-
-
-@pytest.mark.parametrize(
-    "depth",
-    [
-        np.ones((4, 8), np.float32),
-        np.ones((4, 6, 3), np.float32),
-        np.ones((0, 6), np.float32),
-        np.ones((4, 6), np.uint8),
-    ],
-    ids=["wider", "colours", "empty", "u8"],
-)
-def test_depth_of_another_shape_or_type_is_refused(depth: NDArray[Any]) -> None:
-    with pytest.raises(DepthError) as raised:
-        clean_depth(depth, (4, 6))
-    assert "\n" not in str(raised.value)
-    assert raised.value.exit_code == 65
 
 
 TEXTURE = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (512, 512, 3)).astype(np.float32), (0, 0), 1.2)
@@ -273,3 +252,45 @@ def test_a_real_unrectified_pair_shows_a_floor_and_a_head_at_their_distance() ->
     floor, head = depth[160:280, 60:240], depth[120:160, 310:350]
     assert np.median(floor[floor > 0]) == pytest.approx(2.7, abs=0.15)
     assert np.median(head[head > 0]) == pytest.approx(1.0, abs=0.1)
+
+
+def board_camera(step_cm: float, onward: int) -> dict[str, Any]:
+    return {
+        "width": PAIR_SIZE[0],
+        "height": PAIR_SIZE[1],
+        "cameraType": 0,
+        "intrinsicMatrix": [[FX, 0.0, 191.5], [0.0, FX, 127.5], [0.0, 0.0, 1.0]],
+        "distortionCoeff": [0.0] * 14,
+        "extrinsics": {
+            "rotationMatrix": np.eye(3).tolist(),
+            "translation": {"x": step_cm, "y": 0.0, "z": 0.0},
+            "toCameraSocket": onward,
+        },
+    }
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """left.mkv, right.mkv and calib.json of a camera before a wall."""
+    folder = tmp_path_factory.mktemp("pair")
+    wall = np.random.default_rng(1).integers(0, 256, (256, 384 + DISPARITY, 3)).astype(np.float32)
+    wall = cv2.normalize(cv2.GaussianBlur(wall, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    write_video(folder / "left.mkv", [np.ascontiguousarray(wall[:, :384])] * 14, 10.0)
+    write_video(folder / "right.mkv", [np.ascontiguousarray(wall[:, DISPARITY:])] * 14, 10.0)
+    left, right = board_camera(-100 * BASELINE_M, 2), board_camera(0.0, -1)
+    (folder / "calib.json").write_text(json.dumps({"boardName": "made up", "cameraData": [[1, left], [2, right]]}))
+    return folder
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(films: Path, rectified: bool) -> None:
+    request = ClipRequest(depth=films / "right.mkv", calibration=films / "calib.json", rectified=rectified)
+    source = read_clip(films / "left.mkv", request, live_traits())
+    depth, lens = source.clip.depth, source.clip.lens
+    assert depth is not None
+    assert lens is not None
+    assert (lens.width, lens.height) == (WIDTH, HEIGHT)
+    assert source.hfov_deg == lens.hfov_deg
+    known = depth[depth > 0]
+    assert len(known) > 0.6 * depth.numel()
+    assert float(known.median()) == pytest.approx(FX * BASELINE_M / DISPARITY, rel=0.06)

@@ -1,5 +1,7 @@
 import math
 from collections.abc import Callable
+from itertools import accumulate, product
+from typing import Any
 
 import pytest
 import torch
@@ -8,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.errors import OptionError, ShapeError
-from gcd_model.geometry import Intrinsics, center_crop_box
+from gcd_model.geometry import Intrinsics, Orbit, center_crop_box
 
 CAMERA = Intrinsics(fx=400.0, fy=390.0, cx=310.0, cy=250.0, width=640, height=480)
 POINTS = torch.tensor([[0.0, 0.0, 1.0], [0.7, -0.2, 2.0], [-1.5, 1.0, 4.0], [3.0, 2.0, 9.0]], dtype=torch.float64)
@@ -36,12 +38,6 @@ def test_a_field_of_view_survives_the_round_trip(hfov_deg: float) -> None:
     assert (camera.cx, camera.cy) == (192.0, 128.0)
 
 
-def with_entry(row: int, column: int, value: float) -> Tensor:
-    matrix = CAMERA.matrix
-    matrix[row, column] = value
-    return matrix
-
-
 @pytest.mark.parametrize(
     ("make", "error"),
     [
@@ -54,9 +50,6 @@ def with_entry(row: int, column: int, value: float) -> Tensor:
         (lambda: Intrinsics.from_hfov(180.0, 384, 256), OptionError),
         (lambda: Intrinsics.from_hfov(math.nan, 384, 256), OptionError),
         (lambda: Intrinsics.from_hfov(50.0, 0, 256), ShapeError),
-        (lambda: Intrinsics.from_matrix(with_entry(0, 1, 3.0), 640, 480), OptionError),
-        (lambda: Intrinsics.from_matrix(with_entry(2, 2, 2.0), 640, 480), OptionError),
-        (lambda: Intrinsics.from_matrix(torch.eye(4), 640, 480), ShapeError),
         (lambda: center_crop_box(640, 480, -1.5), OptionError),
         (lambda: center_crop_box(640, 480, math.nan), OptionError),
     ],
@@ -64,12 +57,6 @@ def with_entry(row: int, column: int, value: float) -> Tensor:
 def test_what_no_pinhole_camera_is_is_refused(make: Callable[[], object], error: type[Exception]) -> None:
     with pytest.raises(error):
         make()
-
-
-def test_a_matrix_survives_the_round_trip_in_single_precision_too() -> None:
-    assert Intrinsics.from_matrix(CAMERA.matrix, 640, 480) == CAMERA
-    assert Intrinsics.from_matrix(CAMERA.matrix.float(), 640, 480) == CAMERA
-    assert CAMERA.matrix.dtype == torch.float64
 
 
 # The crop to the trained shape
@@ -97,3 +84,64 @@ def test_the_crop_is_the_largest_centred_part_of_that_shape(width: int, height: 
 )
 def test_recorded_crops_to_three_by_two(width: int, height: int, box: tuple[int, int, int, int]) -> None:
     assert center_crop_box(width, height, 1.5) == box
+
+
+ORBITS = [
+    Orbit(rate_deg_s=rate, amplitude_deg=amplitude, azimuth_deg=share * amplitude, direction=direction)
+    for rate, amplitude, share, direction in product([25.0, -7.3], [45.0, 0.1], [-0.9, 0.35], [1, -1])
+]
+
+
+def swing_seconds(orbit: Orbit) -> float:
+    return 4 * orbit.amplitude_deg / abs(orbit.rate_deg_s)
+
+
+def ends_together(one: Orbit, other: Orbit) -> bool:
+    """The same motion up to rounding: same place, and same way unless both are at a turn."""
+    near = math.isclose(one.azimuth_deg, other.azimuth_deg, abs_tol=1e-6)
+    at_turn = math.isclose(abs(one.azimuth_deg), one.amplitude_deg, abs_tol=1e-6)
+    return near and (at_turn or one.direction == other.direction)
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+def test_the_azimuth_never_leaves_the_amplitude(orbit: Orbit) -> None:
+    steps = [0.0, 0.01, 0.5, 0.583333, 3.0, 100.0, 12345.678]
+    visited = list(accumulate(steps * 5, lambda place, step: place.advanced(step), initial=orbit))
+    assert all(abs(place.azimuth_deg) <= orbit.amplitude_deg for place in visited)
+    assert {place.amplitude_deg for place in visited} == {orbit.amplitude_deg}
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+@pytest.mark.parametrize(("first_s", "second_s"), [(0.13, 0.4), (2.0, 9.1), (3.3, -1.2)])
+def test_two_steps_are_one_step_of_their_sum(orbit: Orbit, first_s: float, second_s: float) -> None:
+    assert ends_together(orbit.advanced(first_s).advanced(second_s), orbit.advanced(first_s + second_s))
+
+
+@pytest.mark.parametrize("orbit", ORBITS)
+def test_a_whole_swing_leads_back_and_half_a_swing_to_the_mirror_image(orbit: Orbit) -> None:
+    whole, half = orbit.advanced(swing_seconds(orbit)), orbit.advanced(swing_seconds(orbit) / 2)
+    assert ends_together(whole, orbit)
+    assert half.azimuth_deg == pytest.approx(-orbit.azimuth_deg, abs=1e-9)
+    assert half.direction == -orbit.direction
+
+
+@pytest.mark.parametrize(
+    "orbit", [Orbit(rate_deg_s=0.0, amplitude_deg=20.0, azimuth_deg=5.0), Orbit(rate_deg_s=9.0, amplitude_deg=0.0)]
+)
+def test_an_orbit_without_rate_or_amplitude_stays(orbit: Orbit) -> None:
+    assert orbit.advanced(17.0) == orbit
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"amplitude_deg": -1.0},
+        {"azimuth_deg": 10.1},
+        {"direction": 0},
+        {"rate_deg_s": math.nan},
+        {"amplitude_deg": math.inf},
+    ],
+)
+def test_an_impossible_orbit_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(OptionError):
+        Orbit(**{"rate_deg_s": 1.0, "amplitude_deg": 10.0, **changes})

@@ -1,4 +1,4 @@
-"""A low-rank adapter beside its weights, as the node and `synthesize` take it."""
+"""Adapters beside their weights, exports and engines: what is taken, and what is refused before anything runs."""
 
 from pathlib import Path
 
@@ -11,7 +11,9 @@ from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import write_adapter
+from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig, parse_config
+from gcd_node.errors import ConfigError
 from gcd_node.session import load_model
 from gcd_node.stream_context import config_digest
 
@@ -66,3 +68,28 @@ def test_the_node_runs_weights_with_their_adapter_under_a_name_of_their_own(
 def test_an_adapter_of_other_weights_ends_a_run_before_it_begins(tmp_path: Path, files: dict[str, Path]) -> None:
     with pytest.raises(CheckpointError):
         load_model(launch(tmp_path, files["tiny"], files["other"]).model)
+
+
+LAUNCH = b"""
+[source]
+path = "drive.mp4"
+[model]
+weights = "random:driving"
+threads = 1
+[view.topdown]
+"""
+
+
+def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
+    assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64
+    assert "exists; give another name, or allow an export to be overwritten" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("change", ["model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'])
+def test_onnxruntime_is_refused_for_what_is_no_export(change: str) -> None:
+    section = parse_config(LAUNCH, "launch.toml", [change]).model
+    with pytest.raises(
+        ConfigError, match=r"\[model\]: the engine onnxruntime runs exports, and random:driving is none"
+    ):
+        load_model(section)
