@@ -79,8 +79,8 @@ def _run(
         latents=latents,
     )
     distiller = Distiller(inputs)
-    folder.begin(recipe, command_line())
-    distiller.run(stage)
+    with folder.begun(recipe, command_line()):
+        distiller.run(stage)
 
 
 def _require_one_process() -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias, get_args
 
@@ -81,9 +82,8 @@ def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
     with processes_of(ComputeRecipe(device=loaded.device, parallel="ddp")) as processes:
         if not processes.first:
             logging.getLogger().setLevel(logging.WARNING)
-        else:
-            RunFolder(out).begin(loaded, command_line())
-        train_live(loaded, places, stop_when_asked(), processes)
+        with RunFolder(out).begun(loaded, command_line()) if processes.first else nullcontext():
+            train_live(loaded, places, stop_when_asked(), processes)
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:
@@ -162,6 +162,5 @@ def _run(
         processes=processes,
     )
     trainer = Trainer(inputs)
-    if processes.first:
-        folder.begin(recipe, command_line())
-    trainer.run(stage)
+    with folder.begun(recipe, command_line()) if processes.first else nullcontext():
+        trainer.run(stage)

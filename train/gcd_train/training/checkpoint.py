@@ -11,6 +11,7 @@ Random numbers need no state of their own: they follow from the seed and the num
 
 import hashlib
 import logging
+import math
 import os
 import shutil
 import warnings
@@ -193,7 +194,7 @@ class States:
             yield
         except (OSError, CheckpointException) as error:
             raise RunError(
-                f"cannot write a state in {self._folder}: {error}; free some space, or choose --out"
+                f"cannot write a state in {self._folder}: {_told(error)}; free some space, or choose --out"
             ) from error
 
     def _write(self, unfinished: Path, mark: Mark) -> None:
@@ -234,9 +235,16 @@ class States:
             shutil.rmtree(path)
 
     def _choose(self) -> "tuple[Path, StateNote] | str | None":
-        """The newest good state; None without any, or in other processes; a message where all are damaged."""
+        """The newest good state; None without any, or in other processes; a message where none can be used."""
         if not self._processes.first:
             return None
+        try:
+            return self._newest_good()
+        except (RunError, OSError) as error:  # told to the others, too, which wait for it
+            return f"cannot go on in {self._folder}: {error}" if isinstance(error, OSError) else str(error)
+
+    def _newest_good(self) -> "tuple[Path, StateNote] | None":
+        """Damaged ones before it are put aside. Raises RunError where all are damaged, or the newest does not fit."""
         self._sweep()
         states = listed(self._folder)
         for path in states:
@@ -248,13 +256,11 @@ class States:
                 last = path == states[-1]
                 _log.warning("%s; %s", error, "no state is left" if last else "going on from the state before it")
                 if last:
-                    return (
+                    raise RunError(
                         f"all {len(states)} states of the stage are damaged, see above; delete {self._folder} to start "
                         "the stage anew"
-                    )
+                    ) from error
                 continue
-            except RunError as error:
-                return str(error)
             for damaged in states[: states.index(path)]:
                 shutil.rmtree(damaged.with_suffix(".damaged"), ignore_errors=True)
                 damaged.rename(damaged.with_suffix(".damaged"))
@@ -264,7 +270,7 @@ class States:
 
 def listed(folder: Path) -> list[Path]:
     """All states of a stage's folder `states`, newest first."""
-    found = [path for path in folder.glob("[0-9]*") if path.name.isdigit()]
+    found = [path for path in folder.glob("[0-9]*") if path.name.isdecimal()]
     return sorted(found, key=lambda path: int(path.name), reverse=True)
 
 
@@ -328,7 +334,8 @@ def checked_note(folder: Path, stage: str) -> StateNote:
         if hashlib.sha256(content).hexdigest().encode() != digest:
             raise _damaged(folder, f"{_NOTE} is not as it was written")
         note = decode_json(content, StateNote)
-        if set(note.files) != {path.name for path in folder.iterdir() if path.is_file()} - {_NOTE}:
+        there = list(folder.iterdir())
+        if {path.name for path in there} != {*note.files, _NOTE} or not all(path.is_file() for path in there):
             raise _damaged(folder, "it has not the files that were written")
         for name, digest in note.files.items():
             if _digest(folder / name) != digest:
@@ -343,10 +350,15 @@ def checked_note(folder: Path, stage: str) -> StateNote:
 def _metadata(folder: Path) -> dict[str, TensorStorageMetadata]:
     """The tensors a state holds, by name. Raises DamagedStateError."""
     try:
-        found = HuggingFaceStorageReader(str(folder)).read_metadata().state_dict_metadata
+        listed = HuggingFaceStorageReader(str(folder)).read_metadata().state_dict_metadata
+        found = cast("dict[str, TensorStorageMetadata]", listed)
+        for name, whole in found.items():
+            parts = sum(math.prod(part.sizes) for part in whole.chunks)
+            if parts != math.prod(whole.size) or any(first < 0 for part in whole.chunks for first in part.offsets):
+                raise ValueError(f"the parts of {name} do not make the whole")
     except Exception as error:  # a header that somebody made up fails in any way
         raise _damaged(folder, f"its tensors cannot be listed ({error})") from error
-    return cast("dict[str, TensorStorageMetadata]", found)
+    return found
 
 
 def _load(folder: Path, tensors: dict[str, Tensor], processes: Processes) -> None:
@@ -357,7 +369,14 @@ def _load(folder: Path, tensors: dict[str, Tensor], processes: Processes) -> Non
         try:
             load(cast(Any, tensors), storage_reader=reader, process_group=group, no_dist=not processes.several)
         except CheckpointException as error:
-            raise RunError(f"the state {folder} does not fit what is trained: {error}") from error
+            raise RunError(f"the state {folder} does not fit what is trained: {_told(error)}") from error
+
+
+def _told(error: OSError | CheckpointException) -> str:
+    """In one line: torch's message holds every process's whole traceback."""
+    if isinstance(error, OSError):
+        return str(error)
+    return "; ".join(f"process {rank}: {str(fault).strip()}" for rank, (fault, _) in error.failures.items())
 
 
 def _plain(name: str, value: Tensor) -> dict[str, Tensor]:
