@@ -96,7 +96,7 @@ def generate_live(
     failures: list[str] = []
     for outcome in map_items(partial(film_scene, folder, world, settings), missing, workers=workers):
         if outcome.error is not None:
-            failures.append(outcome.error)
+            failures.append(str(outcome.error))
     return len(seeds) - len(failures), failures
 
 
