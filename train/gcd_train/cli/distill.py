@@ -26,13 +26,7 @@ if TYPE_CHECKING:
     from gcd_train.data.open import DataPlaces
     from gcd_train.training.distill_recipe import DistillRecipe
 
-RecipeFile: TypeAlias = Annotated[
-    str,
-    Argument(
-        metavar="RECIPE",
-        help="A TOML file, or package:distill-kubric.",
-    ),
-]
+RecipeFile: TypeAlias = Annotated[str, Argument(metavar="RECIPE", help="A TOML file, or package:distill-kubric.")]
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(DistillStageName))}.")]
 
 
