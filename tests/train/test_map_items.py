@@ -10,7 +10,6 @@ import pytest
 from mapped_work import always_killed, killed_once, seat_after_a_death, square, unsendable
 
 from gcd_train.data.files import FileFault
-from gcd_train.errors import RunError
 from gcd_train.parallel import ItemError, map_items
 
 HERE = Path(__file__).parent

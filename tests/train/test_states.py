@@ -115,8 +115,10 @@ def pipe(path: Path) -> None:
     os.mkfifo(path.parent / "pipe.safetensors")  # whoever opens it waits for ever
 
 
-HARMS = [("tensors", truncate), ("tensors", flip), ("tensors", Path.unlink), ("tensors", extra), ("tensors", pipe)]
-HARMS += [("note", truncate), ("note", flip), ("note", Path.unlink)]
+HARMS = [
+    *(("tensors", harm) for harm in (truncate, flip, Path.unlink, extra, pipe)),
+    *(("note", harm) for harm in (truncate, flip, Path.unlink)),
+]
 
 
 @pytest.mark.parametrize(("which", "harm"), HARMS)
