@@ -168,19 +168,9 @@ def _run(
 
     stop = stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
-    opened = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
+    data = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
     folder = RunFolder(out, board)
-    inputs = RunInputs(
-        recipe=recipe,
-        clips=opened.clips,
-        valid=opened.valid,
-        batches=opened.batches,
-        parts=opened.parts,
-        latents=latents,
-        folder=folder,
-        stop=stop,
-        processes=processes,
-    )
+    inputs = RunInputs(recipe=recipe, data=data, latents=latents, folder=folder, stop=stop, processes=processes)
     trainer = Trainer(inputs)
     with folder.begun(recipe, command_line()) if processes.first else nullcontext():
         trainer.run(stage)
