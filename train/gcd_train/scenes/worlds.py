@@ -53,12 +53,16 @@ def _tabletop(seed: int, frames: int) -> Scene:
     return tabletop_scene(seed, frames=frames)
 
 
+def _driving(seed: int, frames: int) -> Scene:
+    return driving_drive(seed, frames=frames)
+
+
 SCENE_WORLDS: dict[str, SceneWorld] = {
     "drop": SceneWorld(name="drop", make=_drop),
     "tabletop": SceneWorld(name="tabletop", make=_tabletop),
     "driving": SceneWorld(
         name="driving",
-        make=lambda seed, frames: driving_drive(seed, frames=frames),
+        make=_driving,
         edition=2,  # the first is that of the pairs
         layout="parallel_domain4d",
         frames=parallel_domain4d.FRAMES,
