@@ -49,6 +49,8 @@ def test_two_processes_end_with_the_weights_of_one_with_twice_the_batch(found: d
 
 def test_two_processes_share_three_batches(found: dict[str, Any]) -> None:
     assert found["uneven"] < 1e-6
+    shared, alone = found["uneven speeds"]  # a batch that counts nothing is not counted
+    assert shared == alone > 0
 
 
 def test_the_first_of_two_processes_measures_alone(found: dict[str, Any]) -> None:
