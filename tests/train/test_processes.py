@@ -161,26 +161,10 @@ def test_torchrun_trains_a_recipe_from_its_clips_to_its_weights(tmp_path: Path) 
     list(generate(tmp_path / "data", world, range(2), workers=1))
     list(generate(tmp_path / "valid", world, range(1_000_000, 1_000_001), workers=1))
     (tmp_path / "tiny.toml").write_bytes(RECIPE)
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        "2",
-        "-m",
-        "gcd_train",
-    ]
-    command += [
-        "train",
-        str(tmp_path / "tiny.toml"),
-        "--data",
-        str(tmp_path / "data"),
-        "--valid",
-        str(tmp_path / "valid"),
-    ]
-    command += ["--out", str(tmp_path / "run"), "--set", "unet.batch=2"]
-    command += ["--set", "unet.clip_batch=1", "--set", "unet.budget.updates=40"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "gcd_train"]
+    command += ["train", str(tmp_path / "tiny.toml"), *(f"--{name}={tmp_path / name}" for name in ("data", "valid"))]
+    command += [f"--out={tmp_path / 'run'}", "--set=unet.batch=2", "--set=unet.clip_batch=1"]
+    command += ["--set=unet.budget.updates=40"]
     run = subprocess.Popen(command, env=QUIET, stderr=subprocess.PIPE, text=True)
     index = tmp_path / "run" / "latents" / "index.json"
     while not (index.exists() and json.loads(index.read_text())["sensitivity"]) and run.poll() is None:

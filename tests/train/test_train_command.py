@@ -9,13 +9,6 @@ from gcd_train.recipe_files import packaged_recipes
 from gcd_train.training.distill_recipe import DistillRecipe
 
 
-def test_train_explains_itself() -> None:
-    result = CliRunner().invoke(app, ["train", "--help"], env={"COLUMNS": "120"})
-    assert result.exit_code == 0
-    for text in ("RECIPE", "--data", "--valid", "--out", "--stage", "--threads"):
-        assert text in result.output
-
-
 def test_a_missing_recipe_ends_with_the_exit_code_of_a_bad_configuration(tmp_path: Path) -> None:
     where = [f"--{name}={tmp_path}" for name in ("data", "valid", "out")]
     result = CliRunner().invoke(app, ["train", str(tmp_path / "none.toml"), *where])
