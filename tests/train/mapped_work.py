@@ -5,7 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from gcd_train.errors import DataError
+from gcd_train.data.files import FileFault
 
 
 def killed_once(place: tuple[str, int]) -> int:
@@ -28,7 +28,7 @@ def always_killed(number: int) -> int:
 def square(number: int) -> int:
     """Fails in three ways: an error of ours, one of the disk, and a bug."""
     if number == 1:
-        raise DataError("one is refused")
+        raise FileFault(Path("one.png"), "is refused")
     if number == 2:
         raise OSError(28, "No space left on device")
     if number == 4:

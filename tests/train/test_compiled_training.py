@@ -7,6 +7,7 @@ import pytest
 import torch
 from tiny_world import Never, TinyClips, saved, tiny_recipe
 
+from gcd_train.data.open import RunData
 from gcd_train.training.checkpoint import SavedWeights
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.run import RunInputs, Trainer
@@ -18,8 +19,7 @@ def unet_of(path: Path, *, compiled: bool, recompute: bool = False) -> SavedWeig
     compute = msgspec.structs.replace(recipe.compute, compile=compiled, checkpoint_activations=recompute)
     inputs = RunInputs(
         recipe=msgspec.structs.replace(recipe, compute=compute),
-        clips=TinyClips(2),
-        valid=TinyClips(1, seed=9),
+        data=RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9)),
         folder=RunFolder(path),
         stop=Never(),
     )

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 import torch
 from cached_sets import CHOICE, CLIP, HEIGHT, WIDTH, FakePictures, tiny_identity
@@ -72,6 +73,16 @@ def test_kubric_is_split_by_number(kubric: Path) -> None:
     source, target = run.valid.rgb(0)
     assert source.shape == target.shape == (3, 32, 48, 3)
     assert run.valid.trajectory(0).frames == 3
+
+
+def test_points_are_drawn_on_the_device_that_the_recipe_names(kubric: Path) -> None:
+    on_gpu = recipe(msgspec.structs.replace(KUBRIC, splat_device="cuda"))
+    if not torch.cuda.is_available():
+        with pytest.raises(RecipeError, match=r"data\.splat_device"):
+            opened(on_gpu, kubric)
+        return
+    there, here = (opened(told, kubric).valid.rgb(0)[1] for told in (on_gpu, recipe(KUBRIC)))
+    assert np.abs(there.astype(int) - here).mean() < 0.1
 
 
 def test_the_last_scenes_are_held_out_where_the_recipe_says_so(kubric: Path) -> None:

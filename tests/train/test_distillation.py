@@ -25,8 +25,8 @@ from gcd_train.stop import StopSignal
 from gcd_train.training.batches import PixelBatches
 from gcd_train.training.distill import (
     Distiller,
-    DistillInputs,
     SampleLoss,
+    as_training,
     colour_loss,
     sampled,
     schedule_of,
@@ -43,6 +43,7 @@ from gcd_train.training.distill_recipe import (
 from gcd_train.training.draws import Draws
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import Batch, denoiser_of
+from gcd_train.training.run import RunInputs
 from gcd_train.training.setup import Precision, loaded_base
 
 CPU = Precision.of(ComputeRecipe(device="cpu"))
@@ -67,14 +68,9 @@ def tiny(teacher: Path, **changes: object) -> DistillRecipe:
 
 
 def distiller(recipe: DistillRecipe, path: Path, stop: StopSignal | None = None) -> Distiller:
-    inputs = DistillInputs(
-        recipe=recipe,
-        teacher=teacher_of(recipe),
-        data=RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9)),
-        folder=RunFolder(path),
-        stop=stop or Never(),
-    )
-    return Distiller(inputs)
+    teacher, data = teacher_of(recipe), RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9))
+    inputs = RunInputs(recipe=as_training(recipe, teacher), data=data, folder=RunFolder(path), stop=stop or Never())
+    return Distiller(inputs, recipe, teacher)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Scenes on disk: whole or not there, continued, checked; and the command that makes them."""
 
 import os
+import pickle
 import re
 import resource
 import signal
@@ -27,6 +28,7 @@ from gcd_train.layouts.scene_writer import GIVE_UP_AFTER, SceneFormat, generate_
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import FrozenScene
 from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.worlds import SCENE_WORLDS
 
 FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)
 
@@ -360,3 +362,8 @@ class TestCommand:
         assert made.exit_code == RecipeError.exit_code
         assert said in made.output
         assert inside(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", SCENE_WORLDS)
+def test_every_world_reaches_a_worker(name: str) -> None:
+    assert pickle.loads(pickle.dumps(SCENE_WORLDS[name])) == SCENE_WORLDS[name]

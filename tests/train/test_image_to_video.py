@@ -13,7 +13,7 @@ from gcd_model.networks import Networks, random_networks
 from gcd_train.data.files import Skips
 from gcd_train.data.latents import LatentClips, LatentVideos
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
-from gcd_train.data.open import DataPlaces, open_data
+from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import ClipSource, Sample, VideoClips, VideoSamples
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import Recipe
@@ -138,11 +138,9 @@ def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[ClipSource, 
     videos = VideoClips(parts) if parts else None
     inputs = RunInputs(
         recipe=told,
-        clips=videos or TinyClips(2),
-        valid=videos or TinyClips(1, seed=9),
+        data=RunData(clips=videos or TinyClips(2), valid=videos or TinyClips(1, seed=9), parts=parts),
         folder=RunFolder(folder),
         stop=Never(),
-        parts=parts,
         latents=latents,
     )
     return Trainer(inputs)

@@ -17,6 +17,7 @@ from gcd_model.weights.adapter import adapted, base_digest
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
 from gcd_train.cli.main import app
+from gcd_train.data.open import RunData
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe
 from gcd_train.recipe_files import parse_recipe
@@ -140,7 +141,9 @@ def test_a_run_leaves_the_adapter_apart_and_merged_weights(tmp_path: Path) -> No
     networks = random_networks(model_config(model), seed=1)
     save_weights(networks, base, Card(name="base", config=networks.config, family=None, move_time=3))
     valid = TinyClips(1, seed=9)
-    inputs = RunInputs(recipe=recipe(base), clips=TinyClips(1), valid=valid, folder=RunFolder(out), stop=Never())
+    inputs = RunInputs(
+        recipe=recipe(base), data=RunData(clips=TinyClips(1), valid=valid), folder=RunFolder(out), stop=Never()
+    )
     Trainer(inputs).run()
     state = saved(out / "unet", "unet").module
     assert all(name.endswith((".down", ".up")) for name in state)

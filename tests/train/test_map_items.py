@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from mapped_work import always_killed, killed_once, seat_after_a_death, square, unsendable
 
-from gcd_train.errors import DataError, RunError
-from gcd_train.parallel import Outcome, map_items
+from gcd_train.data.files import FileFault
+from gcd_train.parallel import ItemError, map_items
 
 HERE = Path(__file__).parent
 
@@ -20,18 +20,12 @@ def test_each_item_has_one_outcome_and_errors_end_nothing(workers: int) -> None:
     outcomes = {outcome.item: outcome for outcome in map_items(square, range(6), workers=workers)}
     assert sorted(outcomes) == [0, 1, 2, 3, 4, 5]
     assert [outcomes[n].value for n in (0, 3, 5)] == [0, 9, 25]
-    assert (outcomes[1].error, outcomes[1].kind) == ("one is refused", "DataError")
-    assert "No space left" in (outcomes[2].error or "")
-    assert "ZeroDivisionError" in (outcomes[4].error or "")
-    assert "mapped_work.py, line" in (outcomes[4].error or "")
-
-
-def test_an_outcome_gives_its_value_or_raises_its_error() -> None:
-    assert Outcome(item=3, value=9).unwrap() == 9
-    with pytest.raises(DataError, match="refused"):
-        Outcome(item=3, error="refused", kind="DataError").unwrap()
-    with pytest.raises(RunError, match="disk"):
-        Outcome(item=3, error="disk", kind="OSError").unwrap()
+    with pytest.raises(FileFault) as refused:
+        outcomes[1].unwrap()
+    assert (refused.value.path, refused.value.reason) == (Path("one.png"), "is refused")
+    for number, told in ((2, "No space left"), (4, r"ZeroDivisionError.*mapped_work.py, line")):
+        with pytest.raises(ItemError, match=told):
+            outcomes[number].unwrap()
 
 
 def test_what_a_killed_worker_had_is_done_again(tmp_path: Path) -> None:
@@ -45,8 +39,8 @@ def test_what_a_killed_worker_had_is_done_again(tmp_path: Path) -> None:
 def test_an_item_that_kills_every_worker_is_given_up() -> None:
     outcomes = {outcome.item: outcome for outcome in map_items(always_killed, range(4), workers=2, retries=1)}
     assert {item: outcome.value for item, outcome in outcomes.items()} == {0: 0, 1: 1, 2: None, 3: 9}
-    assert "killed 2 times (exit code -9)" in (outcomes[2].error or "")
-    assert outcomes[2].kind == "WorkerLost"
+    with pytest.raises(ItemError, match=r"killed 2 times \(exit code -9\)"):
+        outcomes[2].unwrap()
 
 
 def test_workers_take_environments_in_turn_and_a_new_one_has_that_of_the_killed(tmp_path: Path) -> None:
@@ -60,7 +54,7 @@ def test_workers_take_environments_in_turn_and_a_new_one_has_that_of_the_killed(
 
 def test_a_result_that_cannot_travel_is_an_error() -> None:
     (outcome,) = map_items(unsendable, [1], workers=2)
-    assert "cannot be sent" in (outcome.error or "")
+    assert "cannot be sent" in str(outcome.error)
 
 
 def test_items_are_taken_as_workers_come_free() -> None:

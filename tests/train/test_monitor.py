@@ -8,7 +8,6 @@ import torch
 
 from gcd_train.errors import RunError, TrainError
 from gcd_train.pictures import write_sheet
-from gcd_train.training.loop import peak_memory_gb
 from gcd_train.training.monitor import FiniteGuard, RunFolder, TensorBoard
 
 
@@ -31,22 +30,6 @@ def test_looked_at_late_the_first_wrong_value_counts_with_the_clips_of_its_updat
         guard.check()
 
 
-def test_what_was_looked_at_and_fine_is_forgotten(tmp_path: Path) -> None:
-    guard = FiniteGuard("vae", tmp_path / "note.json", at_once=False)
-    guard.saw(1, "loss", torch.tensor(1.0))
-    guard.check()
-    guard.check()
-    assert not (tmp_path / "note.json").exists()
-
-
-def test_many_clips_are_counted_in_the_message_and_all_in_the_note(tmp_path: Path) -> None:
-    guard = FiniteGuard("unet", tmp_path / "note.json")
-    ids = tuple(f"seed {i}" for i in range(20))
-    with pytest.raises(TrainError, match="seed 5 and 14 more"):
-        guard.saw(0, "loss", torch.tensor(torch.inf), ids)
-    assert json.loads((tmp_path / "note.json").read_text())["clips"] == list(ids)
-
-
 def test_a_note_that_cannot_be_written_does_not_hide_what_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "unet").write_text("a file where a folder should be")
     with pytest.raises(TrainError, match="the loss of unet is nan at update 5"):
@@ -58,10 +41,6 @@ def test_a_folder_that_tensorboard_cannot_write_is_named(tmp_path: Path) -> None
     (tmp_path / "tensorboard").write_text("a file where a folder should be")
     with pytest.raises(RunError, match=r"cannot write in .*tensorboard"):
         TensorBoard(tmp_path / "tensorboard")
-
-
-def test_memory_is_told_in_gigabytes_of_the_process() -> None:
-    assert 0.05 < peak_memory_gb(torch.device("cpu")) < 1000.0
 
 
 def test_figures_and_pictures_reach_tensorboard(tmp_path: Path) -> None:

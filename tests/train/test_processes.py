@@ -49,6 +49,8 @@ def test_two_processes_end_with_the_weights_of_one_with_twice_the_batch(found: d
 
 def test_two_processes_share_three_batches(found: dict[str, Any]) -> None:
     assert found["uneven"] < 1e-6
+    shared, alone = found["uneven speeds"]  # a batch that counts nothing is not counted
+    assert shared == alone > 0
 
 
 def test_the_first_of_two_processes_measures_alone(found: dict[str, Any]) -> None:
@@ -159,26 +161,10 @@ def test_torchrun_trains_a_recipe_from_its_clips_to_its_weights(tmp_path: Path) 
     list(generate(tmp_path / "data", world, range(2), workers=1))
     list(generate(tmp_path / "valid", world, range(1_000_000, 1_000_001), workers=1))
     (tmp_path / "tiny.toml").write_bytes(RECIPE)
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        "2",
-        "-m",
-        "gcd_train",
-    ]
-    command += [
-        "train",
-        str(tmp_path / "tiny.toml"),
-        "--data",
-        str(tmp_path / "data"),
-        "--valid",
-        str(tmp_path / "valid"),
-    ]
-    command += ["--out", str(tmp_path / "run"), "--set", "unet.batch=2"]
-    command += ["--set", "unet.clip_batch=1", "--set", "unet.budget.updates=40"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "gcd_train"]
+    command += ["train", str(tmp_path / "tiny.toml"), *(f"--{name}={tmp_path / name}" for name in ("data", "valid"))]
+    command += [f"--out={tmp_path / 'run'}", "--set=unet.batch=2", "--set=unet.clip_batch=1"]
+    command += ["--set=unet.budget.updates=40"]
     run = subprocess.Popen(command, env=QUIET, stderr=subprocess.PIPE, text=True)
     index = tmp_path / "run" / "latents" / "index.json"
     while not (index.exists() and json.loads(index.read_text())["sensitivity"]) and run.poll() is None:

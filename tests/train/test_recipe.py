@@ -8,7 +8,7 @@ from tiny_world import RECIPE, tiny_recipe
 
 from gcd_train.data.open import sampling_of
 from gcd_train.data.paths import DRIVING, MAX90, MAX180
-from gcd_train.errors import RecipeError
+from gcd_train.errors import RecipeError, RunError
 from gcd_train.live.recipe import LiveRecipe, live_recipes, load_live_recipe
 from gcd_train.recipe_files import load_recipe, packaged_recipes, parse_recipe
 from gcd_train.training.monitor import RunFolder
@@ -167,7 +167,8 @@ def test_a_run_folder_keeps_recipe_and_commands_and_says_what_another_recipe_cha
     )
     for recipe, command in ((first, "gcd-train train tiny.toml"), (first, "again"), (other, "with another seed")):
         caplog.clear()
-        folder.begin(recipe, command)
+        with folder.begun(recipe, command):
+            pass
     assert parse_recipe((tmp_path / "recipe.toml").read_bytes(), "kept") == other
     lines = (tmp_path / "commands.txt").read_text().splitlines()
     assert lines[1::2] == ["gcd-train train tiny.toml", "again", "with another seed"]
@@ -175,12 +176,27 @@ def test_a_run_folder_keeps_recipe_and_commands_and_says_what_another_recipe_cha
     assert f"seed was {first.seed}, is {other.seed}" in said
     assert "model.weights was not given, is start.ckpt" in said
     caplog.clear()
-    folder.begin(other, "once more")
-    assert not caplog.records
+    with folder.begun(other, "once more"):
+        assert not caplog.records
+        with pytest.raises(RunError), folder.begun(first, "two at once"):
+            pass
+    assert parse_recipe((tmp_path / "recipe.toml").read_bytes(), "kept") == other
+
+
+@pytest.mark.parametrize("name", ["recipe.toml", "commands.txt", "metrics.jsonl"])
+def test_a_run_folder_whose_files_lead_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
+    mine, given = tmp_path / "profile", tmp_path / "given"
+    mine.write_text("mine")
+    given.mkdir()
+    (given / name).symlink_to(mine)
+    with pytest.raises(RunError), RunFolder(given).begun(tiny_recipe(), "gcd-train train"):
+        pass
+    assert mine.read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", live_recipes())
 def test_a_live_recipe_is_kept_too(tmp_path: Path, name: str) -> None:
     recipe = load_live_recipe(f"package:{name}")
-    RunFolder(tmp_path).begin(recipe, "gcd-train train")
+    with RunFolder(tmp_path).begun(recipe, "gcd-train train"):
+        pass
     assert msgspec.convert(tomllib.loads((tmp_path / "recipe.toml").read_text()), LiveRecipe) == recipe

@@ -19,7 +19,7 @@ from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.networks import random_networks
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
-from gcd_train.data.open import DataPlaces, open_data
+from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import ClipSource, PaintedClips, SomeClips, to_network
 from gcd_train.errors import DataError, Interrupted
 from gcd_train.recipe import ClassWeightsName, NoiseRecipe, Recipe
@@ -69,7 +69,9 @@ def painted_recipe() -> Recipe:
 def trainer(
     path: Path, recipe: Recipe, clips: ClipSource, valid: ClipSource, stop: StopSignal | None = None
 ) -> Trainer:
-    return Trainer(RunInputs(recipe=recipe, clips=clips, valid=valid, folder=RunFolder(path), stop=stop or Never()))
+    return Trainer(
+        RunInputs(recipe=recipe, data=RunData(clips=clips, valid=valid), folder=RunFolder(path), stop=stop or Never())
+    )
 
 
 def orbits(path: Path, stop: StopSignal | None = None) -> Trainer:

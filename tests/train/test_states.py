@@ -3,6 +3,7 @@
 import os
 import pickle
 import shutil
+import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +19,7 @@ from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
 from gcd_train.errors import RunError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe_data import Budget, LogRecipe
-from gcd_train.training.checkpoint import DamagedStateError, close_folder, newest_weights, read_weights
+from gcd_train.training.checkpoint import DamagedStateError, StateNote, close_folder, newest_weights, read_weights
 from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.optimiser import ParameterGroup
@@ -110,8 +111,14 @@ def extra(path: Path) -> None:
     (path.parent / "extra.safetensors").write_bytes(path.read_bytes())
 
 
-HARMS = [("tensors", truncate), ("tensors", flip), ("tensors", Path.unlink), ("tensors", extra)]
-HARMS += [("note", truncate), ("note", flip), ("note", Path.unlink)]
+def pipe(path: Path) -> None:
+    os.mkfifo(path.parent / "pipe.safetensors")  # whoever opens it waits for ever
+
+
+HARMS = [
+    *(("tensors", harm) for harm in (truncate, flip, Path.unlink, extra, pipe)),
+    *(("note", harm) for harm in (truncate, flip, Path.unlink)),
+]
 
 
 @pytest.mark.parametrize(("which", "harm"), HARMS)
@@ -138,6 +145,28 @@ def test_a_run_whose_states_are_all_damaged_does_not_start_anew_by_itself(tmp_pa
     assert not list((tmp_path / "unet").rglob("*.damaged"))
 
 
+@pytest.mark.parametrize("first", [-1, 1 << 50, 1 << 62])
+def test_a_state_whose_tensors_are_not_whole_is_damaged(tmp_path: Path, first: int) -> None:
+    """What nobody wrote would be read as zeros, or asks for more memory than there is."""
+    run(tmp_path, 1)
+    state = tmp_path / "unet" / "states" / "0000001"
+    note, file = read_weights(state, "unet").note, tensors(state)
+    content = file.read_bytes()
+    (size,) = struct.unpack("<Q", content[:8])
+    header = content[8 : 8 + size].replace(rb'"saved_offsets\": [0', rb'"saved_offsets\": [%d' % first)
+    file.write_bytes(struct.pack("<Q", len(header)) + header + content[8 + size :])
+    sealed(state, note)
+    with pytest.raises(DamagedStateError):
+        read_weights(state, "unet")
+
+
+def sealed(state: Path, note: StateNote) -> None:
+    """Digests that match what is in it."""
+    unfinished = state.rename(state.with_suffix(".part"))
+    (unfinished / "state.json").unlink()
+    close_folder(unfinished, note)
+
+
 def test_the_state_of_another_stage_or_model_is_refused(tmp_path: Path) -> None:
     run(tmp_path, 1)
     shutil.copytree(tmp_path / "unet", tmp_path / "vae")
@@ -158,7 +187,7 @@ def test_a_full_disk_leaves_the_older_state(tmp_path: Path, monkeypatch: pytest.
     for owner, name in ((os, "fsync"), (HuggingFaceStorageWriter, "write_data")):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, full)
-            with pytest.raises(RunError):
+            with pytest.raises(RunError, match=r"^[^\n]*No space left on device[^\n]*$"):
                 run(tmp_path, 2)
         assert saved(tmp_path / "unet", "unet").note.updates == 1
 
@@ -242,9 +271,7 @@ def test_a_run_folder_that_somebody_else_made_runs_nothing(tmp_path: Path, name:
     place = {"tensors": tensors(state), "0000005.pt": state.parent / name, "state.pt": state.parent.parent / name}
     place.get(name, state / name).write_bytes(pickled)
     if name != "state.json":
-        unfinished = state.rename(state.with_suffix(".part"))
-        (unfinished / "state.json").unlink()
-        close_folder(unfinished, note)
+        sealed(state, note)
     for attempt in (lambda: read_weights(state, "unet"), lambda: run(tmp_path, 2)):
         with suppress(RunError):
             attempt()

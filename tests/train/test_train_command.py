@@ -1,16 +1,12 @@
+import tomllib
 from pathlib import Path
 
+import msgspec
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.recipe_files import packaged_recipes
-
-
-def test_train_explains_itself() -> None:
-    result = CliRunner().invoke(app, ["train", "--help"], env={"COLUMNS": "120"})
-    assert result.exit_code == 0
-    for text in ("RECIPE", "--data", "--valid", "--out", "--stage", "--threads"):
-        assert text in result.output
+from gcd_train.training.distill_recipe import DistillRecipe
 
 
 def test_a_missing_recipe_ends_with_the_exit_code_of_a_bad_configuration(tmp_path: Path) -> None:
@@ -39,14 +35,26 @@ def test_the_recipes_that_ship_are_listed_and_one_is_shown_whole() -> None:
         assert text in listed.output
     shown = CliRunner().invoke(app, ["recipes", "package:tabletop", "--small", "--set=unet.batch=6"])
     assert shown.exit_code == 0, shown.output
-    for text in (
+    wanted = (
         'name = "tabletop-small"',
         'camera = "relative_pose"',
         "batch = 6",
         "[unet.loss]",
         "dropout_joint = false",
-    ):
+    )
+    for text in wanted:
         assert text in shown.output
+
+
+def test_a_distillation_is_listed_and_shown_whole_and_train_refuses_it(tmp_path: Path) -> None:
+    assert "package:distill-kubric" in CliRunner().invoke(app, ["recipes"]).output
+    shown = CliRunner().invoke(app, ["recipes", "package:distill-kubric", "--set=student.steps=7"])
+    assert shown.exit_code == 0, shown.output
+    assert msgspec.convert(tomllib.loads(shown.output), DistillRecipe).student.steps == 7
+    folders = [f"--{name}={tmp_path}" for name in ("data", "out")]
+    refused = CliRunner().invoke(app, ["train", "package:distill-kubric", *folders])
+    assert refused.exit_code == 78
+    assert "gcd-train distill" in refused.output
 
 
 def test_train_takes_the_small_scale_and_changes(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_sa
 
 from gcd_model import Clip, load_synthesizer
 from gcd_train.data.latents import LatentClips, write_index
+from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
 from gcd_train.recipe import Recipe
@@ -24,8 +25,7 @@ from gcd_train.training.setup import model_config, sampled_as_trained
 def trainer(path: Path, recipe: Recipe | None = None, stop: StopSignal | None = None, clips: int = 2) -> Trainer:
     inputs = RunInputs(
         recipe=recipe or tiny_recipe(),
-        clips=TinyClips(clips),
-        valid=TinyClips(1, seed=9),
+        data=RunData(clips=TinyClips(clips), valid=TinyClips(1, seed=9)),
         folder=RunFolder(path),
         stop=stop or Never(),
     )

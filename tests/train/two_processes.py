@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import msgspec
@@ -160,6 +161,15 @@ def trained(path: Path, task: Task, chosen: LoopOptions, stop_at: int | None = N
     return {name: whole(value).clone() for name, value in task.module.state_dict().items()}
 
 
+def in_three(chosen: LoopOptions) -> LoopOptions:
+    """Three batches an update, by a clock that says one second for each."""
+    return replace(chosen, parts=3, clock=map(float, count()).__next__)
+
+
+def frames_per_s(path: Path) -> float:
+    return next(told["frames_per_s"] for told in map(json.loads, (path / "metrics.jsonl").open()) if "loss" in told)
+
+
 def furthest(first: dict[str, Tensor], second: dict[str, Tensor]) -> float:
     assert first.keys() == second.keys()
     return max(float((first[name] - second[name]).abs().max()) for name in first)
@@ -176,7 +186,7 @@ def alone(folder: Path) -> dict[str, dict[str, Tensor]]:
     return {
         "two batches": trained(folder / "two", Task(recipe), options(ALONE, Never(), LOG)),
         "twice the batch": trained(folder / "twice", TwiceTheBatch(recipe), once),
-        "three batches": trained(folder / "three", Task(recipe_of(3)), replace(options(ALONE, Never(), LOG), parts=3)),
+        "three batches": trained(folder / "three", Task(recipe_of(3)), in_three(options(ALONE, Never(), LOG))),
         "start": Task(recipe).module.state_dict(),
     }
 
@@ -209,9 +219,10 @@ class Together:
 
     def uneven(self) -> dict[str, object]:
         """Three batches an update, of which one process computes two."""
-        chosen = replace(options(self.processes, Never(), LOG, parallel="ddp"), parts=3)
+        chosen = in_three(options(self.processes, Never(), LOG, parallel="ddp"))
         weights = trained(self.folder / "uneven", Task(recipe_of(3)), chosen)
-        return {"uneven": furthest(weights, self.single["three batches"])}
+        speeds = [frames_per_s(self.folder / name) for name in ("uneven", "alone/three")]
+        return {"uneven": furthest(weights, self.single["three batches"]), "uneven speeds": speeds}
 
     def stopped_and_resumed(self, parallel: str) -> dict[str, object]:
         """Only the second process hears the signal; both stop, and go on to the bits of an undisturbed run."""

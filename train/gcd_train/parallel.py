@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Generic, TypeVar
 
-from gcd_train.errors import DataError, RecipeError, RenderError, RunError, TrainError
+from gcd_train.errors import RunError, TrainError
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -29,25 +29,27 @@ Value = TypeVar("Value")
 _LOG = logging.getLogger(__name__)
 _ONE_THREAD = ("LP_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 _STOP_S = 30.0
-_KINDS: dict[str, type[TrainError]] = {kind.__name__: kind for kind in (DataError, RecipeError, RenderError, RunError)}
 _TASKS_AT_ONCE = 2  # on Ray, for each that can be worked on: one is done, one waits
 _LOOK_AGAIN_S = 5.0
 _ANSWER_S = 10.0
 
 
+class ItemError(RunError):
+    """An item failed for want of disk or memory, or by a fault of ours."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Outcome(Generic[Item, Value]):
-    """What became of an item: its value, or the error that it ended in. kind: name of the error's class."""
+    """What became of an item: its value, or the error that it ended in."""
 
     item: Item
     value: Value | None = None
-    error: str | None = None
-    kind: str | None = None
+    error: TrainError | None = None
 
     def unwrap(self) -> Value:
-        """The value. Raises: the error, as the TrainError it was or as a RunError."""
+        """The value. Raises: the error, as the TrainError it was or as an ItemError."""
         if self.error is not None:
-            raise _KINDS.get(self.kind or "", RunError)(self.error)
+            raise self.error
         return self.value  # pyright: ignore[reportReturnType]
 
 
@@ -96,13 +98,15 @@ def _outcome(function: Callable[[Item], Value], item: Item) -> Outcome[Item, Val
     """Apply a function; an error becomes an outcome, only being stopped is none."""
     try:
         return Outcome(item=item, value=function(item))
-    except (TrainError, OSError) as error:
-        return Outcome(item=item, error=str(error), kind=type(error).__name__)
+    except TrainError as error:
+        return Outcome(item=item, error=error)
+    except OSError as error:
+        return Outcome(item=item, error=ItemError(str(error)))
     except Exception as error:  # a fault of ours: told with its place
         _LOG.exception("item %r", item)
         place = traceback.extract_tb(error.__traceback__)[-1]
         told = f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}, line {place.lineno})"
-        return Outcome(item=item, error=told, kind=type(error).__name__)
+        return Outcome(item=item, error=ItemError(told))
 
 
 @dataclass(slots=True, eq=False)
@@ -158,11 +162,11 @@ class _Pool:
         attempt = worker.attempt
         assert attempt is not None, "only busy workers are waited for"
         try:
-            value, error, kind = worker.pipe.recv()
+            value, error = worker.pipe.recv()
         except (EOFError, OSError):
             return self._after_death(worker, attempt)
         worker.attempt = None
-        return Outcome(item=attempt.item, value=value, error=error, kind=kind)
+        return Outcome(item=attempt.item, value=value, error=error)
 
     def _after_death(self, worker: _Worker, attempt: _Attempt) -> Outcome[Any, Any] | None:
         worker.process.join(_STOP_S)
@@ -175,7 +179,7 @@ class _Pool:
             self._again.append(attempt)
             return None
         why = f"its worker was killed {attempt.killed} times (exit code {code}), most likely for want of memory"
-        return Outcome(item=attempt.item, error=f"{why}; give fewer --workers", kind="WorkerLost")
+        return Outcome(item=attempt.item, error=ItemError(f"{why}; give fewer --workers"))
 
     def _start(self) -> _Worker:
         context = get_context("spawn")  # a fork would share OpenGL's and torch's state
@@ -219,9 +223,9 @@ def _serve(pipe: Connection, environment: Mapping[str, str]) -> None:
         while True:
             outcome = _outcome(function, pipe.recv())
             try:
-                pipe.send((outcome.value, outcome.error, outcome.kind))
+                pipe.send((outcome.value, outcome.error))
             except (TypeError, AttributeError, ValueError) as error:  # what pickle raises for what it cannot take
-                pipe.send((None, f"its result cannot be sent to the parent ({error})", type(error).__name__))
+                pipe.send((None, ItemError(f"its result cannot be sent to the parent ({error})")))
 
 
 def _refuse(why: str, item: object) -> None:
@@ -288,16 +292,16 @@ def _connect(ray: Any, address: str) -> None:
         signal.signal(signal.SIGTERM, on_stop)
 
 
-def _on_a_node(function: Callable[[Any], Any], item: Any) -> tuple[Any, str | None, str | None]:
+def _on_a_node(function: Callable[[Any], Any], item: Any) -> tuple[Any, TrainError | None]:
     one_thread_each()
     outcome = _outcome(function, item)
-    return outcome.value, outcome.error, outcome.kind
+    return outcome.value, outcome.error
 
 
 def _ray_outcome(ray: Any, reference: Any, item: Any) -> Outcome[Any, Any]:
     try:
-        value, error, kind = ray.get(reference)
+        value, error = ray.get(reference)
     except ray.exceptions.RayError as lost:
         first = str(lost).strip().splitlines()[0]
-        return Outcome(item=item, error=f"its Ray worker was lost again and again ({first})", kind="WorkerLost")
-    return Outcome(item=item, value=value, error=error, kind=kind)
+        return Outcome(item=item, error=ItemError(f"its Ray worker was lost again and again ({first})"))
+    return Outcome(item=item, value=value, error=error)

@@ -152,6 +152,7 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     move_time: the frame in which a gradual move is done, the last if left out.
     exact: draw from the geometry that our own scenes keep, instead of from points. published: points with the
     approximations of the release (distance to depth, see `pointcloud`); otherwise without.
+    splat_device: where points are drawn; "cuda" is the process's own GPU.
     cameras: views to draw points from, all published ones if left out.
     split, split_file, held_out: what is measured on where no --valid is given. "published": Kubric-4D by number (0-2799
     to learn from, 2800-2899 held out), ParallelDomain-4D by split_file. "last": the last held_out scenes or episodes.
@@ -165,6 +166,7 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     move_time: Annotated[int, Meta(ge=0)] | None = None
     exact: bool = False
     published: bool = False
+    splat_device: Literal["cpu", "cuda"] = "cpu"
     cameras: tuple[str, ...] | None = None
     split: Literal["published", "last"] = "published"
     split_file: str | None = None

@@ -18,7 +18,8 @@ from gcd_train.recipe import Recipe
 
 PACKAGED = Path(__file__).parent / "recipes"
 """Where the recipes that ship with the package lie; those that only serve as a base, in `bases/`."""
-BASE, WITHOUT, SMALL = "base", "without", "small"
+DISTILLATIONS = PACKAGED / "distillation"
+BASE, WITHOUT, SMALL, TEACHER = "base", "without", "small", "teacher"
 _DEEPEST = 20
 
 Table: TypeAlias = dict[str, object]
@@ -42,7 +43,8 @@ def recipe_path(source: str | Path, beside: Path | None = None) -> Path:
     """Where a recipe lies: a path, taken from the folder `beside` if it is not absolute, or `package:NAME`."""
     kind, _, name = str(source).partition(":")
     if kind == "package":
-        return PACKAGED / f"{name}.toml"
+        distillation = DISTILLATIONS / f"{name}.toml"
+        return distillation if distillation.is_file() else PACKAGED / distillation.name
     return Path(source) if beside is None else beside / source
 
 
@@ -178,6 +180,8 @@ def checked_recipe(table: Table, place: str, kind: type[Kind], changes: Sequence
 
 
 def _recipe(read: MergedTable, *, small: bool, changes: Sequence[str]) -> Recipe:
+    if TEACHER in read.table:
+        raise RecipeError(f"{read.place} has a [{TEACHER}]: it is a distillation, for `gcd-train distill`")
     require_known(read.table, _KEYS, read.place)
     own = {key: value for key, value in read.table.items() if key not in (SMALL, WITHOUT)}
     if not small:

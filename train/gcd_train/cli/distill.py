@@ -26,13 +26,7 @@ if TYPE_CHECKING:
     from gcd_train.data.open import DataPlaces
     from gcd_train.training.distill_recipe import DistillRecipe
 
-RecipeFile: TypeAlias = Annotated[
-    str,
-    Argument(
-        metavar="RECIPE",
-        help="A TOML file, or package:distill-kubric.",
-    ),
-]
+RecipeFile: TypeAlias = Annotated[str, Argument(metavar="RECIPE", help="A TOML file, or package:distill-kubric.")]
 Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(DistillStageName))}.")]
 
 
@@ -64,23 +58,18 @@ def _run(
     recipe: "DistillRecipe", places: "DataPlaces", out: Path, latents: Path | None, stage: DistillStageName | None
 ) -> None:
     from gcd_train.data.open import open_data
-    from gcd_train.training.distill import Distiller, DistillInputs, as_training, teacher_of
+    from gcd_train.training.distill import Distiller, as_training, teacher_of
     from gcd_train.training.monitor import RunFolder, TensorBoard
+    from gcd_train.training.run import RunInputs
 
-    stop = stop_when_asked()
-    teacher = teacher_of(recipe)
+    stop, teacher = stop_when_asked(), teacher_of(recipe)
+    training = as_training(recipe, teacher)
     folder = RunFolder(out, TensorBoard(out / "tensorboard") if recipe.log.tensorboard else None)
-    inputs = DistillInputs(
-        recipe=recipe,
-        teacher=teacher,
-        data=open_data(as_training(recipe, teacher), teacher.config, teacher.family, places),
-        folder=folder,
-        stop=stop,
-        latents=latents,
-    )
-    distiller = Distiller(inputs)
-    folder.begin(recipe, command_line())
-    distiller.run(stage)
+    data = open_data(training, teacher.config, teacher.family, places)
+    inputs = RunInputs(recipe=training, data=data, folder=folder, stop=stop, latents=latents)
+    distiller = Distiller(inputs, recipe, teacher)
+    with folder.begun(recipe, command_line()):
+        distiller.run(stage)
 
 
 def _require_one_process() -> None:

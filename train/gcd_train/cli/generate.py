@@ -43,72 +43,44 @@ def about() -> None:
     """Keep `generate` a command with sub-commands, one for each world."""
 
 
-@app.command()
-def drop(
-    folder: Folder = None,
-    out: Out = None,
-    scenes: Scenes = None,
-    pairs: Pairs = False,
-    clips: Clips = None,
-    first_seed: FirstSeed = 0,
-    workers: Workers = None,
-    ray: Ray = None,
-    compact: Compact = False,
-    oversample: Oversample = 2,
-    frames: Frames = None,
-    width: Width = None,
-    height: Height = None,
-    clips_per_scene: ClipsPerScene = 3,
-    clips_per_shard: ClipsPerShard = 24,
-    contact_sheet: Sheet = None,
-) -> None:
-    """Things that fall and collide, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz).
+def _orbited(name: str, about: str) -> None:
+    """Add the command of a world that cameras stand round."""
 
-    With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default.
-    """
-    with errors_shown():
-        world, place = SCENE_WORLDS["drop"], _one_folder(folder, out)
-        if _wants_pairs(pairs, clips, scenes, compact):
-            form = _pair_form(width, height, frames, oversample, clips_per_shard)
-            made = orbit_world(world, form, clips_per_scene=clips_per_scene)
-            _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
-            return
-        form = _form(world, compact, oversample, frames, width, height)
-        _make_scenes(world, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+    @app.command(name, help=about)
+    def make(  # pyright: ignore[reportUnusedFunction]
+        folder: Folder = None,
+        out: Out = None,
+        scenes: Scenes = None,
+        pairs: Pairs = False,
+        clips: Clips = None,
+        first_seed: FirstSeed = 0,
+        workers: Workers = None,
+        ray: Ray = None,
+        compact: Compact = False,
+        oversample: Oversample = 2,
+        frames: Frames = None,
+        width: Width = None,
+        height: Height = None,
+        clips_per_scene: ClipsPerScene = 3,
+        clips_per_shard: ClipsPerShard = 24,
+        contact_sheet: Sheet = None,
+    ) -> None:
+        with errors_shown():
+            world, place = SCENE_WORLDS[name], _one_folder(folder, out)
+            if _wants_pairs(pairs, clips, scenes, compact):
+                form = _pair_form(width, height, frames, oversample, clips_per_shard)
+                made = orbit_world(world, form, clips_per_scene=clips_per_scene)
+                _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
+                return
+            form = _form(world, compact, oversample, frames, width, height)
+            _make_scenes(world, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
 
 
-@app.command()
-def tabletop(
-    folder: Folder = None,
-    out: Out = None,
-    scenes: Scenes = None,
-    pairs: Pairs = False,
-    clips: Clips = None,
-    first_seed: FirstSeed = 0,
-    workers: Workers = None,
-    ray: Ray = None,
-    compact: Compact = False,
-    oversample: Oversample = 2,
-    frames: Frames = None,
-    width: Width = None,
-    height: Height = None,
-    clips_per_scene: ClipsPerScene = 3,
-    clips_per_shard: ClipsPerShard = 24,
-    contact_sheet: Sheet = None,
-) -> None:
-    """A robot arm at work on a table, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz).
+_ORBITED = """%s, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz).
 
-    With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default.
-    """
-    with errors_shown():
-        world, place = SCENE_WORLDS["tabletop"], _one_folder(folder, out)
-        if _wants_pairs(pairs, clips, scenes, compact):
-            form = _pair_form(width, height, frames, oversample, clips_per_shard)
-            made = orbit_world(world, form, clips_per_scene=clips_per_scene)
-            _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
-            return
-        form = _form(world, compact, oversample, frames, width, height)
-        _make_scenes(world, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+With --pairs or --clips: a camera that stands, and one that goes round, 192x128 and 14 frames at 12 Hz by default."""
+_orbited("drop", _ORBITED % "Things that fall and collide")
+_orbited("tabletop", _ORBITED % "A robot arm at work on a table")
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias, get_args
 
@@ -26,8 +27,9 @@ from gcd_train.cli.training_run import (
 from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
 from gcd_train.recipe import Recipe
-from gcd_train.recipe_data import ComputeRecipe, StageName
-from gcd_train.recipe_files import load_recipe, packaged_recipes, to_toml
+from gcd_train.recipe_data import Budget, ComputeRecipe, StageName
+from gcd_train.recipe_files import TEACHER, load_recipe, packaged_recipes, read_merged, to_toml
+from gcd_train.training.distill_recipe import DistillRecipe, load_distillation, packaged_distillations
 
 if TYPE_CHECKING:
     from gcd_train.data.open import DataPlaces
@@ -81,9 +83,8 @@ def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
     with processes_of(ComputeRecipe(device=loaded.device, parallel="ddp")) as processes:
         if not processes.first:
             logging.getLogger().setLevel(logging.WARNING)
-        else:
-            RunFolder(out).begin(loaded, command_line())
-        train_live(loaded, places, stop_when_asked(), processes)
+        with RunFolder(out).begun(loaded, command_line()) if processes.first else nullcontext():
+            train_live(loaded, places, stop_when_asked(), processes)
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:
@@ -94,7 +95,11 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
             console.print(live_toml(recipe), markup=False, end="")
             return
         if recipe is not None:
-            console.print(to_toml(load_recipe(recipe, small=small, changes=changes or ())), markup=False, end="")
+            if TEACHER in read_merged(recipe).table:
+                whole = to_toml(load_distillation(recipe, changes or ()))
+            else:
+                whole = to_toml(load_recipe(recipe, small=small, changes=changes or ()))
+            console.print(whole, markup=False, end="")
             return
         table = Table(box=SIMPLE, pad_edge=False, padding=(0, 0))
         for column in ("recipe", "data", "model", "updates", "clips an update", "starts from"):
@@ -103,23 +108,38 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
             table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
         for name in live_recipes():
             table.add_row(f"package:{name}", *_live_row(load_live_recipe(f"package:{name}")))
+        for name in packaged_distillations():
+            table.add_row(f"package:{name}", *_student_row(load_distillation(f"package:{name}")))
         # a name that is cut off cannot be given to `train`: a narrow terminal breaks lines instead
-        whole = console.measure(table, options=console.options.update(max_width=1000)).maximum
-        console.width = max(console.width, whole)
+        widest = console.measure(table, options=console.options.update(max_width=1000)).maximum
+        console.width = max(console.width, widest)
         console.print(table)
 
 
 def _row(recipe: Recipe) -> tuple[str, ...]:
     data, unet, model = recipe.data, recipe.unet, recipe.model
-    budget = f"{unet.budget.updates}" if unet.budget.updates is not None else f"{unet.budget.minutes:g} min"
     kind = data.kind if data.modality == "rgb" else f"{data.kind}, classes"
-    return kind, f"{model.base} ({model.family})", budget, f"{unet.clip_batch * unet.parts}", model.weights or "nothing"
+    clips = f"{unet.clip_batch * unet.parts}"
+    return kind, f"{model.base} ({model.family})", _length(unet.budget), clips, model.weights or "nothing"
 
 
 def _live_row(recipe: LiveRecipe) -> tuple[str, ...]:
-    budget = recipe.paint.budget
-    length = f"{budget.updates}" if budget.updates is not None else f"{budget.minutes:g} min"
-    return "live", "live", length, f"{recipe.paint.batch} views", "nothing"
+    return "live", "live", _length(recipe.paint.budget), f"{recipe.paint.batch} views", "nothing"
+
+
+def _student_row(recipe: DistillRecipe) -> tuple[str, ...]:
+    clips, steps = recipe.batches.clip_batch * recipe.batches.accumulate, recipe.student.steps
+    return (
+        recipe.data.kind,
+        f"student, {steps} steps",
+        _length(recipe.paired.budget),
+        f"{clips}",
+        recipe.teacher.weights,
+    )
+
+
+def _length(budget: Budget) -> str:
+    return f"{budget.updates}" if budget.updates is not None else f"{budget.minutes:g} min"
 
 
 def _in_processes(
@@ -148,20 +168,9 @@ def _run(
 
     stop = stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
-    opened = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
+    data = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
     folder = RunFolder(out, board)
-    inputs = RunInputs(
-        recipe=recipe,
-        clips=opened.clips,
-        valid=opened.valid,
-        batches=opened.batches,
-        parts=opened.parts,
-        latents=latents,
-        folder=folder,
-        stop=stop,
-        processes=processes,
-    )
+    inputs = RunInputs(recipe=recipe, data=data, latents=latents, folder=folder, stop=stop, processes=processes)
     trainer = Trainer(inputs)
-    if processes.first:
-        folder.begin(recipe, command_line())
-    trainer.run(stage)
+    with folder.begun(recipe, command_line()) if processes.first else nullcontext():
+        trainer.run(stage)

@@ -316,14 +316,14 @@ def cache_scenes(
     todo = [scene for scene in scenes if scene not in index.scenes]
     done, failed = len(scenes) - len(todo), 0
     for outcome in map_items(job, todo, workers=workers, ray_address=ray_address):
-        scene, entry = outcome.item, outcome.value
+        scene, entry, why = outcome.item, outcome.value, outcome.error and str(outcome.error)
         if entry is None:
             failed += 1
         else:
             done += 1
             index = msgspec.structs.replace(index, scenes=dict(sorted({**index.scenes, scene: entry}.items())))
             write_index(job.folder, index)
-        yield CacheProgress(scene=scene, entry=entry, error=outcome.error, done=done, failed=failed, total=len(scenes))
+        yield CacheProgress(scene=scene, entry=entry, error=why, done=done, failed=failed, total=len(scenes))
         left = len(scenes) - done - failed
         if free_bytes is None or not index.scenes or not left:
             continue

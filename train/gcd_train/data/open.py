@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import torch
+
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
 from gcd_train.data.batches import CachedBatches, SampleBatches
@@ -223,6 +225,7 @@ class _Opening:
             class_ids=class_ids,
             exact=recipe.exact,
             published=recipe.published,
+            device=_splat_device(recipe),
         )
         return ViewPairs(data, sampling, seed, options, repeats=repeats)
 
@@ -372,3 +375,12 @@ def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sa
         move_time=move_time,
         frames=chosen,
     )
+
+
+def _splat_device(recipe: DataRecipe) -> str:
+    """By its number, as a loader's worker does not know its process's GPU. Raises RecipeError if there is none."""
+    if recipe.splat_device == "cpu":
+        return "cpu"
+    if not torch.cuda.is_available():
+        raise RecipeError('data.splat_device is "cuda" but this machine has no CUDA device; use "cpu"')
+    return f"cuda:{torch.cuda.current_device()}"

@@ -325,11 +325,9 @@ class Account:
         key, useful, faults = outcome.item.key, False, dict[str, str]()
         try:
             found = outcome.unwrap()
-        except RunError:
-            if outcome.kind == RunError.__name__:
-                raise
-            faults = {key: outcome.error or "unknown"}
         except TrainError as error:
+            if type(error) is RunError:  # and not an item's own
+                raise
             faults = {key: str(error)}
         else:
             faults = {f"{key}, {name}": why for name, why in found.failed.items()}

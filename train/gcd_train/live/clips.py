@@ -92,7 +92,7 @@ def generate_live(
     missing = [seed for seed in seeds if not (folder / f"{seed:07d}-0.safetensors").exists()]
     one_thread_each()
     outcomes = map_items(partial(film_scene, folder, world, settings), missing, workers=workers)
-    failures = [outcome.error for outcome in outcomes if outcome.error is not None]
+    failures = [str(outcome.error) for outcome in outcomes if outcome.error is not None]
     return len(seeds) - len(failures), failures
 
 

@@ -11,6 +11,7 @@ Random numbers need no state of their own: they follow from the seed and the num
 
 import hashlib
 import logging
+import math
 import os
 import shutil
 import warnings
@@ -46,6 +47,9 @@ _FILE_BYTES = 2 << 30  # a file is put together in memory before it is written
 
 class DamagedStateError(RunError):
     """A state that cannot be used: cut short, changed, or not a state at all."""
+
+    def __init__(self, folder: Path, reason: str) -> None:
+        super().__init__(f"the state {folder} is damaged: {reason}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +197,7 @@ class States:
             yield
         except (OSError, CheckpointException) as error:
             raise RunError(
-                f"cannot write a state in {self._folder}: {error}; free some space, or choose --out"
+                f"cannot write a state in {self._folder}: {_told(error)}; free some space, or choose --out"
             ) from error
 
     def _write(self, unfinished: Path, mark: Mark) -> None:
@@ -234,9 +238,16 @@ class States:
             shutil.rmtree(path)
 
     def _choose(self) -> "tuple[Path, StateNote] | str | None":
-        """The newest good state; None without any, or in other processes; a message where all are damaged."""
+        """The newest good state; None without any, or in other processes; a message where none can be used."""
         if not self._processes.first:
             return None
+        try:
+            return self._newest_good()
+        except (RunError, OSError) as error:  # told to the others, too, which wait for it
+            return str(error)
+
+    def _newest_good(self) -> "tuple[Path, StateNote] | None":
+        """Damaged ones before it are put aside. Raises RunError where all are damaged, or the newest does not fit."""
         self._sweep()
         states = listed(self._folder)
         for path in states:
@@ -245,16 +256,11 @@ class States:
                 require_identity(path, note.identity, self._identity)
                 _metadata(path)
             except DamagedStateError as error:
-                last = path == states[-1]
-                _log.warning("%s; %s", error, "no state is left" if last else "going on from the state before it")
-                if last:
-                    return (
-                        f"all {len(states)} states of the stage are damaged, see above; delete {self._folder} to start "
-                        "the stage anew"
-                    )
+                _log.warning("%s", error)
+                if path == states[-1]:
+                    told = f"all {len(states)} states are damaged, see above; delete {self._folder} to start anew"
+                    raise RunError(told) from error
                 continue
-            except RunError as error:
-                return str(error)
             for damaged in states[: states.index(path)]:
                 shutil.rmtree(damaged.with_suffix(".damaged"), ignore_errors=True)
                 damaged.rename(damaged.with_suffix(".damaged"))
@@ -264,7 +270,7 @@ class States:
 
 def listed(folder: Path) -> list[Path]:
     """All states of a stage's folder `states`, newest first."""
-    found = [path for path in folder.glob("[0-9]*") if path.name.isdigit()]
+    found = [path for path in folder.glob("[0-9]*") if path.name.isdecimal()]
     return sorted(found, key=lambda path: int(path.name), reverse=True)
 
 
@@ -326,15 +332,16 @@ def checked_note(folder: Path, stage: str) -> StateNote:
     try:
         content, _, digest = read_small(folder / _NOTE).encode().rpartition(b"\n")
         if hashlib.sha256(content).hexdigest().encode() != digest:
-            raise _damaged(folder, f"{_NOTE} is not as it was written")
+            raise DamagedStateError(folder, f"{_NOTE} is not as it was written")
         note = decode_json(content, StateNote)
-        if set(note.files) != {path.name for path in folder.iterdir() if path.is_file()} - {_NOTE}:
-            raise _damaged(folder, "it has not the files that were written")
+        there = list(folder.iterdir())
+        if {path.name for path in there} != {*note.files, _NOTE} or not all(path.is_file() for path in there):
+            raise DamagedStateError(folder, "it has not the files that were written")
         for name, digest in note.files.items():
             if _digest(folder / name) != digest:
-                raise _damaged(folder, f"the bytes of {name} are not those that were written")
+                raise DamagedStateError(folder, f"the bytes of {name} are not those that were written")
     except (FileError, OSError) as error:
-        raise _damaged(folder, str(error)) from error
+        raise DamagedStateError(folder, str(error)) from error
     if (note.stage, note.format) != (stage, _FORMAT):
         raise RunError(f"{folder} is no state of the stage {stage!r} in format {_FORMAT}; delete it to start anew")
     return note
@@ -343,10 +350,14 @@ def checked_note(folder: Path, stage: str) -> StateNote:
 def _metadata(folder: Path) -> dict[str, TensorStorageMetadata]:
     """The tensors a state holds, by name. Raises DamagedStateError."""
     try:
-        found = HuggingFaceStorageReader(str(folder)).read_metadata().state_dict_metadata
+        found = cast(dict[str, Any], HuggingFaceStorageReader(str(folder)).read_metadata().state_dict_metadata)
+        for name, whole in found.items():
+            parts = sum(math.prod(part.sizes) for part in whole.chunks)
+            if parts != math.prod(whole.size) or any(first < 0 for part in whole.chunks for first in part.offsets):
+                raise ValueError(f"the parts of {name} do not make the whole")
     except Exception as error:  # a header that somebody made up fails in any way
-        raise _damaged(folder, f"its tensors cannot be listed ({error})") from error
-    return cast("dict[str, TensorStorageMetadata]", found)
+        raise DamagedStateError(folder, f"its tensors cannot be listed ({error})") from error
+    return found
 
 
 def _load(folder: Path, tensors: dict[str, Tensor], processes: Processes) -> None:
@@ -357,7 +368,13 @@ def _load(folder: Path, tensors: dict[str, Tensor], processes: Processes) -> Non
         try:
             load(cast(Any, tensors), storage_reader=reader, process_group=group, no_dist=not processes.several)
         except CheckpointException as error:
-            raise RunError(f"the state {folder} does not fit what is trained: {error}") from error
+            raise RunError(f"the state {folder} does not fit what is trained: {_told(error)}") from error
+
+
+def _told(error: OSError | CheckpointException) -> str:
+    """In one line: torch's message holds every process's whole traceback."""
+    failures = error.failures if isinstance(error, CheckpointException) else {0: (error, None)}
+    return "; ".join(f"process {rank}: {str(fault).strip()}" for rank, (fault, _) in failures.items())
 
 
 def _plain(name: str, value: Tensor) -> dict[str, Tensor]:
@@ -376,10 +393,6 @@ def _files_of(tensors: dict[str, Tensor]) -> dict[str, int]:
         total += value.numel() * value.element_size()
         found[name] = 1 + total // _FILE_BYTES
     return found
-
-
-def _damaged(folder: Path, reason: str) -> DamagedStateError:
-    return DamagedStateError(f"the state {folder} is damaged: {reason}")
 
 
 def _digest(path: Path) -> str:

@@ -1,6 +1,5 @@
 """A student of few steps without guidance, from a model that takes many."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,25 +16,18 @@ from gcd_model.errors import OptionError
 from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.weights.adapter import base_digest
 from gcd_train.data.latents import EncodedClips
-from gcd_train.data.open import RunData
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import LossRecipe, ModelRecipe, OptimiserRecipe, Recipe, UNetRecipe
 from gcd_train.recipe_data import AnyStageName, Budget
-from gcd_train.stop import StopSignal
 from gcd_train.training.distill_recipe import BatchRecipe, DistillRecipe, PairedRecipe, SampleLossRecipe, StudentRecipe
 from gcd_train.training.draws import Draws
 from gcd_train.training.export import Validation
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import energy_l1, frame_losses, gradient_l1, ssim
-from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import Batch, BatchSource, Denoiser, denoiser_of, draw_noise
 from gcd_train.training.optimiser import ParameterGroup
 from gcd_train.training.run import RunInputs, Trainer
-from gcd_train.training.setup import (
-    Precision,
-    digest_of,
-    loaded_base,
-)
+from gcd_train.training.setup import Precision, digest_of, loaded_base
 from gcd_train.training.trainable import keep_trained_alone
 
 
@@ -84,7 +76,7 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
 
     Raises RecipeError for what a training would refuse, too.
     """
-    batches, told = recipe.batches, recipe.batches.augmentation
+    batches, told, student = recipe.batches, recipe.batches.augmentation, recipe.student
     unet = UNetRecipe(
         budget=Budget(updates=1),
         optimiser=OptimiserRecipe(rate=1.0),
@@ -102,7 +94,9 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
             name=recipe.name,
             seed=recipe.seed,
             data=recipe.data,
-            model=model_recipe(recipe, teacher.family),
+            model=ModelRecipe(
+                weights=recipe.teacher.weights, family=teacher.family.name, train=student.train, lora=student.lora
+            ),
             compute=recipe.compute,
             log=recipe.log,
             latents=recipe.latents,
@@ -111,12 +105,6 @@ def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
         )
     except (ValueError, OptionError) as error:
         raise RecipeError(f"the recipe cannot be run: {error}") from error
-
-
-def model_recipe(recipe: DistillRecipe, family: Family) -> ModelRecipe:
-    """Where the student starts, and which part of it learns."""
-    student = recipe.student
-    return ModelRecipe(weights=recipe.teacher.weights, family=family.name, train=student.train, lora=student.lora)
 
 
 def _family(recipe: DistillRecipe, loaded: LoadedWeights) -> Family:
@@ -309,39 +297,15 @@ class PairedTask:
         return self._validation.measure(self._networks, picture)
 
 
-_log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DistillInputs:
-    """What a distillation works with. stop: asked between updates. latents: see `RunInputs`."""
-
-    recipe: DistillRecipe
-    teacher: Teacher
-    data: RunData
-    folder: RunFolder
-    stop: StopSignal
-    latents: Path | None = None
-
-
 class Distiller(Trainer):
     """A training whose denoiser learns through its own sampler, from where its teacher stands."""
 
     denoiser_stage: AnyStageName = "paired"
 
-    def __init__(self, inputs: DistillInputs) -> None:
-        """Raises RecipeError if the student cannot be built or exported, or its device is not there."""
-        self._paired, self._taken = inputs.recipe.paired, inputs.recipe.batches
-        shared = RunInputs(
-            recipe=as_training(inputs.recipe, inputs.teacher),
-            clips=inputs.data.clips,
-            valid=inputs.data.valid,
-            batches=inputs.data.batches,
-            folder=inputs.folder,
-            stop=inputs.stop,
-            latents=inputs.latents,
-        )
-        super().__init__(shared, student_config(inputs.teacher.config, inputs.recipe.student))
+    def __init__(self, inputs: RunInputs, recipe: DistillRecipe, teacher: Teacher) -> None:
+        """inputs: with the recipe that `as_training` makes. Raises RecipeError as `Trainer`, and `student_config`."""
+        self._paired, self._taken = recipe.paired, recipe.batches
+        super().__init__(inputs, student_config(teacher.config, recipe.student))
 
     def _identity(self, networks: Networks) -> str:
         model = self._recipe.model

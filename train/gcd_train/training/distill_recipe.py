@@ -19,10 +19,7 @@ from gcd_train.recipe_data import (
     NotNegative,
     Positive,
 )
-from gcd_train.recipe_files import checked_recipe, read_merged, require_known
-
-PACKAGED = Path(__file__).parents[1] / "recipes" / "distillation"
-"""Where the recipes that ship with the package lie."""
+from gcd_train.recipe_files import DISTILLATIONS, TEACHER, checked_recipe, read_merged, require_known
 
 
 class TeacherRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -135,7 +132,7 @@ class DistillRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 def packaged_distillations() -> list[str]:
     """Names of the recipes that ship."""
-    return sorted(file.stem for file in PACKAGED.glob("*.toml"))
+    return sorted(file.stem for file in DISTILLATIONS.glob("*.toml"))
 
 
 def load_distillation(source: str | Path, changes: Sequence[str] = ()) -> DistillRecipe:
@@ -146,9 +143,8 @@ def load_distillation(source: str | Path, changes: Sequence[str] = ()) -> Distil
     Raises:
         RecipeError: as `load_recipe`; for a recipe that trains instead of distilling, too.
     """
-    kind, _, name = str(source).partition(":")
-    read = read_merged(PACKAGED / f"{name}.toml" if kind == "package" else Path(source))
-    if "teacher" not in read.table:
+    read = read_merged(source)
+    if TEACHER not in read.table:
         shipped = ", ".join(f"package:{each}" for each in packaged_distillations())
         raise RecipeError(
             f"{read.place} names no [teacher], so it is no distillation; train it with `gcd-train train`, or take one "

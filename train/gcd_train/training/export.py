@@ -69,7 +69,7 @@ class Validation:
             name="validation",
             config=config,
             family=self._family,
-            move_time=config.frames - 1,
+            move_time=config.frames - 1,  # unread: each clip brings its own path
             sha256_12="0" * 12,
             precision="float32",
             device=str(device),

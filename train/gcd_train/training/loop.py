@@ -116,14 +116,16 @@ class _Window:
     seconds: float = 0.0
 
     def values(self) -> dict[str, float]:
-        """Mean of the loss, of its parts and of the gradient's norm, and frames per second."""
+        """Mean of the gradient's norm, frames per second, and means of the loss and its parts, if any batch counted."""
+        norm, frames = float(torch.stack(self.norms).float().mean()), sum(loss.frames for loss in self.losses)
+        values = {"gradient_norm": norm, "frames_per_s": frames / max(self.seconds, 1e-9)}
+        if not self.losses:
+            return values
         names = {name: None for loss in self.losses for name in loss.parts}
         parts = {name: [loss.parts[name] for loss in self.losses if name in loss.parts] for name in names}
         means = {name: float(torch.stack(values).float().mean()) for name, values in parts.items()}
         total = float(torch.stack([loss.total for loss in self.losses]).float().mean())
-        frames = sum(loss.frames for loss in self.losses)
-        norm = float(torch.stack(self.norms).float().mean())
-        return {"loss": total, **means, "gradient_norm": norm, "frames_per_s": frames / max(self.seconds, 1e-9)}
+        return {"loss": total, **means, **values}
 
 
 class Loop:
@@ -211,7 +213,8 @@ class Loop:
                 (loss.total * (share * engine.share_of_loss(parts))).backward()
             kept = {name: value.detach() for name, value in loss.parts.items()}
             self._guard.saw(progress.updates, "loss", loss.total, loss.ids)
-            self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames, loss.ids))
+            if share:  # and not one that only keeps the others company
+                self._window.losses.append(StepLoss(loss.total.detach(), kept, loss.frames, loss.ids))
         norm = self._clipped()
         self._window.norms.append(norm)
         self._guard.saw(progress.updates, "gradient", norm)
@@ -237,10 +240,10 @@ class Loop:
     def _speak(self) -> None:
         """One line of the log and of the metrics file. Raises TrainError if a loss or gradient was no number."""
         self._guard.check()
-        if not self._window.losses:
+        if not self._window.norms:
             return
         values = self._window.values()
-        values["peak_memory_gb"] = peak_memory_gb(self._window.losses[-1].total.device)
+        values["peak_memory_gb"] = peak_memory_gb(self._window.norms[-1].device)
         self._window = _Window()
         values = self._processes.averaged(values)
         values["frames_per_s"] *= self._processes.count

@@ -1,11 +1,12 @@
 """The folder of a run (recipe, metrics, samples), TensorBoard, and the guard against losses that are no number."""
 
+import fcntl
 import json
 import logging
 import math
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -72,11 +73,37 @@ class RunFolder:
     path: Path
     board: TensorBoard | None = None
 
-    def begin(self, recipe: Struct, command: str) -> None:
-        """Keep the recipe and one more command line, and log what differs from the last recipe. Raises RunError."""
-        path, now = self.path / "recipe.toml", to_toml(recipe)
+    @contextmanager
+    def begun(self, recipe: Struct, command: str) -> Generator[None]:
+        """The folder for this run alone, until the block is left.
+
+        Keeps the recipe and one more command line, and logs what differs from the last recipe. Raises RunError.
+        """
+        for path in (self.path / name for name in (".lock", "recipe.toml", "commands.txt", "metrics.jsonl")):
+            if path.is_symlink() or (
+                path.exists() and not path.is_file()
+            ):  # somebody else's folder: it leads elsewhere
+                raise RunError(f"{path} is no plain file; delete it, or choose another --out")
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            lock = (self.path / ".lock").open("a")
+        except OSError as error:
+            raise RunError(f"cannot write in {self.path}: {error.strerror}; choose another --out") from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunError(
+                    f"another run is at work in {self.path}; wait for it, or choose another --out"
+                ) from error
+            except OSError as error:
+                _log.warning("%s is on a file system without locks; start no second run in it (%s)", self.path, error)
+            self._keep(recipe, command)
+            yield
+
+    def _keep(self, recipe: Struct, command: str) -> None:
+        path, now = self.path / "recipe.toml", to_toml(recipe)
+        try:
             was = decode_toml(read_small(path)) if path.exists() else None
             path.write_text(now)
             with (self.path / "commands.txt").open("a") as file:

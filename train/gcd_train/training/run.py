@@ -16,6 +16,7 @@ from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
 from gcd_train.data.latents import EncodedClips
 from gcd_train.data.latents_writer import Encodings, autoencoder_digest
+from gcd_train.data.open import RunData
 from gcd_train.data.sample import ClipSource
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
@@ -26,7 +27,7 @@ from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.export import ExportJob, Validation, export
 from gcd_train.training.loop import Loop, LoopOptions, Task
 from gcd_train.training.monitor import RunFolder
-from gcd_train.training.objective import BatchMaker, BatchSource, UNetTask
+from gcd_train.training.objective import BatchSource, UNetTask
 from gcd_train.training.setup import (
     Precision,
     carried_leftovers,
@@ -57,20 +58,16 @@ class StageTable(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunInputs:
-    """What a run works with. clips: to learn from. valid: held out, to measure on. stop: asked between updates.
+    """What a run works with. stop: asked between updates.
 
-    batches: makes the U-Net's batches where they come neither from encoded clips nor from `clips`.
-    parts: see `RunData`. latents: a folder for encoded clips that several runs share; None for the run's own.
+    latents: a folder for encoded clips that several runs share; None for the run's own.
     processes: this one among those of the run.
     """
 
     recipe: Recipe
-    clips: ClipSource
-    valid: ClipSource
+    data: RunData
     folder: RunFolder
     stop: StopSignal
-    batches: BatchMaker | None = None
-    parts: tuple[ClipSource, ...] = ()
     latents: Path | None = None
     processes: Processes = ALONE
 
@@ -97,8 +94,8 @@ class Trainer:
             config=self._config,
             family=self._family,
             precision=self._precision,
-            sets=inputs.parts or (inputs.clips,),
-            as_videos=bool(inputs.parts),
+            sets=inputs.data.parts or (inputs.data.clips,),
+            as_videos=bool(inputs.data.parts),
             folder=inputs.folder.stage("latents"),
             shared=inputs.latents,
             stop=inputs.stop,
@@ -132,12 +129,12 @@ class Trainer:
 
     def _trained_config(self) -> ModelConfig:
         """The networks' config, by the recipe. Raises DataError for clips that do not fit it."""
-        recipe, inputs = self._recipe, self._inputs
+        recipe, data = self._recipe, self._inputs.data
         config = model_config(recipe.model)
-        if self._family.output == "semantic" and inputs.valid.classes:
-            config = msgspec.structs.replace(config, semantic_classes=tuple(inputs.valid.classes))
+        if self._family.output == "semantic" and data.valid.classes:
+            config = msgspec.structs.replace(config, semantic_classes=tuple(data.valid.classes))
         config = sampled_as_trained(config, recipe.unet)
-        for clips in (inputs.clips, inputs.valid):
+        for clips in (data.clips, data.valid):
             require_fit(clips, config, recipe.unet.fps)
         return config
 
@@ -188,7 +185,8 @@ class Trainer:
 
     def _train_vae(self, recipe: VAERecipe) -> None:
         networks = start_networks(self._recipe.model, self._config, self._recipe.seed)
-        task = VAETask(networks, self._inputs.clips, self._inputs.valid, recipe, self._precision, self._recipe.seed)
+        data = self._inputs.data
+        task = VAETask(networks, data.clips, data.valid, recipe, self._precision, self._recipe.seed)
         self._loop(task, "vae", recipe, self._vae_identity())
 
     def _train_denoiser(self) -> None:
@@ -226,15 +224,16 @@ class Trainer:
         export(networks, self._folder, job, self._validation())
 
     def _validation(self) -> Validation:
-        return Validation(self._inputs.valid, self._family, count=self._recipe.log.valid_clips)
+        return Validation(self._inputs.data.valid, self._family, count=self._recipe.log.valid_clips)
 
     def _batches(self, networks: Networks, clips: EncodedClips | None) -> BatchSource:
         recipe = self._recipe.unet
         if clips is not None:
             return EncodedBatches(clips, self._config, recipe, self._precision)
-        if self._inputs.batches is not None:
-            return self._inputs.batches(networks, self._precision)
-        return PixelBatches(self._inputs.clips, networks, recipe, self._precision, self._family)
+        data = self._inputs.data
+        if data.batches is not None:
+            return data.batches(networks, self._precision)
+        return PixelBatches(data.clips, networks, recipe, self._precision, self._family)
 
     def _weights(self, clips: EncodedClips | None) -> torch.Tensor | None:
         """Of latent channels, by what the decoder makes of them."""
