@@ -243,8 +243,11 @@ def read_map(client: Path, sender: Sender, message: ViewMessage, folder: Path) -
     return lines_of(process, 69)
 
 
-@pytest.mark.parametrize("message", [class_map(5), visibility(5)], ids=["cls", "vis"])
-def test_maps_are_written_as_grey(client: Path, sender: Sender, tmp_path: Path, message: ViewMessage) -> None:
+@pytest.mark.parametrize("made", [class_map, visibility], ids=["cls", "vis"])  # made when sent: old ones are stale
+def test_maps_are_written_as_grey(
+    client: Path, sender: Sender, tmp_path: Path, made: Callable[[int], ViewMessage]
+) -> None:
+    message = made(5)
     told = fields_of(read_map(client, sender, message, tmp_path)[0])
     assert (told["shape"], told["encoding"]) == ("2x4x6x1", "class8")
     written = (tmp_path / f"top_{told['kind']}_000005_01.pgm").read_bytes()

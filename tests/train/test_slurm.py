@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -40,6 +39,9 @@ SCRIPT = Path(__file__).parents[2] / "launch" / "slurm.sh"
 def test_training_goes_to_torchrun_and_all_else_to_ray(tmp_path: Path, nodes: int, words: str, said: list[str]) -> None:
     for name in ("srun", "ray", "gcd-train"):
         (tmp_path / name).write_text(f'#!/bin/sh\necho "{name} $*" >> "$LOG"\n')
+    with (tmp_path / "gcd-train").open("r+") as script:  # what was started beside it may be slower
+        script.write('#!/bin/sh\nuntil [ "$(grep -vc "^ray status" "$LOG")" -ge "$BEFORE" ]; do sleep 0.05; done\n')
+        script.write('echo "gcd-train $*" >> "$LOG"\n')
     (tmp_path / "scontrol").write_text("#!/bin/sh\nprintf 'n1\\nn2\\nn3\\n'\n")
     for path in tmp_path.iterdir():
         path.chmod(0o755)
@@ -49,11 +51,14 @@ def test_training_goes_to_torchrun_and_all_else_to_ray(tmp_path: Path, nodes: in
         "SLURM_JOB_ID": "41",
         "SLURM_SUBMIT_DIR": str(tmp_path),
     }
-    told = {**os.environ, **slurm, "LOG": str(tmp_path / "log"), "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    told = {
+        **os.environ,
+        **slurm,
+        "LOG": str(tmp_path / "log"),
+        "BEFORE": str(len(said) - 1),
+        "PATH": f"{tmp_path}:{os.environ['PATH']}",
+    }
     subprocess.run(["bash", str(SCRIPT), *words.split()], env=told, check=True)
-    lines, deadline = list[str](), time.monotonic() + 20  # what runs beside the script may end after it
-    while len(lines) < len(said) and time.monotonic() < deadline:
-        lines = [line for line in (tmp_path / "log").read_text().splitlines() if not line.startswith("ray status")]
-        time.sleep(0.05)
+    lines = [line for line in (tmp_path / "log").read_text().splitlines() if not line.startswith("ray status")]
     assert len(lines) == len(said)
     assert all(any(line.startswith(each) for line in lines) for each in said), lines
