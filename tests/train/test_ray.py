@@ -15,7 +15,7 @@ import pytest
 from mapped_work import mark_and_square, square
 
 from gcd_train import parallel
-from gcd_train.errors import RunError
+from gcd_train.errors import DataError, RunError
 from gcd_train.parallel import map_items
 
 
@@ -87,8 +87,8 @@ class TestWithoutACluster:
         outcomes = {outcome.item: outcome for outcome in map_items(square, range(8), ray_address="auto", retries=3)}
         assert sorted(outcomes) == list(range(8))
         assert [outcomes[n].value for n in (0, 3, 6, 7)] == [0, 9, 36, 49]
-        assert outcomes[1].kind == "DataError"
-        assert "lost again and again (The node died.)" in (outcomes[5].error or "")
+        assert isinstance(outcomes[1].error, DataError)
+        assert "lost again and again (The node died.)" in str(outcomes[5].error)
         assert (fake.most_out, fake.stopped) == (4, True)
         assert fake.task_options == {"num_cpus": 1, "num_gpus": 0.0, "max_retries": 3}
 
