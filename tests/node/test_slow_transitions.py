@@ -117,6 +117,7 @@ def test_a_thread_left_behind_keeps_the_node_from_starting_only_until_it_ends(tm
     model = FakeSynthesizer(traits(), deaf)
     with Rig(tmp_path, lambda _: FakeSource(10_000), model, config=LOCKSTEP, more=more) as rig:
         assert deaf.begun.wait(30)
+        rig.await_state("active")
         assert rig.ask("deactivate").code is Code.ACCEPTED
         rig.await_state("inactive")
         assert rig.node.left_behind
