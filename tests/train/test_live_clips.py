@@ -18,6 +18,7 @@ from gcd_train.live.clips import (
     encode_depth,
     generate_live,
     read_clip,
+    tensor_of,
     visibility,
 )
 from gcd_train.live.draws import live_scene
@@ -26,11 +27,11 @@ from gcd_train.scenes.renderer import Rendering
 
 @given(st.floats(0.03, 900.0))
 def test_depth_survives_its_code_to_a_fiftieth_of_a_per_cent(metres: float) -> None:
-    assert abs(decode_depth(encode_depth(np.array([metres])))[0] / metres - 1) < 2e-4
+    assert abs(decode_depth(tensor_of(encode_depth(np.array([metres]))))[0] / metres - 1) < 2e-4
 
 
 def test_no_depth_is_the_sky() -> None:
-    assert decode_depth(encode_depth(np.array([0.0])))[0] == SKY_M
+    assert decode_depth(tensor_of(encode_depth(np.array([0.0]))))[0] == SKY_M
 
 
 def rendering(pose: np.ndarray) -> Rendering:

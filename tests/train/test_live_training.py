@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,14 @@ from gcd_model.live.depth_net import (
     bin_width,
     depth_inputs,
     first_bin,
+    pixel_rays,
     plane_depth,
     read_depth,
 )
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError, Interrupted, RecipeError
-from gcd_train.live.batches import FrameBatches, lens_rays, pictures_of, training_paths
+from gcd_train.live.batches import FrameBatches, pictures_of
 from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import read_clip
 from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
@@ -38,8 +40,10 @@ from gcd_train.live.measure_figures import SpreadHistogram
 from gcd_train.live.measure_methods import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage, load_live_recipe
+from gcd_train.live.store import Shelf, TrainingClips, training_paths
 from gcd_train.live.training import LivePlaces, train_live
 from gcd_train.live.views import (
+    InputShelf,
     ViewBatches,
     Views,
     carried_through,
@@ -62,6 +66,8 @@ TINY = LiveConfig(
     paint=PaintConfig(widths=(8, 16, 16), fine_width=8, half_width=8, embedding_width=16),
     memory=2000,
 )
+
+CPU = torch.device("cpu")
 
 
 def stage(updates: int) -> LiveStage:
@@ -100,6 +106,12 @@ def path(places: LivePlaces) -> Path:
     path = training_paths(places.data)[0]
     make_inputs(places.out, [path], None, TINY, 0)
     return path
+
+
+def view_batches(places: LivePlaces, size: int, carried: float) -> ViewBatches:
+    """Of the clips of which it is worked out what is seen."""
+    clips = TrainingClips(places.data, CPU)
+    return ViewBatches(clips, InputShelf(clips, [places.out]), TINY, size, 0, carried)
 
 
 class StopAfter(threading.Event):
@@ -201,11 +213,40 @@ def test_an_unknown_key_is_refused(tmp_path: Path) -> None:
 
 
 def test_batches_follow_from_the_update_alone(places: LivePlaces) -> None:
-    paths = training_paths(places.data)
-    one, two = (FrameBatches(paths, 3, 7).batch(11) for _ in range(2))
+    clips = TrainingClips(places.data, CPU)
+    one, two = (FrameBatches(clips, 3, 7).batch(11) for _ in range(2))
     assert torch.equal(one[0].video, two[0].video)
     assert torch.equal(one[1], two[1])
-    assert not torch.equal(FrameBatches(paths, 3, 7).batch(12)[0].video, one[0].video)
+    assert not torch.equal(FrameBatches(clips, 3, 7).batch(12)[0].video, one[0].video)
+
+
+def test_clips_that_are_kept_in_memory_are_those_on_disk_until_it_is_full(places: LivePlaces) -> None:
+    names, files, frames = ["source.rgb", "source.depth"], np.array([1, 0, 1]), np.array([3, 3, 13])
+
+    def read(path: Path, frames: slice, names: Sequence[str]) -> dict[str, Any]:
+        return read_clip(path, frames, names).arrays
+
+    sizes: list[int] = []
+
+    def room(size: int) -> int:
+        sizes.append(size)
+        return 2
+
+    kept, disk = (Shelf(read, names, CPU, each) for each in (room, None))
+    paths = training_paths(places.data)
+    assert [kept.add(path) for path in paths] == [True, True, False]
+    assert all(disk.add(path) for path in paths)
+    assert sizes == [14 * HEIGHT * WIDTH * (3 + 2)]
+    for name, array in disk.take(files, frames, names).items():
+        assert torch.equal(array, kept.take(files, frames, names)[name])
+
+
+def test_clips_that_are_added_to_the_folder_are_taken_in(places: LivePlaces) -> None:
+    clips = TrainingClips(places.data, CPU)
+    write_clip(places.data, 1, "drop")
+    clips.grow()
+    assert [f"{path.parent.name}/{path.stem}" for path in clips.paths][-1] == "drop/0000001-0"
+    assert len(clips) == len({*clips.paths}) == 4
 
 
 def test_true_logits_are_read_as_the_true_depth() -> None:
@@ -235,8 +276,9 @@ def test_where_the_gate_is_open_depth_is_that_of_the_declared_ground() -> None:
     net.head.out.bias.data.zero_()
     net.head.out.bias.data[-2] = 1e6
     lens = Intrinsics.from_hfov(85.0, TINY.width, TINY.height)
-    ground = plane_depth(lens, torch.tensor([0.0, -0.985, -0.174]), 1.5)
-    inputs = depth_inputs(torch.zeros(1, 3, TINY.height, TINY.width), lens_rays(lens)[None], ground[None])
+    rays = pixel_rays(lens)
+    ground = plane_depth(rays, torch.tensor([0.0, -0.985, -0.174]), 1.5)
+    inputs = depth_inputs(torch.zeros(1, 3, TINY.height, TINY.width), rays[None], ground[None])
     with torch.no_grad():
         net.head.out.weight.zero_()
         metres = read_depth(net(inputs), TINY.depth).metres[0]
@@ -248,8 +290,9 @@ def test_where_the_gate_is_open_depth_is_that_of_the_declared_ground() -> None:
 def test_depth_learns_one_picture_by_heart(places: LivePlaces) -> None:
     torch.manual_seed(0)
     net = DepthNet(TINY.depth, len(TINY.classes))
-    paths = training_paths(places.data)[:1]
-    task = DepthTask(net, TINY, paths, paths, msgspec.structs.replace(stage(1), small_share=0.0), 0)
+    clips = TrainingClips(places.data, CPU)
+    paths = clips.paths[:1]
+    task = DepthTask(net, TINY, clips, paths, msgspec.structs.replace(stage(1), small_share=0.0), 0)
     before = measure_depth(net, TINY, paths)["mean_relative"]
     optimiser = torch.optim.Adam(net.parameters(), 1e-2)
     for update in range(60):
@@ -274,17 +317,17 @@ def test_edges_match_within_a_pixel() -> None:
 def test_inputs_come_back_as_they_were_splatted(places: LivePlaces, path: Path) -> None:
     clip = read_clip(path)
     splats = splats_of(clip, exact_geometry(pictures_of(clip, "source")), TINY)
-    back = read_inputs(places.out / path.parent.name / path.name, slice(0, 14), len(TINY.classes))
-    assert (back["coverage"][5] - splats[5].coverage).abs().mean() < 0.03
+    back = views_of(clip, read_inputs(places.out / path.parent.name / path.name, slice(0, 14)), ground=True).seen
+    assert (back.coverage[5] - splats[5].coverage).abs().mean() < 0.03
     seen = splats[5].coverage > 0.5
     assert seen.float().mean() > 0.5
     # the stored one is by depth that is off by a few per cent, so colours agree in the middle of tiles alone
-    assert (back["colour"][5] - splats[5].colour).abs().mean(0)[seen].median() < 0.05
+    assert (back.colour[5] - splats[5].colour).abs().mean(0)[seen].median() < 0.05
 
 
 def test_an_untrained_paint_network_shows_the_splat(places: LivePlaces, path: Path) -> None:
     net = PaintNet(TINY.paint, len(TINY.classes)).eval()
-    (view, *_) = HeldOutViews([path], places.out, TINY).on(torch.device("cpu"))
+    (view, *_) = HeldOutViews([path], places.out).on(torch.device("cpu"))
     with torch.no_grad():
         made = net.first_step(view.seen, filled(view.seen), TINY.sigma_max)
     assert torch.equal(made.mean, filled(view.seen))
@@ -294,8 +337,7 @@ def test_an_untrained_paint_network_shows_the_splat(places: LivePlaces, path: Pa
 def test_what_was_painted_is_carried_to_where_the_camera_sees_it(places: LivePlaces, path: Path) -> None:
     inputs = places.out / path.parent.name / path.name
     before, now = (
-        views_of(read_clip(path, slice(t, t + 1)), read_inputs(inputs, slice(t, t + 1), 17), ground=True)
-        for t in (4, 5)
+        views_of(read_clip(path, slice(t, t + 1)), read_inputs(inputs, slice(t, t + 1)), ground=True) for t in (4, 5)
     )
     nothing = replace(before.seen, coverage=torch.zeros_like(before.seen.coverage))
     before = replace(before, seen=nothing)
@@ -315,7 +357,7 @@ def test_what_was_painted_is_carried_to_where_the_camera_sees_it(places: LivePla
 
 
 def test_painted_pixels_of_several_frames_in_a_row_drift_and_no_others(places: LivePlaces, path: Path) -> None:
-    batches = ViewBatches([path], [places.out], TINY, 3, 0, carried=0.7)
+    batches = view_batches(places, 3, carried=0.7)
     net = PaintNet(TINY.paint, len(TINY.classes)).eval()
     runs: set[int] = set()
     drifted = 0
@@ -341,8 +383,8 @@ def test_painted_pixels_of_several_frames_in_a_row_drift_and_no_others(places: L
 
 
 def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces, path: Path) -> None:
-    batches = ViewBatches([path], [places.out], TINY, 2, 0)
-    views = HeldOutViews([path], places.out, TINY)
+    batches = view_batches(places, 2, carried=0.35)
+    views = HeldOutViews([path], places.out)
     net = PaintNet(TINY.paint, len(TINY.classes))
     task = PaintTask(net, TINY, [batches], [path], views, 0.0)
     _, now, _ = batches.batch(0)
@@ -356,8 +398,8 @@ def test_paint_losses_are_lowest_at_the_truth(places: LivePlaces, path: Path) ->
 
 def test_the_second_half_of_the_training_carries_and_denoises(places: LivePlaces, path: Path) -> None:
     net = PaintNet(TINY.paint, len(TINY.classes))
-    batches = ViewBatches([path], [places.out], TINY, 2, 0, carried=1.0)
-    task = PaintTask(net, TINY, [batches], [path], HeldOutViews([path], places.out, TINY), 0.0)
+    batches = view_batches(places, 2, carried=1.0)
+    task = PaintTask(net, TINY, [batches], [path], HeldOutViews([path], places.out), 0.0)
     early, late = ([task.step_loss(Progress(u, share)).parts for u in range(8)] for share in (0.0, 0.9))
     assert all("denoising" not in parts for parts in early)
     denoised = [parts["denoising"] for parts in late if "denoising" in parts]
@@ -372,7 +414,7 @@ def test_calibration_makes_the_interval_hold_and_takes_back_what_rare_classes_we
     networks = LiveNetworks(TINY).eval()
     paths = [*places.data.glob("*/*.safetensors")][:1]
     make_inputs(places.out, paths, None, TINY, 0)
-    views = HeldOutViews(paths, places.out, TINY)
+    views = HeldOutViews(paths, places.out)
     assert networks.depth.head.out.bias is not None
     biases = networks.depth.head.out.bias.requires_grad_(False)
     first = 2 * TINY.depth.bins - 1

@@ -168,14 +168,17 @@ def pixel_rays(lens: Intrinsics, device: torch.device | None = None) -> Tensor:
     return torch.stack(torch.meshgrid(x, y, indexing="xy"))
 
 
-def plane_depth(lens: Intrinsics, up: Tensor, height_m: float) -> Tensor:
-    """Depth of a plane below the camera: float32 [H, W], 0 where no ray meets it.
+def plane_depth(rays: Tensor, up: Tensor, height_m: Tensor | float) -> Tensor:
+    """Depth of a plane below each camera: float32 [..., H, W], 0 where no ray meets it.
 
-    up: [3], the plane's normal in camera axes, towards the camera. height_m: of the camera over the plane.
+    rays: [..., 2, H, W], see `pixel_rays`. up: [..., 3], the plane's normal in camera axes, towards the camera.
+    height_m: [...], of the camera over the plane.
     """
-    x, y = pixel_rays(lens)
-    falling = -(up[0] * x + up[1] * y + up[2])  # metres down for each metre ahead
-    return torch.where(falling > height_m / SKY_M, height_m / falling.clamp(min=1e-6), 0.0).float()
+    x, y = rays.unbind(dim=-3)
+    across, down, ahead = up[..., None, None].unbind(dim=-3)
+    height = torch.as_tensor(height_m, dtype=rays.dtype, device=rays.device)[..., None, None]
+    falling = -(across * x + down * y + ahead)  # metres down for each metre ahead
+    return torch.where(falling > height / SKY_M, height / falling.clamp(min=1e-6), 0.0).float()
 
 
 def first_bin(config: DepthConfig) -> float:
@@ -262,35 +265,47 @@ def sweep_channels(config: DepthConfig) -> int:
 
 
 def sweep_costs(picture: Tensor, lens: Intrinsics, reference: Reference | None, config: DepthConfig) -> Tensor:
-    """Differences of colour by depth: [bins + 1, H/2, W/2]; all zero without a reference.
-
-    picture: [3, H, W] in [-1, 1].
-    """
-    height, width = lens.height // SWEEP_SCALE, lens.width // SWEEP_SCALE
+    """`plane_sweep` of one picture [3, H, W], with an earlier one or none: [bins + 1, H/2, W/2]."""
     if reference is None:
-        return picture.new_zeros(sweep_channels(config), height, width)
-    here, there = (F.avg_pool2d(each, SWEEP_SCALE) for each in (picture, reference.picture.to(picture)))
-    move = reference.reference_from_camera.to(picture.device)
-    turn, step = move[:3, :3].float(), move[:3, 3].float()
-    x = ((torch.arange(width, device=picture.device) + 0.5) * SWEEP_SCALE - lens.cx) / lens.fx
-    y = ((torch.arange(height, device=picture.device) + 0.5) * SWEEP_SCALE - lens.cy) / lens.fy
-    u, v = torch.meshgrid(x.float(), y.float(), indexing="xy")
-    turned = turn @ torch.stack([u, v, torch.ones_like(u)]).flatten(1)  # [3, h*w], of points 1 m ahead
-    points = turned + step[:, None] * _inverse_depths(config).to(picture.device)[:, None, None]  # [bins, 3, h*w]
-    ahead = points[:, 2] > _BEHIND_M
-    z = points[:, 2].clamp(min=_BEHIND_M)
+        return picture.new_zeros(sweep_channels(config), lens.height // SWEEP_SCALE, lens.width // SWEEP_SCALE)
+    earlier = reference.picture.to(picture)
+    lenses = torch.tensor([[lens.fx, lens.fy, lens.cx, lens.cy]], device=picture.device)
+    return plane_sweep(picture[None], lenses, earlier[None], reference.reference_from_camera[None], config)[0]
+
+
+def plane_sweep(
+    pictures: Tensor, lenses: Tensor, earlier: Tensor, earlier_from_camera: Tensor, config: DepthConfig
+) -> Tensor:
+    """How much the colours of N pictures and of an earlier one of each differ, by depth: [N, bins + 1, H/2, W/2].
+
+    pictures, earlier: [N, 3, H, W] in [-1, 1]. lenses: float32 [N, 4], fx, fy, cx, cy in pixels.
+    earlier_from_camera: [N, 4, 4], metres. The last channel is 1: there is an earlier picture.
+    """
+    here, there = (F.avg_pool2d(each, SWEEP_SCALE) for each in (pictures, earlier))
+    n, _, height, width = here.shape
+    moves = earlier_from_camera.to(here.device)
+    turn, step = moves[:, :3, :3].float(), moves[:, :3, 3].float()
+    fx, fy, cx, cy = lenses[:, :, None].unbind(dim=1)  # [N, 1] each
+    x = ((torch.arange(width, device=here.device) + 0.5) * SWEEP_SCALE - cx) / fx
+    y = ((torch.arange(height, device=here.device) + 0.5) * SWEEP_SCALE - cy) / fy
+    u, v = x[:, None].expand(n, height, width), y[:, :, None].expand(n, height, width)
+    turned = turn @ torch.stack([u, v, torch.ones_like(u)], dim=1).flatten(2)  # [N, 3, h*w], of points 1 m ahead
+    shifts = step[:, None] * _inverse_depths(config).to(here.device)[:, None]  # [N, bins, 3]
+    points_x, points_y, points_z = (turned[:, None] + shifts[..., None]).unbind(dim=2)  # [N, bins, h*w] each
+    ahead = points_z > _BEHIND_M
+    z = points_z.clamp(min=_BEHIND_M)
     place = torch.stack(
         [
-            (points[:, 0] / z * lens.fx + lens.cx) * (2 / lens.width) - 1,
-            (points[:, 1] / z * lens.fy + lens.cy) * (2 / lens.height) - 1,
+            (points_x / z * fx[:, None] + cx[:, None]) / (width * SWEEP_SCALE / 2) - 1,
+            (points_y / z * fy[:, None] + cy[:, None]) / (height * SWEEP_SCALE / 2) - 1,
         ],
         dim=-1,
-    )  # [bins, h*w, 2]
+    )  # [N, bins, h*w, 2]
     inside = ahead & (place.abs() <= 1).all(dim=-1)
-    looked_up = F.grid_sample(there[None], place[None], mode="bilinear", padding_mode="border", align_corners=False)
-    difference = (looked_up[0] - here.flatten(1)[:, None]).abs().mean(dim=0) * _CONTRAST  # [bins, h*w]
+    looked_up = F.grid_sample(there, place, mode="bilinear", padding_mode="border", align_corners=False)
+    difference = (looked_up - here.flatten(2)[:, :, None]).abs().mean(dim=1) * _CONTRAST  # [N, bins, h*w]
     costs = torch.where(inside, difference, _UNSEEN)
-    return torch.cat([costs, torch.ones_like(costs[:1])]).view(-1, height, width)
+    return torch.cat([costs, torch.ones_like(costs[:, :1])], dim=1).view(n, -1, height, width)
 
 
 def _inverse_depths(config: DepthConfig) -> Tensor:

@@ -122,9 +122,11 @@ class Eyes:
         Args: see `step`. reference: an earlier frame, see `sweep_costs`.
         """
         picture = self._checked(frame, lens)
-        ground = torch.zeros(lens.height, lens.width) if floor is None else plane_depth(lens, floor.up, floor.height_m)
         rays = pixel_rays(lens, self._device)
-        inputs = depth_inputs(picture[None], rays[None], ground[None].to(self._device))
+        ground = torch.zeros_like(rays[0])
+        if floor is not None:
+            ground = plane_depth(rays, floor.up.to(self._device), floor.height_m)
+        inputs = depth_inputs(picture[None], rays[None], ground[None])
         output = self._networks.depth(inputs, sweep_costs(picture, lens, reference, self._config.depth)[None])
         reading = read_depth(output, self._config.depth)
         labels = likeliest(output.classes[0])

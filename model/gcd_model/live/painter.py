@@ -70,12 +70,12 @@ class Painter:
         carried: Splat | None = None
         if index < len(self._painted) and len(self._painted[index]):
             carried = splat(self._painted[index], target, lens, len(self._config.classes), 0.0)
-        ground = torch.zeros(lens.height, lens.width)
-        if frame.seen.floor is not None:
-            ground = _floor_of(frame.seen.floor, invert_rigid(target) @ source, lens)
         rays = pixel_rays(lens, self._device)
+        ground = torch.zeros_like(rays[0])
+        if frame.seen.floor is not None:
+            ground = _floor_of(frame.seen.floor, invert_rigid(target) @ source, rays)
         camera = camera_features((invert_rigid(source) @ target)[None])[0]
-        return seen_of(frame.splats[index], carried, rays, ground.to(self._device), camera.to(self._device))
+        return seen_of(frame.splats[index], carried, rays, ground, camera.to(self._device))
 
     def _view(self, index: int, seen: Seen, target: Tensor, lens: Intrinsics) -> ViewFrame:
         """Paint, read off, and remember what was painted."""
@@ -141,12 +141,12 @@ class Painter:
         self._painted[index:] = [surfels] if index >= len(self._painted) else [surfels, *self._painted[index + 1 :]]
 
 
-def _floor_of(floor: Floor, target_from_source: Tensor, lens: Intrinsics) -> Tensor:
-    """Depth of the floor in a target camera: [H, W]; 0 where it is below the floor, too."""
+def _floor_of(floor: Floor, target_from_source: Tensor, rays: Tensor) -> Tensor:
+    """Depth of the floor in a target camera: [H, W]; 0 where it is below the floor, too. rays: see `pixel_rays`."""
     turn, move = target_from_source[:3, :3].float(), target_from_source[:3, 3].float()
     up = turn @ floor.up
     height = floor.height_m - float(up @ move)
-    return plane_depth(lens, up, height) if height > 0 else torch.zeros(lens.height, lens.width)
+    return plane_depth(rays, up.to(rays.device), height) if height > 0 else torch.zeros_like(rays[0])
 
 
 # --- the three steps at once, frame by frame -------------------------------------------------------------------------

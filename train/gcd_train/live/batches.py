@@ -1,31 +1,34 @@
-"""What the live trainings learn from: single frames for depth, short runs of frames for paint, all drawn by number."""
+"""What the live trainings learn from: single frames for depth, short runs of frames for paint, all drawn by number.
 
-from collections.abc import Callable, Iterator, Sequence
+Which frames are drawn, and how they are changed, follows from the number of the update; the pixels are worked on where
+the training runs.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
-from gcd_model.live.depth_net import Reference, pixel_rays, plane_depth, sweep_costs
+from gcd_model.live.depth_net import pixel_rays, plane_depth, plane_sweep
 from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
-from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
+from gcd_train.live.clips import LiveClip, decode_depth, evenly, read_clip, tensor_of
 from gcd_train.live.draws import Poses
+from gcd_train.live.store import Camera, TrainingClips, camera_of
 from gcd_train.training.loop import Progress
 
 Random = np.random.Generator
 Record = TypeVar("Record")
-Batch = TypeVar("Batch")
 PART_SEED = 1_000_003
 """Between the seeds of the batches of one update."""
 _MOST_GAP, _REFERENCE_SHARE = 6, 0.85
@@ -36,15 +39,19 @@ _TARGET_SHARE = 0.25  # of the pictures that depth learns from: targets see the 
 _NO_MOUNT, _EXACT_MOUNT = 0.35, 0.35
 _COUNTED = 48  # clips that say how common classes are
 _HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.05, 0.7  # of the other mounts that are declared
+_NEWS = 200
+"""Updates after which the folder is asked for clips that were added."""
+_MIRRORED = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Pictures:
-    """N pictures of cameras and the truth about them.
+    """N pictures of cameras and the truth about them, on one device.
 
     video: float32 [N, 3, H, W] in [-1, 1]. metres: float32 [N, H, W]. labels: int64 [N, H, W]. moves: float32
-    [N, H, W]. lenses: N. ups: N normals of the floor in camera axes, [3]. heights_m: N, of the cameras over it.
-    references: N earlier frames of the same cameras, None where there is none.
+    [N, H, W]. lenses: N. ups: [N, 3], normals of the floor in camera axes. heights_m: [N], of the cameras over it.
+    earlier: [N, 3, H, W], earlier frames of the same cameras. earlier_from_camera: float64 [N, 4, 4]. compared: bool
+    [N], whether there is an earlier frame at all.
     """
 
     video: Tensor
@@ -52,131 +59,151 @@ class Pictures:
     labels: Tensor
     moves: Tensor
     lenses: tuple[Intrinsics, ...]
-    ups: tuple[Tensor, ...]
-    heights_m: tuple[float, ...]
-    references: tuple[Reference | None, ...]
+    ups: Tensor
+    heights_m: Tensor
+    earlier: Tensor
+    earlier_from_camera: Tensor
+    compared: Tensor
 
     def sweeps(self, config: DepthConfig) -> Tensor:
-        """[N, bins + 1, H/2, W/2], see `sweep_costs`."""
-        each = zip(self.video, self.lenses, self.references, strict=True)
-        return torch.stack([sweep_costs(picture, lens, reference, config) for picture, lens, reference in each])
+        """[N, bins + 1, H/2, W/2], see `plane_sweep`; all zero without an earlier frame."""
+        table = torch.tensor([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in self.lenses]).to(self.video)
+        costs = plane_sweep(self.video, table, self.earlier, self.earlier_from_camera, config)
+        return costs * self.compared[:, None, None, None]
 
     @property
     def rays(self) -> Tensor:
         """[N, 2, H, W]."""
-        return torch.stack([lens_rays(lens) for lens in self.lenses])
+        return rays_of(self.lenses, self.video.device)
 
     def ground(self, random: Random | None = None, *, whole: bool = False) -> Tensor:
         """Depth of the floor, [N, H, W]; with `random`, of floors as people declare them: inexact, or not at all.
 
         whole: one declaration for all pictures, which one camera took.
         """
-        rows: list[Tensor] = []
-        salt = None if random is None else int(random.integers(2**31))
-        for lens, up, height in zip(self.lenses, self.ups, self.heights_m, strict=True):
-            drawn = None if salt is None else np.random.default_rng(salt) if whole else random
-            declared = (up, height) if drawn is None else _declared(up, height, drawn)
-            empty = torch.zeros(lens.height, lens.width)
-            rows.append(empty if declared is None else plane_depth(lens, *declared))
-        return torch.stack(rows)
+        ups, heights = self.ups, self.heights_m
+        if random is None:
+            return plane_depth(self.rays, ups, heights)
+        n = 1 if whole else len(self.lenses)
+        drawn = random.random((n, 1))
+        inexact = drawn >= _NO_MOUNT + _EXACT_MOUNT
+        tilt = on_device(random.normal(size=(n, 3)) * np.radians(_TILT_SPREAD_DEG) * inexact, ups)
+        factor = on_device(np.exp(random.normal(size=n) * _HEIGHT_SPREAD * inexact[:, 0]), ups)
+        turned = ups + torch.linalg.cross(tilt.expand_as(ups), ups)
+        made = plane_depth(self.rays, turned / turned.norm(dim=1, keepdim=True), heights * factor)
+        return made * on_device(drawn >= _NO_MOUNT, ups)[:, :, None]
+
+
+def on_device(array: NDArray[Any], like: Tensor) -> Tensor:
+    """Numbers of an array as `like` has them, and where."""
+    return torch.from_numpy(np.asarray(array)).to(like)
 
 
 @lru_cache(maxsize=4096)
-def lens_rays(lens: Intrinsics) -> Tensor:
-    """`pixel_rays`, kept."""
-    return pixel_rays(lens)
+def _rays(lens: Intrinsics, device: torch.device) -> Tensor:
+    return pixel_rays(lens, device)
 
 
-def _declared(up: Tensor, height: float, random: Random) -> tuple[Tensor, float] | None:
-    drawn = random.random()
-    if drawn < _NO_MOUNT:
-        return None
-    if drawn < _NO_MOUNT + _EXACT_MOUNT:
-        return up, height
-    tilt = torch.from_numpy(random.normal(size=3) * np.radians(_TILT_SPREAD_DEG)).float()
-    turned = up + torch.linalg.cross(tilt, up)
-    return turned / turned.norm(), height * float(np.exp(random.normal() * _HEIGHT_SPREAD))
+def rays_of(lenses: Sequence[Intrinsics], device: torch.device) -> Tensor:
+    """`pixel_rays` of N lenses: [N, 2, H, W]."""
+    return torch.stack([_rays(lens, device) for lens in lenses])
 
 
 def pictures_of(clip: LiveClip, camera: str) -> Pictures:
-    """All frames that were read of a clip, as "source" or "target" sees them, without references."""
-    arrays = {name.removeprefix(f"{camera}."): array for name, array in clip.arrays.items() if name.startswith(camera)}
-    n, height, width = arrays["labels"].shape
-    lens = Intrinsics.from_hfov(clip.hfov_deg(camera), width, height)
-    poses = arrays["pose"]
-    floor = float(clip.facts["floor_z_m"])
+    """All frames that were read of a clip, as "source" or "target" sees them, without earlier ones."""
+    arrays = {name: tensor_of(array) for name, array in clip.arrays.items() if name.startswith(camera)}
+    n, *size = arrays[f"{camera}.labels"].shape
+    cameras = [camera_of(clip, camera, size)] * n
+    return _pictures(arrays, camera, cameras, clip.arrays[f"{camera}.pose"])
+
+
+def _pictures(arrays: dict[str, Tensor], name: str, cameras: Sequence[Camera], poses: Poses) -> Pictures:
+    """arrays: as a clip has them, of frames of N cameras that stand at `poses`, [N, 4, 4]."""
+    video = to_video(arrays[f"{name}.rgb"])
+    heights = [pose[2, 3] - camera.floor_z_m for camera, pose in zip(cameras, poses, strict=True)]
     return Pictures(
-        video=to_video(arrays["rgb"]),
-        metres=torch.from_numpy(clip.depth(camera)),
-        labels=torch.from_numpy(arrays["labels"].astype(np.int64)),
-        moves=torch.from_numpy(arrays["moves"].astype(np.float32)),
-        lenses=(lens,) * n,
-        ups=tuple(torch.from_numpy(pose[2, :3].copy()).float() for pose in poses),
-        heights_m=tuple(max(float(pose[2, 3]) - floor, 0.05) for pose in poses),
-        references=(None,) * n,
+        video=video,
+        metres=decode_depth(arrays[f"{name}.depth"]),
+        labels=arrays[f"{name}.labels"].long(),
+        moves=arrays[f"{name}.moves"].float(),
+        lenses=tuple(camera.lens for camera in cameras),
+        ups=on_device(poses[:, 2, :3].copy(), video),
+        heights_m=on_device(np.maximum(heights, 0.05), video),
+        earlier=video,
+        earlier_from_camera=torch.eye(4, dtype=torch.float64, device=video.device).expand(len(video), 4, 4),
+        compared=torch.zeros(len(video), dtype=torch.bool, device=video.device),
     )
 
 
-def to_video(rgb: NDArray[np.uint8]) -> Tensor:
+def to_video(rgb: Tensor | NDArray[np.uint8]) -> Tensor:
     """u8 [N, H, W, 3] -> float32 [N, 3, H, W] in [-1, 1]."""
-    return torch.from_numpy(rgb).permute(0, 3, 1, 2).float() / 127.5 - 1
+    return torch.as_tensor(rgb).permute(0, 3, 1, 2).float() / 127.5 - 1
 
 
 def with_true_references(clip: LiveClip, camera: str) -> Pictures:
     """All frames of a clip, each with the earlier one that a live view would compare it with, by true poses."""
     pictures = pictures_of(clip, camera)
-    kept, references = References(), []
-    for picture, pose, metres in zip(pictures.video, clip.arrays[f"{camera}.pose"], pictures.metres, strict=True):
+    kept = References()
+    earlier, moves = pictures.earlier.clone(), pictures.earlier_from_camera.clone()
+    compared = pictures.compared.clone()
+    for t, (picture, pose) in enumerate(zip(pictures.video, clip.arrays[f"{camera}.pose"], strict=True)):
         world_from_camera = torch.from_numpy(pose)
-        references.append(kept.chosen(world_from_camera))
-        kept.add(picture, world_from_camera, metres)
-    return replace(pictures, references=tuple(references))
+        chosen = kept.chosen(world_from_camera)
+        if chosen is not None:
+            earlier[t], moves[t], compared[t] = chosen.picture, chosen.reference_from_camera, True
+        kept.add(picture, world_from_camera, pictures.metres[t])
+    return replace(pictures, earlier=earlier, earlier_from_camera=moves, compared=compared)
 
 
 class FrameBatches:
     """Batches of single frames of many clips; the number of the update decides which."""
 
-    def __init__(self, paths: Sequence[Path], size: int, seed: int) -> None:
-        self._paths, self._size, self._seed = list(paths), size, seed
+    def __init__(self, clips: TrainingClips, size: int, seed: int) -> None:
+        self._clips, self._size, self._seed = clips, size, seed
 
     def batch(self, update: int) -> tuple[Pictures, Tensor, Random]:
         """Pictures, float32 [N, H, W] declared ground, and the generator for what else is drawn of them."""
+        if update % _NEWS == 0:
+            self._clips.grow()
         random = np.random.default_rng([self._seed, update])
-        made: list[Pictures] = []
-        for _ in range(self._size):
-            path = self._paths[int(random.integers(len(self._paths)))]
-            frame = int(random.integers(14))
-            camera = "target" if random.random() < _TARGET_SHARE else "source"
-            names = [f"{camera}.{name}" for name in ("rgb", "depth", "labels", "moves", "pose")]
-            clip = read_clip(path, slice(frame, frame + 1), names)
-            earlier = frame - int(random.integers(1, _MOST_GAP + 1))
-            pictures = pictures_of(clip, camera)
-            if earlier >= 0 and random.random() < _REFERENCE_SHARE:
-                before = read_clip(path, slice(earlier, earlier + 1), names[:1] + names[-1:])
-                pictures = _compared(pictures, before, clip.arrays[names[-1]][0], camera, random)
-            made.append(pictures)
-        together = augmented(joined(made), random)
+        targets = int(random.binomial(self._size, _TARGET_SHARE))
+        counts = {"source": self._size - targets, "target": targets}
+        together = augmented(joined([self._drawn(name, n, random) for name, n in counts.items() if n]), random)
         return together, together.ground(random), random
 
+    def _drawn(self, name: str, count: int, random: Random) -> Pictures:
+        """Of "source" or "target", with earlier frames that are not too far away, by motion that is not quite right."""
+        chosen, frames = random.integers(len(self._clips), size=count), random.integers(14, size=count)
+        before = frames - random.integers(1, _MOST_GAP + 1, size=count)
+        compared = (before >= 0) & (random.random(count) < _REFERENCE_SHARE)
+        before = before.clip(0)
+        cameras = self._clips.cameras(name, chosen)
+        poses, poses_before = (
+            np.stack([camera.poses[t] for camera, t in zip(cameras, times, strict=True)]) for times in (frames, before)
+        )
+        names = [f"{name}.{array}" for array in ("rgb", "depth", "labels", "moves")]
+        pictures = _pictures(self._clips.take(chosen, frames, names), name, cameras, poses)
+        far = torch.where(pictures.metres < SKY_M, pictures.metres, torch.nan).flatten(1)
+        median = far.nanmedian(dim=1).values.nan_to_num(0.0).double()
+        moves = on_device(np.linalg.inv(poses_before) @ poses, median)
+        near = moves[:, :3, 3].norm(dim=1) <= 2 * LONGEST * median
+        turned = _slightly_turned(random, count, median)
+        shifted = on_device(random.normal(size=(count, 3)) * _MOVE_NOISE, median) * median[:, None]
+        moves[:, :3] = torch.cat([moves[:, :3, :3] @ turned, moves[:, :3, 3:] + shifted[..., None]], dim=2)
+        return replace(
+            pictures,
+            earlier=to_video(self._clips.take(chosen, before, names[:1])[names[0]]),
+            earlier_from_camera=moves,
+            compared=on_device(compared, near) & near,
+        )
 
-def _compared(pictures: Pictures, before: LiveClip, pose: Poses, camera: str, random: Random) -> Pictures:
-    """One picture with an earlier one, unless that is too far away; the motion between them is not quite right."""
-    move = torch.from_numpy(np.linalg.inv(before.arrays[f"{camera}.pose"][0]) @ pose)
-    near = pictures.metres[pictures.metres < SKY_M]
-    median = float(near.median()) if near.numel() else 0.0
-    if float(move[:3, 3].norm()) > 2 * LONGEST * median:
-        return pictures
-    turn = torch.from_numpy(random.normal(size=3) * np.radians(_TURN_NOISE_DEG))
-    move[:3, :3] = move[:3, :3] @ torch.linalg.matrix_exp(_cross(turn))
-    move[:3, 3] += torch.from_numpy(random.normal(size=3) * _MOVE_NOISE * median)
-    reference = Reference(picture=to_video(before.arrays[f"{camera}.rgb"])[0], reference_from_camera=move)
-    return replace(pictures, references=(reference,))
 
-
-def _cross(turn: Tensor) -> Tensor:
-    """[3] -> [3, 3], the matrix of the cross product."""
-    x, y, z = turn.tolist()
-    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+def _slightly_turned(random: Random, n: int, like: Tensor) -> Tensor:
+    """Rotations by angles so small that their first order is enough: [N, 3, 3]."""
+    x, y, z = random.normal(size=(3, n)) * np.radians(_TURN_NOISE_DEG)
+    one = np.ones(n)
+    rows = [[one, -z, y], [z, one, -x], [-y, x, one]]
+    return on_device(np.moveaxis(np.array(rows), 2, 0), like)
 
 
 def halved(pictures: Pictures) -> Pictures:
@@ -188,50 +215,38 @@ def halved(pictures: Pictures) -> Pictures:
         labels=pictures.labels[:, ::2, ::2],
         moves=pictures.moves[:, ::2, ::2],
         lenses=tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in pictures.lenses),
-        references=tuple(
-            None if each is None else replace(each, picture=avg_pool2d(each.picture, 2)) for each in pictures.references
-        ),
+        earlier=avg_pool2d(pictures.earlier, 2),
     )
 
 
 def augmented(pictures: Pictures, random: Random) -> Pictures:
     """Mirrored or not, and seen by a camera of another exposure, colour, noise and focus."""
-    video = pictures.video
-    mirrored = [random.random() < 0.5 for _ in pictures.lenses]
-    flip = torch.tensor(mirrored)[:, None, None]
-    n = len(mirrored)
+    n, video = len(pictures.lenses), pictures.video
+    flip = on_device(random.random(n) < 0.5, pictures.compared)
 
     def turned(x: Tensor) -> Tensor:
-        return torch.where(flip if x.ndim == 3 else flip[:, None], x.flip(-1), x)
+        return torch.where(flip.view(-1, *(1,) * (x.ndim - 1)), x.flip(-1), x)
 
-    look = other_camera(random, n)
-    flipped = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64))
-    earlier = [video[i] if each is None else each.picture for i, each in enumerate(pictures.references)]
-    seen_earlier = look(turned(torch.stack(earlier)), random)
+    look, noise = other_camera(random, n, video), generator_on(video.device, random)
+    mirror, moves = _MIRRORED.to(video.device), pictures.earlier_from_camera
     return replace(
         pictures,
-        video=look(turned(video), random),
-        references=tuple(
-            None
-            if each is None
-            else Reference(
-                picture=seen_earlier[i],
-                reference_from_camera=flipped @ each.reference_from_camera @ flipped
-                if mirrored[i]
-                else each.reference_from_camera,
-            )
-            for i, each in enumerate(pictures.references)
-        ),
+        video=look(turned(video), noise),
+        earlier=look(turned(pictures.earlier), noise),
+        earlier_from_camera=torch.where(flip[:, None, None], mirror @ moves @ mirror, moves),
         metres=turned(pictures.metres),
         labels=turned(pictures.labels),
         moves=turned(pictures.moves),
-        ups=tuple(
-            up * torch.tensor([-1.0, 1.0, 1.0]) if m else up for up, m in zip(pictures.ups, mirrored, strict=True)
-        ),
+        ups=torch.where(flip[:, None], pictures.ups * mirror.diagonal()[:3].to(video), pictures.ups),
     )
 
 
-def other_camera(random: Random, n: int) -> Callable[[Tensor, Random], Tensor]:
+def generator_on(device: torch.device, random: Random) -> torch.Generator:
+    """For what is drawn of every pixel."""
+    return torch.Generator(device).manual_seed(int(random.integers(2**62)))
+
+
+def other_camera(random: Random, n: int, like: Tensor) -> Callable[[Tensor, torch.Generator], Tensor]:
     """Exposure, gamma, white balance, noise and blur of N cameras, one in four as it is.
 
     What pictures [N, 3, H, W] in [-1, 1] look like through them; only the noise is drawn anew every time.
@@ -239,7 +254,7 @@ def other_camera(random: Random, n: int) -> Callable[[Tensor, Random], Tensor]:
 
     def drawn(spread: float, channels: int = 1) -> Tensor:
         wide = random.normal(size=(n, channels, 1, 1)) * spread * (random.random((n, 1, 1, 1)) < 0.75)
-        return torch.from_numpy(wide).float()
+        return on_device(wide, like)
 
     gamma, gain, offset, spread = (
         drawn(0.25).exp(),
@@ -247,12 +262,12 @@ def other_camera(random: Random, n: int) -> Callable[[Tensor, Random], Tensor]:
         drawn(0.03),
         drawn(0.04).abs(),
     )
-    blur = torch.from_numpy(random.random((n, 1, 1, 1)) * (random.random((n, 1, 1, 1)) < 0.3)).float()
+    blur = on_device(random.random((n, 1, 1, 1)) * (random.random((n, 1, 1, 1)) < 0.3), like)
 
-    def look(video: Tensor, random: Random) -> Tensor:
+    def look(video: Tensor, generator: torch.Generator) -> Tensor:
         levels = (((video + 1) / 2).clamp(0, 1) ** gamma * gain + offset).clamp(0, 1)
         soft = avg_pool2d(levels, 3, 1, 1, count_include_pad=False)
-        noise = torch.from_numpy(random.standard_normal(levels.shape, np.float32))
+        noise = torch.randn(levels.shape, generator=generator, device=levels.device)
         return (torch.lerp(levels, soft, blur) * 2 - 1 + noise * spread).clamp(-1, 1)
 
     return look
@@ -322,42 +337,3 @@ class LiveTask:
         """Nothing to do."""
         _ = progress
         return False
-
-
-class Ahead(Generic[Batch]):
-    """Batches by number, made in order by other processes before they are asked for; without workers, when they are."""
-
-    def __init__(self, batch: Callable[[int], Batch], workers: int) -> None:
-        self._batch, self._workers = batch, workers
-        self._next, self._made = -1, iter(cast("list[Batch]", []))
-
-    def __call__(self, update: int) -> Batch:
-        """The batch of an update. Asked for out of order, the processes begin anew."""
-        if self._workers == 0:
-            return self._batch(update)
-        if update != self._next:
-            numbers = _Numbered(self._batch, update)
-            self._made = iter(DataLoader(numbers, batch_size=None, num_workers=self._workers, prefetch_factor=4))
-        self._next = update + 1
-        return next(self._made)
-
-
-class _Numbered(IterableDataset[Any]):
-    """Batches from a number on; of W workers, worker w makes every W-th."""
-
-    def __init__(self, batch: Callable[[int], Any], first: int) -> None:
-        self._batch, self._first = batch, first
-
-    def __iter__(self) -> Iterator[Any]:
-        torch.set_num_threads(1)
-        worker = get_worker_info()
-        own, count = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        number = self._first + own
-        while True:
-            yield self._batch(number)
-            number += count
-
-
-def training_paths(folder: Path) -> list[Path]:
-    """The clips of a data folder that may be learned from: scenes below a million. Raises DataError."""
-    return [path for path in clip_paths(folder) if int(path.stem.split("-")[0]) < 1_000_000]

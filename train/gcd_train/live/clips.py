@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
+from torch import Tensor
 
 from gcd_model.live.config import LIVE_CLASSES, SKY_M
 from gcd_model.small_files import decode_json
@@ -49,10 +51,16 @@ def encode_depth(metres: Array) -> Array:
     return np.where(metres > 0, np.rint(code), 0).astype(np.uint16)
 
 
-def decode_depth(code: Array) -> Array:
-    """Metres along the optical axis, float32; SKY_M for the sky."""
-    metres = _NEAREST_M * np.exp((code.astype(np.float32) - 1) * np.float32(_SPAN / (_CODES - 1)))
-    return np.where(code > 0, metres, np.float32(SKY_M)).astype(np.float32)
+def tensor_of(array: Array) -> Tensor:
+    """The same numbers; of 16-bit codes, for which torch has few operations, the same bits."""
+    return torch.from_numpy(array.view(np.int16) if array.dtype == np.uint16 else array)
+
+
+def decode_depth(code: Tensor) -> Tensor:
+    """Metres along the optical axis, float32, of codes as `tensor_of` gives them; SKY_M for the sky."""
+    code = code.int() & 0xFFFF
+    metres = _NEAREST_M * torch.exp((code - 1) * (_SPAN / (_CODES - 1)))
+    return torch.where(code > 0, metres, SKY_M)
 
 
 _STAGE_LABELS = {
@@ -240,7 +248,7 @@ class LiveClip:
 
     def depth(self, camera: str) -> Array:
         """float32 [T, H, W], metres; SKY_M for the sky."""
-        return decode_depth(self.arrays[f"{camera}.depth"])
+        return decode_depth(tensor_of(self.arrays[f"{camera}.depth"])).numpy()
 
 
 def clip_paths(folder: Path) -> list[Path]:

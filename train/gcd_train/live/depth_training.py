@@ -21,12 +21,12 @@ from gcd_model.live.depth_net import (
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import (
     PART_SEED,
-    Ahead,
     FrameBatches,
     LiveTask,
     Pictures,
     autocast,
     class_weights,
+    generator_on,
     halved,
     on,
     some_of,
@@ -34,6 +34,7 @@ from gcd_train.live.batches import (
 )
 from gcd_train.live.clips import evenly, read_clip
 from gcd_train.live.recipe import LiveStage
+from gcd_train.live.store import TrainingClips
 from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.optimiser import ParameterGroup
@@ -54,20 +55,15 @@ class DepthTask(LiveTask):
         self,
         net: DepthNet,
         config: LiveConfig,
-        paths: Sequence[Path],
+        clips: TrainingClips,
         held_out: Sequence[Path],
         stage: LiveStage,
         seed: int,
-        workers: int = 0,
     ) -> None:
-        """workers: processes that read batches."""
         super().__init__(net, config)
         self._net, self._held_out, self._small_share = net, held_out, stage.small_share
-        self._batches = [
-            Ahead(FrameBatches(paths, stage.batch, seed + part * PART_SEED).batch, workers)
-            for part in range(stage.parts)
-        ]
-        self._class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
+        self._batches = [FrameBatches(clips, stage.batch, seed + part * PART_SEED) for part in range(stage.parts)]
+        self._class_weights = class_weights(clips.paths, config, _CLASS_POWER).to(self._device)
         names = [entry.name for entry in config.classes]
         self._thin = torch.tensor([name in THIN for name in names], device=self._device)
 
@@ -82,16 +78,14 @@ class DepthTask(LiveTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of frames."""
-        pictures, ground, random = self._batches[progress.part](progress.updates)
+        pictures, ground, random = self._batches[progress.part].batch(progress.updates)
         if progress.share < self._small_share:
             pictures, ground = halved(pictures), ground[:, ::2, ::2]
         self._net.train()
-        inputs = depth_inputs(pictures.video, pictures.rays, ground).to(self._device)
-        pictures = on(self._device, pictures)
+        inputs = depth_inputs(pictures.video, pictures.rays, ground)
         weights = self._pixel_weights(pictures).flatten(1)  # [N, H * W]
-        generator = torch.Generator().manual_seed(int(random.integers(2**62)))
-        drawn = torch.multinomial(weights.cpu(), int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
-        pixels = drawn.to(self._device)
+        generator = generator_on(self._device, random)
+        pixels = torch.multinomial(weights, int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
         sweeps = pictures.sweeps(self._config.depth)
         with autocast(self._device):
             output = self._network(inputs, sweeps, pixels)
@@ -158,10 +152,9 @@ def measure_depth(
     for path in paths:
         for frame in frames:
             truth = some_of(with_true_references(read_clip(path, slice(frame + 1)), "source"), slice(-1, None))
+            inputs = depth_inputs(truth.video, truth.rays, truth.ground())
             device = next(net.parameters()).device
-            sweeps = truth.sweeps(config.depth).to(device)
-            output = net(depth_inputs(truth.video, truth.rays, truth.ground()).to(device), sweeps)
-            output = on(torch.device("cpu"), output)
+            output = on(torch.device("cpu"), net(*on(device, (inputs, truth.sweeps(config.depth)))))
             metres, true = read_depth(output, config.depth).metres, truth.metres
             near = true < config.depth.farthest_m
             relative = (metres.clamp(max=SKY_M) - true).abs() / true

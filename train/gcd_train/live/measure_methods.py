@@ -25,9 +25,10 @@ from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
-from gcd_train.live.batches import Pictures, pictures_of, training_paths
+from gcd_train.live.batches import Pictures, pictures_of
 from gcd_train.live.clips import LiveClip, evenly, read_clip
 from gcd_train.live.measure_figures import NEVER, NOW, MethodViews
+from gcd_train.live.store import training_paths
 
 Array = NDArray[Any]
 _SAMPLE = 60
@@ -211,7 +212,7 @@ class LiveModel:
         tilt = torch.tensor(np.radians(self.floor_tilt_deg)).float()
         x, y, z = source.ups[t]
         up = torch.stack([x, y * tilt.cos() - z * tilt.sin(), y * tilt.sin() + z * tilt.cos()])
-        return Floor(up=up, height_m=source.heights_m[t] + self.floor_higher_m)
+        return Floor(up=up, height_m=float(source.heights_m[t]) + self.floor_higher_m)
 
 
 class _Misjudging(Eyes):

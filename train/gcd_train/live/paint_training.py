@@ -21,7 +21,7 @@ from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.painter import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import Ahead, LiveTask, Random, autocast, class_weights, on
+from gcd_train.live.batches import LiveTask, Random, autocast, class_weights, generator_on, on
 from gcd_train.live.clips import read_clip
 from gcd_train.live.views import (
     VIEW_ARRAYS,
@@ -66,12 +66,10 @@ class PaintTask(LiveTask):
         paths: Sequence[Path],
         held_out: "HeldOutViews",
         small_share: float,
-        workers: int = 0,
     ) -> None:
-        """batches: of the parts of an update. small_share: see LiveStage. workers: processes that read batches."""
+        """batches: of the parts of an update. small_share: see LiveStage."""
         super().__init__(net, config)
-        self._net, self._held_out, self._small_share = net, held_out, small_share
-        self._batches = [Ahead(each.batch, workers) for each in batches]
+        self._net, self._held_out, self._small_share, self._batches = net, held_out, small_share, batches
         self.class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
         self._movable = movable_classes(config).to(self._device)
 
@@ -82,7 +80,7 @@ class PaintTask(LiveTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of views."""
-        before, now, random = on(self._device, self._batches[progress.part](progress.updates))
+        before, now, random = self._batches[progress.part].batch(progress.updates)
         if progress.share < self._small_share:
             before, now = tuple(halved(each) for each in before), halved(now)
         later = progress.share >= _MEAN_ALONE
@@ -110,7 +108,8 @@ class PaintTask(LiveTask):
         """Weighted as in Karras et al. 2022, Table 1, from the levels that the sampler visits."""
         low, high = np.log(self._config.sigma_min), np.log(self._config.sigma_start)
         sigma = torch.from_numpy(np.exp(random.uniform(low, high, len(views.poses)))).float().to(self._device)
-        noise = torch.from_numpy(random.standard_normal(tuple(views.target.shape), np.float32)).to(self._device)
+        generator = generator_on(self._device, random)
+        noise = torch.randn(views.target.shape, generator=generator, device=self._device)
         noisy = views.target + sigma[:, None, None, None] * noise
         with autocast(self._device):
             clean = self._network(views.seen, filled(views.seen), sigma, noisy)
@@ -177,16 +176,14 @@ class DetailTask(LiveTask):
         config: LiveConfig,
         batches: ViewBatches,
         held_out: "HeldOutViews",
-        workers: int = 0,
     ) -> None:
-        """workers: processes that read batches."""
         net.requires_grad_(False)
         net.detail.requires_grad_(True)
         self._critic = Critic()
         trained = nn.ModuleDict({"detail": net.detail, "critic": self._critic}).to(next(net.parameters()).device)
         super().__init__(trained, config)
         self._net, self._depth = net, depth.eval().requires_grad_(False)
-        self._held_out, self._batch = held_out, Ahead(batches.batch, workers)
+        self._held_out, self._batches = held_out, batches
         self._movable = movable_classes(config).to(self._device)
         torch.manual_seed(0)
         self._random = nn.Sequential(
@@ -203,7 +200,7 @@ class DetailTask(LiveTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of the detail against the critic, and of the critic: their gradients do not meet."""
-        before, now, random = on(self._device, self._batch(progress.updates))
+        before, now, random = self._batches.batch(progress.updates)
         now = carried_through(self._first_step, before, now, self._movable, random)
         if random.random() < 0.5:
             now = mirrored(now)
@@ -269,17 +266,13 @@ def _energy(x: Tensor) -> Tensor:
 class HeldOutViews:
     """Some frames of held-out clips, opened once."""
 
-    def __init__(
-        self, paths: Sequence[Path], inputs: Path, config: LiveConfig, frames: Sequence[int] = (5, 9, 13)
-    ) -> None:
+    def __init__(self, paths: Sequence[Path], inputs: Path, frames: Sequence[int] = (5, 9, 13)) -> None:
         self._views: list[Views] = []
         for path in paths:
             place = inputs / path.parent.name / path.name
             for t in frames:
                 cut = slice(t, t + 1)
-                inputs_there = read_inputs(place, cut, len(config.classes))
-                views = views_of(read_clip(path, cut, VIEW_ARRAYS), inputs_there, ground=True)
-                self._views.append(views)
+                self._views.append(views_of(read_clip(path, cut, VIEW_ARRAYS), read_inputs(place, cut), ground=True))
 
     def on(self, device: torch.device) -> Iterator[Views]:
         """One by one."""

@@ -38,7 +38,7 @@ class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     weights: a live weight file to begin from, at random without. keep: stages that are left as it has them.
     exact_every, learned_every: of the clips, every so many-th has its inputs worked out by exact and by learned depth.
-    workers: processes that read batches and work out inputs beside the training; 0 for none.
+    workers: processes that work out inputs; 0 for none but this one.
     """
 
     kind: Literal["live"]

@@ -19,13 +19,14 @@ from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
-from gcd_train.live.batches import PART_SEED, training_paths
+from gcd_train.live.batches import PART_SEED
 from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import clip_paths, read_clip
 from gcd_train.live.depth_training import DepthTask
 from gcd_train.live.paint_training import DetailTask, HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
-from gcd_train.live.views import ViewBatches, make_inputs
+from gcd_train.live.store import TrainingClips, training_paths
+from gcd_train.live.views import InputShelf, ViewBatches, make_inputs
 from gcd_train.parallel import map_items
 from gcd_train.recipe_data import ComputeRecipe, LiveStageName
 from gcd_train.stop import StopSignal
@@ -36,6 +37,8 @@ from gcd_train.training.monitor import RunFolder
 _log = logging.getLogger(__name__)
 _MEASURED = 8
 """About so many held-out clips are measured while training."""
+_CARRIED = {"paint": 0.35, "detail": 0.6}
+"""Share of the views that see what was painted a frame before, of a model that carries that."""
 _SHARE = 16
 """Clips whose inputs a process works out at a time."""
 
@@ -60,36 +63,47 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     """
     _require_apart(places)
     _require_shape(recipe, places)
-    folder, paths, held_out = RunFolder(places.out), training_paths(places.data), clip_paths(places.valid)
+    folder, device, held_out = RunFolder(places.out), _device(recipe.device), clip_paths(places.valid)
     torch.manual_seed(recipe.seed)
-    networks = _networks(recipe).to(_device(recipe.device), memory_format=torch.channels_last)  # pyright: ignore
-    measured = held_out[:: max(len(held_out) // _MEASURED, 1)]
-    run = partial(_stage, recipe, folder, stop)
+    networks = _networks(recipe).to(device, memory_format=torch.channels_last)  # pyright: ignore
+    clips, measured = TrainingClips(places.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
+    model, seed = recipe.model, recipe.seed
     alone = partial(processes.by_the_first, stop=stop)
-    model, (seed, workers) = recipe.model, (recipe.seed, recipe.workers)
-    depth = DepthTask(networks.depth, model, paths, measured, recipe.depth, seed, workers)
+
+    def run(name: LiveStageName, stage: LiveStage, task: Task, processes: Processes) -> None:
+        """Train a stage, whose weights are then in a file of their own; one to be kept is kept."""
+        if name in recipe.keep:
+            task.module.eval().requires_grad_(False)
+            return
+        _stage(recipe, folder, stop, name, stage, task, processes)
+        so_far = places.out / f"{recipe.name}-{name}.safetensors"
+        alone(lambda: save_live(so_far, networks, recipe.name, overwrite=True))
+
+    depth = DepthTask(networks.depth, model, clips, measured, recipe.depth, seed)
     run("depth", recipe.depth, depth, processes)
     exact, learned, shown = (
         places.out / "inputs" / name / _digest(net, recipe)
         for name, net in (("exact", None), ("learned", networks.depth), ("held-out", networks.depth))
     )
-    make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(workers, processes.count))
-    alone(lambda: make(exact, paths[:: recipe.exact_every], None))
-    alone(lambda: make(learned, paths[:: recipe.learned_every], networks.depth))
+    make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(recipe.workers, processes.count))
+    alone(lambda: make(exact, clips.paths[:: recipe.exact_every], None))
+    alone(lambda: make(learned, clips.paths[:: recipe.learned_every], networks.depth))
     alone(lambda: make(shown, measured, networks.depth))
+    carried = _CARRIED if model.carry_painted else {"paint": 0.0, "detail": 0.0}
+    inputs = InputShelf(clips, [exact, learned])
     batches = [
-        ViewBatches(paths, [exact, learned], model, recipe.paint.batch, seed + part * PART_SEED)
+        ViewBatches(clips, inputs, model, recipe.paint.batch, seed + part * PART_SEED, carried["paint"])
         for part in range(recipe.paint.parts)
     ]
-    views = HeldOutViews(measured, shown, model)
-    paint = PaintTask(networks.paint, model, batches, paths, views, recipe.paint.small_share, workers)
+    views = HeldOutViews(measured, shown)
+    paint = PaintTask(networks.paint, model, batches, clips.paths, views, recipe.paint.small_share)
     run("paint", recipe.paint, paint, processes)
-    seen = ViewBatches(paths, [learned], model, recipe.detail.batch, seed + 1, carried=0.6)
     path = places.out / f"{recipe.name}.safetensors"
 
     def finish() -> None:
-        run("detail", recipe.detail, DetailTask(networks.paint, networks.depth, model, seen, views, workers), ALONE)
-        calibrate(networks.cpu(), paths, held_out, views, depth.class_weights, paint.class_weights)
+        seen = ViewBatches(clips, inputs, model, recipe.detail.batch, seed + 1, carried["detail"])
+        run("detail", recipe.detail, DetailTask(networks.paint, networks.depth, model, seen, views), ALONE)
+        calibrate(networks.cpu(), clips.paths, held_out, views, depth.class_weights, paint.class_weights)
         save_live(path, networks, recipe.name, overwrite=True)
         _log.info("wrote %s", path)
 
@@ -148,10 +162,7 @@ def _stage(
     task: Task,
     processes: Processes,
 ) -> None:
-    """Train a stage to the end of its budget; its module then has the averaged weights. One to be kept is kept."""
-    if name in recipe.keep:
-        task.module.eval().requires_grad_(False)
-        return
+    """Train a stage to the end of its budget; its module then has the averaged weights."""
     told = msgspec.json.encode([recipe.model.depth, recipe.model.paint, recipe.seed, name])
     options = LoopOptions(
         stage=name,
@@ -198,7 +209,7 @@ def _digest(net: DepthNet | None, recipe: LiveRecipe) -> str:
 def _inputs_of(out: Path, state: dict[str, Any] | None, recipe: LiveRecipe, paths: list[Path]) -> None:
     net: DepthNet | None = None
     if state is not None:
-        net = DepthNet(recipe.model.depth, len(recipe.model.classes))
+        net = DepthNet(recipe.model.depth, len(recipe.model.classes)).to(_device(recipe.device))
         net.load_state_dict(state)
         net.eval()
     threads = torch.get_num_threads()

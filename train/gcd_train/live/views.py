@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.config import LIVE_CLASSES, SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, plane_depth, read_depth
 from gcd_model.live.memory import SeenWorld
 from gcd_model.live.paint_net import Painted, Seen, camera_features
@@ -29,19 +29,24 @@ from gcd_train.live.batches import (
     Pictures,
     Random,
     autocast,
-    joined,
-    lens_rays,
+    on,
+    on_device,
     pictures_of,
-    some_of,
+    rays_of,
     to_video,
     with_true_references,
 )
-from gcd_train.live.clips import LiveClip, decode_depth, encode_depth, read_clip
+from gcd_train.live.clips import LiveClip, decode_depth, encode_depth, read_clip, tensor_of
+from gcd_train.live.draws import Poses
+from gcd_train.live.store import CAMERAS, Camera, Numbers, Shelf, TrainingClips, camera_of, room_on
 
 Array = NDArray[Any]
 _DEPTH_NOISE = 0.03
 VIEW_ARRAYS = ("source.pose", *(f"target.{name}" for name in ("pose", "rgb", "depth", "labels", "visibility")))
 """What is read of a clip."""
+INPUTS = ("colour", "coverage", "now_share", "age", "log_depth", "label", "label_share")
+"""What is read of its inputs."""
+_PIXELS = ("target.rgb", "target.depth", "target.labels", "target.visibility")
 _MOST_CARRIED = 3
 """Frames in a row of which each sees what was painted in the one before."""
 _DRIFT = 0.15
@@ -59,17 +64,16 @@ class Geometry:
 
 @torch.inference_mode()
 def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Geometry:
-    """By the depth network, frame by frame."""
-    metres, labels, static = [], [], []
-    sweeps = source.sweeps(config.depth)
-    for t in range(len(source.lenses)):
-        inputs = depth_inputs(source.video[t : t + 1], source.rays[t : t + 1], ground[t : t + 1])
-        with autocast(inputs.device):
-            output = net(inputs, sweeps[t : t + 1])
-        metres.append(read_depth(output, config.depth).metres)
-        labels.append(output.classes.argmax(1).to(torch.uint8))
-        static.append(output.moves < 0)
-    return Geometry(metres=torch.cat(metres), labels=torch.cat(labels), static=torch.cat(static))
+    """By the depth network, where that is."""
+    device = next(net.parameters()).device
+    source, inputs = on(device, (source, depth_inputs(source.video, source.rays, ground)))
+    with autocast(device):
+        output = net(inputs, source.sweeps(config.depth))
+    metres = read_depth(output, config.depth).metres
+    return on(
+        torch.device("cpu"),
+        Geometry(metres=metres, labels=output.classes.argmax(1).to(torch.uint8), static=output.moves < 0),
+    )
 
 
 def exact_geometry(source: Pictures, random: Random | None = None) -> Geometry:
@@ -134,23 +138,10 @@ def make_inputs(out: Path, paths: Sequence[Path], net: DepthNet | None, config: 
         write_inputs(out / path.parent.name / path.name, splats_of(clip, geometry, config))
 
 
-def read_inputs(path: Path, frames: slice, classes: int) -> dict[str, Tensor]:
-    """The fields of `Seen` that do not depend on the lens, of some frames: see the module."""
+def read_inputs(path: Path, frames: slice, names: Sequence[str] = INPUTS) -> dict[str, Array]:
+    """What is stored of some frames: see the module."""
     with safe_open(path, framework="numpy") as file:
-        arrays = {name: file.get_slice(name)[frames] for name in file.keys()}  # noqa: SIM118
-    metres = torch.from_numpy(decode_depth(arrays.pop("log_depth")))
-    cut = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    coverage = cut["coverage"].float() / 255
-    share = (cut["label_share"].float() / 255 * (coverage > 0))[:, None]
-    votes = torch.zeros(len(coverage), classes, *coverage.shape[1:]).scatter_(1, cut["label"].long()[:, None], share)
-    return {
-        "colour": (cut["colour"].permute(0, 3, 1, 2).float() / 127.5 - 1) * (coverage > 0)[:, None],
-        "coverage": coverage,
-        "now_share": cut["now_share"].float() / 255,
-        "age": cut["age"].float() / 10,
-        "log_depth": torch.where(coverage > 0, metres.log(), 0.0),
-        "votes": votes,
-    }
+        return {name: file.get_slice(name)[frames] for name in names}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -170,36 +161,49 @@ class Views:
     lenses: tuple[Intrinsics, ...]
 
 
-def views_of(clip: LiveClip, inputs: dict[str, Tensor], *, ground: bool) -> Views:
+def views_of(clip: LiveClip, inputs: dict[str, Array], *, ground: bool) -> Views:
     """The frames that were read of a clip, with what is seen of them."""
-    labels = torch.from_numpy(clip.arrays["target.labels"].astype(np.int64))
-    n, height, width = labels.shape
-    lens = Intrinsics.from_hfov(clip.hfov_deg("target"), width, height)
-    poses = clip.arrays["target.pose"]
-    floor = float(clip.facts["floor_z_m"])
-    grounds = [
-        plane_depth(lens, torch.from_numpy(pose[2, :3].copy()).float(), max(float(pose[2, 3]) - floor, 0.05))
-        if ground
-        else torch.zeros(height, width)
-        for pose in poses
-    ]
-    empty = torch.zeros(n, height, width)
+    arrays = {name: tensor_of(array) for name, array in {**clip.arrays, **inputs}.items()}
+    sources, targets = (clip.arrays[f"{name}.pose"] for name in CAMERAS)
+    n, *size = clip.arrays["target.labels"].shape
+    return _views(arrays, [camera_of(clip, "target", size)] * n, sources, targets, np.full(n, ground))
+
+
+def _views(
+    arrays: dict[str, Tensor], cameras: Sequence[Camera], sources: Poses, targets: Poses, ground: Array
+) -> Views:
+    """arrays: as clips and inputs have them, of N frames. cameras: the targets'; their poses and the sources',
+    [N, 4, 4]. ground: bool [N], where it is told.
+    """
+    target, lenses = to_video(arrays["target.rgb"]), tuple(camera.lens for camera in cameras)
+    heights = np.maximum([pose[2, 3] - each.floor_z_m for pose, each in zip(targets, cameras, strict=True)], 0.05)
+    rays = rays_of(lenses, target.device)
+    floor = plane_depth(rays, on_device(targets[:, 2, :3].copy(), target), on_device(heights, target))
+    coverage = arrays["coverage"].float() / 255
+    covered = coverage > 0
+    share = (arrays["label_share"].float() / 255 * covered)[:, None]
+    votes = torch.zeros(len(target), len(LIVE_CLASSES), *coverage.shape[1:], device=target.device)
     seen = Seen(
-        **inputs,
-        painted=torch.zeros(n, 3, height, width),
-        painted_coverage=empty,
-        rays=lens_rays(lens).expand(n, -1, -1, -1),
-        ground_m=torch.stack(grounds),
-        camera=camera_features(torch.from_numpy(np.linalg.inv(clip.arrays["source.pose"]) @ poses)),
+        colour=to_video(arrays["colour"]) * covered[:, None],
+        coverage=coverage,
+        now_share=arrays["now_share"].float() / 255,
+        age=arrays["age"].float() / 10,
+        log_depth=torch.where(covered, decode_depth(arrays["log_depth"]).log(), 0.0),
+        votes=votes.scatter_(1, arrays["label"].long()[:, None], share),
+        painted=torch.zeros_like(target),
+        painted_coverage=torch.zeros_like(coverage),
+        rays=rays,
+        ground_m=floor * on_device(ground, target)[:, None, None],
+        camera=camera_features(torch.from_numpy(np.linalg.inv(sources) @ targets)).to(target.device),
     )
     return Views(
         seen=seen,
-        target=to_video(clip.arrays["target.rgb"]),
-        labels=labels,
-        log_depth=torch.from_numpy(clip.depth("target")).log(),
-        visibility=torch.from_numpy(clip.arrays["target.visibility"].astype(np.int64)),
-        poses=tuple(torch.from_numpy(pose) for pose in poses),
-        lenses=(lens,) * n,
+        target=target,
+        labels=arrays["target.labels"].long(),
+        log_depth=decode_depth(arrays["target.depth"]).log(),
+        visibility=arrays["target.visibility"].long(),
+        poses=tuple(torch.from_numpy(pose) for pose in targets),
+        lenses=lenses,
     )
 
 
@@ -229,27 +233,38 @@ def halved(views: Views) -> Views:
     )
 
 
+class InputShelf(Shelf):
+    """What is seen of clips, from folders of `make_inputs`, by number of the file."""
+
+    def __init__(self, clips: TrainingClips, folders: Sequence[Path]) -> None:
+        super().__init__(read_inputs, INPUTS, clips.device, room_on(clips.device))
+        self._of: list[tuple[int, list[int]]] = []
+        count = 0
+        for i, path in enumerate(clips.paths):
+            files = [file for folder in folders if (file := folder / path.parent.name / path.name).exists()]
+            taken = [file for file in files if self.add(file)]
+            if taken:
+                self._of.append((i, list(range(count, count + len(taken)))))
+            count += len(taken)
+
+    def drawn(self, random: Random, n: int) -> tuple[Numbers, Numbers]:
+        """Numbers of N clips and of a file of each."""
+        of = [self._of[i] for i in random.integers(len(self._of), size=n)]
+        files = [each[int(place * len(each))] for (_, each), place in zip(of, random.random(n), strict=True)]
+        return np.array([clip for clip, _ in of]), np.array(files)
+
+
 class ViewBatches:
     """Batches of target views; the number of the update decides which.
 
-    inputs: folders of `make_inputs`; of those that have a clip one is drawn. carried: share of the views that see what
-    was painted a frame before.
+    carried: share of the views that see what was painted a frame before.
     """
 
     def __init__(
-        self,
-        paths: Sequence[Path],
-        inputs: Sequence[Path],
-        config: LiveConfig,
-        size: int,
-        seed: int,
-        carried: float = 0.35,
+        self, clips: TrainingClips, inputs: InputShelf, config: LiveConfig, size: int, seed: int, carried: float
     ) -> None:
-        self._config, self._size, self._seed, self._carried = config, size, seed, carried
-        places = [
-            (path, [p for folder in inputs if (p := folder / path.parent.name / path.name).exists()]) for path in paths
-        ]
-        self._clips = [(path, there) for path, there in places if there]
+        self._clips, self._inputs, self._config = clips, inputs, config
+        self._size, self._seed, self._carried = size, seed, carried
 
     def batch(self, update: int) -> tuple[tuple[Views, ...], Views, Random]:
         """N views; before them the frames before of the first of them, in order, which see what was painted there.
@@ -258,38 +273,41 @@ class ViewBatches:
         """
         random = np.random.default_rng([self._seed, update])
         carried = int(random.binomial(self._size, self._carried))
-        earlier = min(int(random.integers(1, _MOST_CARRIED + 1)), self._config.frames - 1)
-        made = [self._views(random, earlier + 1 if i < carried else 1) for i in range(self._size)]
-        before = tuple(
-            joined([some_of(views, slice(t, t + 1)) for views in made[:carried]])
-            for t in range(earlier if carried else 0)
-        )
-        now = joined([*(some_of(views, slice(-1, None)) for views in made[:carried]), *made[carried:]])
-        return before, now, random
+        run = min(int(random.integers(1, _MOST_CARRIED + 1)), self._config.frames - 1) if carried else 0
+        clips, inputs = self._inputs.drawn(random, self._size)
+        frames = random.integers(self._config.frames - run * (np.arange(self._size) < carried))
+        frames[:carried] += run
+        ground, look = random.random(self._size) < 0.6, other_look(random, self._size)
 
-    def _views(self, random: Random, count: int) -> Views:
-        """Frames in a row of some clip."""
-        path, there = self._clips[int(random.integers(len(self._clips)))]
-        first = int(random.integers(self._config.frames + 1 - count))
-        cut = slice(first, first + count)
-        inputs = read_inputs(there[int(random.integers(len(there)))], cut, len(self._config.classes))
-        views = views_of(read_clip(path, cut, VIEW_ARRAYS), inputs, ground=random.random() < 0.6)
-        return _other_look(views, random)
+        def views(back: int, count: int) -> Views:
+            """The first so many, some frames earlier."""
+            times, some = frames[:count] - back, clips[:count]
+            arrays = self._clips.take(some, times, _PIXELS) | self._inputs.take(inputs[:count], times, INPUTS)
+            sources, targets = (
+                np.stack([each.poses[t] for each, t in zip(self._clips.cameras(name, some), times, strict=True)])
+                for name in CAMERAS
+            )
+            return look(_views(arrays, self._clips.cameras("target", some), sources, targets, ground[:count]))
+
+        return tuple(views(back, carried) for back in range(run, 0, -1)), views(0, self._size), random
 
 
-def _other_look(views: Views, random: Random) -> Views:
-    """Exposure, gamma and white balance, the same for what is seen and for the truth."""
-    gamma, gain = (
-        np.exp(random.normal() * 0.2),
-        np.exp(random.normal() * 0.12 + random.normal(size=(1, 3, 1, 1)) * 0.05),
-    )
-    scale = torch.from_numpy(np.asarray(gain, np.float32))
+def other_look(random: Random, n: int) -> Callable[[Views], Views]:
+    """Exposure, gamma and white balance of N views, the same for what is seen and for the truth."""
+    gamma = np.exp(random.normal(size=(n, 1, 1, 1)) * 0.2)
+    gain = np.exp(random.normal(size=(n, 1, 1, 1)) * 0.12 + random.normal(size=(n, 3, 1, 1)) * 0.05)
 
-    def look(x: Tensor) -> Tensor:
-        return ((((x + 1) / 2).clamp(0, 1) ** float(gamma)) * scale).clamp(0, 1) * 2 - 1
+    def look(views: Views) -> Views:
+        """Of the first of them."""
+        power, scale = (on_device(each[: len(views.poses)], views.target) for each in (gamma, gain))
 
-    colour = look(views.seen.colour) * (views.seen.coverage > 0)[:, None]
-    return replace(views, seen=replace(views.seen, colour=colour), target=look(views.target))
+        def changed(x: Tensor) -> Tensor:
+            return ((((x + 1) / 2).clamp(0, 1) ** power) * scale).clamp(0, 1) * 2 - 1
+
+        colour = changed(views.seen.colour) * (views.seen.coverage > 0)[:, None]
+        return replace(views, seen=replace(views.seen, colour=colour), target=changed(views.target))
+
+    return look
 
 
 def mirrored(views: Views) -> Views:
