@@ -39,7 +39,7 @@ _MEASURED = 8
 """About so many held-out clips are measured while training."""
 _CARRIED = {"paint": 0.35, "detail": 0.6}
 """Share of the views that see what was painted a frame before, of a model that carries that."""
-_SHARE = 16
+_SHARE = 4
 """Clips whose inputs a process works out at a time."""
 
 
