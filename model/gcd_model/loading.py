@@ -12,6 +12,7 @@ from gcd_model.config import SMALL
 from gcd_model.engines.onnx import load_export
 from gcd_model.engines.onnx_export import ExportPrecision, Manifest, Report, export_onnx, is_export, require_onnx
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.live.blocks import layout
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, weights_digest
@@ -216,7 +217,7 @@ def _live_synthesizer(
     if asked is None:
         name = default_precision(place.device, live=True)
         place = replace(place, dtype=precision(name), precision=name)
-    networks = networks.to(place.device, place.dtype, memory_format=torch.channels_last)  # pyright: ignore
+    networks = networks.to(place.device, place.dtype, memory_format=layout(place.device))  # pyright: ignore
     return LiveSynthesizer(networks, _traits(loaded, place))
 
 

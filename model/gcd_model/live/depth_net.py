@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.blocks import FineHead, Trunk
+from gcd_model.live.blocks import FineHead, Trunk, layout
 from gcd_model.live.config import SKY_M, DepthConfig
 
 INPUTS = 7
@@ -105,7 +105,7 @@ class DepthNet(nn.Module):
                 earlier frames. pixels: [N, M], of these alone, as pictures of M x 1.
         """
         weight, bins = self.trunk.stem.weight, self.config.bins
-        pictures = inputs.to(weight.dtype, memory_format=torch.channels_last)
+        pictures = inputs.to(weight.dtype, memory_format=layout(inputs.device))
         features = self.features(pictures, sweep)
         made = self.head(pictures, features, pixels)
         logits, offsets, *others = made.split([bins, bins - 1, self.classes, 1, 1, 1], dim=1)
@@ -136,7 +136,7 @@ def _doubt(sweep: Tensor, width: int, pixels: Tensor | None) -> Tensor:
 
     sweep: [N, B + 1, H/2, W/2]. width: W. pixels: [N, M], of these alone.
     """
-    costs = sweep[:, :-1].contiguous(memory_format=torch.channels_last)  # where pooling is three times as fast
+    costs = sweep[:, :-1].contiguous(memory_format=layout(sweep.device))
     costs = F.avg_pool2d(costs, _DOUBT_PX, 1, _DOUBT_PX // 2, count_include_pad=False)
     costs = costs - costs.amin(dim=1, keepdim=True)
     if pixels is None:

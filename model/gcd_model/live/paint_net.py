@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.layers import embedding_mlp, sinusoid
-from gcd_model.live.blocks import FineHead, Trunk
+from gcd_model.live.blocks import FineHead, Trunk, layout
 from gcd_model.live.config import PaintConfig
 from gcd_model.live.splat import Splat
 
@@ -150,7 +150,7 @@ class PaintNet(nn.Module):
                 base,
             ],
             dim=1,
-        ).to(self.votes.weight.dtype, memory_format=torch.channels_last)
+        ).to(self.votes.weight.dtype, memory_format=layout(base.device))
 
     def embedded(self, seen: Seen, sigma: Tensor) -> Tensor:
         """Noise levels [N] and where the cameras stand -> [N, E]."""

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import torch
 
+from gcd_model.live.blocks import layout
 from gcd_model.live.depth_net import DepthNet
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.loading import load_synthesizer
@@ -65,7 +66,7 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     _require_shape(recipe, places)
     folder, device, held_out = RunFolder(places.out), _device(recipe.device), clip_paths(places.valid)
     torch.manual_seed(recipe.seed)
-    networks = _networks(recipe).to(device, memory_format=torch.channels_last)  # pyright: ignore
+    networks = _networks(recipe).to(device, memory_format=layout(device))  # pyright: ignore
     clips, measured = TrainingClips(places.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
     model, seed = recipe.model, recipe.seed
     alone = partial(processes.by_the_first, stop=stop)
