@@ -147,8 +147,8 @@ def test_what_was_painted_is_seen_again_only_where_the_weights_carry_it(carries:
     half = torch.where(torch.arange(WIDTH) < WIDTH // 2, 3.0, 0.0).expand(HEIGHT, WIDTH)
     first, second = (view.step(frame, [aside(0.3)], lens=LENS, depth=half, odometry=HERE).views[0] for _ in range(2))
     assert bool((first.visibility == 0).any())
-    changed = float((first.picture - second.picture).abs().max())  # by what an earlier frame tells of depth and class
-    assert (changed > 0.01) == carries, changed
+    changed = float((first.picture - second.picture).abs().median())  # here and there a class, by the plane sweep
+    assert (changed > 1e-3) == carries, changed
     assert torch.equal(first.visibility, second.visibility)
 
 

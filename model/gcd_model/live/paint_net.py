@@ -34,6 +34,12 @@ _VOTE_LOGITS = 6.0
 """How sure the class of a seen pixel is at first, as a difference of logits."""
 _MEAN_DEPTH_LOG = 2.5  # of unseen pixels at first: 12 m
 _LOG_VARIANCE = -3.0
+_CELL_PX, _REACH, _ROUNDS, _LEAST_SURE = 4, 3, 2, 1e-4
+"""Colours of classes are averages of cells of so many pixels, so many cells around, so many times."""
+_SPECK_PX = 3
+"""Classes of single pixels do not count."""
+_SMOOTH = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
+"""What is drawn in detail loses the grids that heads of patches like to draw."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -93,9 +99,9 @@ class Painted:
     """The first step's answer for N views.
 
     mean: [N, 3, H, W] in [-1, 1], the mean of what could be there. detail: [N, 3, H, W], what is added to it where
-    nothing was seen, to look like one of the things that could be. classes: [N, K, H, W], logits. log_depth: [N, H, W].
-    log_variance: [N, H, W], of the truth about the mean, channel mean, for colours in [-1, 1]. seen: [N, 3, H, W],
-    logits of never, before, now.
+    nothing was seen, to look like one of the things that could be: the likeliest, see `crisp`, drawn out. classes:
+    [N, K, H, W], logits. log_depth: [N, H, W]. log_variance: [N, H, W], of the truth about the mean, channel mean, for
+    colours in [-1, 1]. seen: [N, 3, H, W], logits of never, before, now.
     """
 
     mean: Tensor
@@ -178,12 +184,16 @@ class PaintNet(nn.Module):
             self.head(inputs, features).float().split([3, self.classes, 1, 1, 3], dim=1)
         )
         unseen = (1 - seen.coverage)[:, None]
-        added = self.detail(inputs.detach(), features.detach()).float() * unseen if detail else torch.zeros_like(mean)
+        mean, classes = base + mean, classes + _VOTE_LOGITS * seen.votes
+        added = torch.zeros_like(mean)
+        if detail:
+            drawn = _smooth(self.detail(inputs.detach(), features.detach()).float())
+            added = (crisp(mean.detach(), classes.detach()) - mean.detach() + drawn) * unseen
         known = (seen.log_depth != 0) & (seen.coverage > 0)
         return Painted(
-            mean=base + mean,
+            mean=mean,
             detail=added,
-            classes=classes + _VOTE_LOGITS * seen.votes,
+            classes=classes,
             log_depth=log_depth[:, 0] + torch.where(known, seen.log_depth, _MEAN_DEPTH_LOG),
             log_variance=log_variance[:, 0] + _LOG_VARIANCE,
             seen=state + _first_guess(seen),
@@ -205,6 +215,54 @@ def _first_guess(seen: Seen) -> Tensor:
     covered = (seen.coverage > 0.5).float()
     now = (seen.now_share > 0.5).float()
     return 4.0 * torch.stack([1 - covered, covered * (1 - now), covered * now], dim=1)
+
+
+def crisp(mean: Tensor, classes: Tensor) -> Tensor:
+    """What a mean would look like if every pixel were of its likeliest class: [N, 3, H, W].
+
+    Where a kerb may run here or there the mean is a mixture of road and pavement. So each class has a colour of its
+    own, place by place, that of the cells around which are surely of it; between cells it is interpolated.
+    mean: [N, 3, H, W]. classes: [N, K, H, W], logits.
+    """
+    n, count, height, width = classes.shape
+    chances = classes.softmax(dim=1)
+    cells = F.avg_pool2d(torch.cat([mean, chances], dim=1), _CELL_PX)
+    h, w = cells.shape[-2:]
+    sure = cells[:, 3:].clamp(min=_LEAST_SURE).square().square().square()
+    sums = torch.cat([cells[:, :3, None] * sure[:, None], sure[:, None]], dim=1).flatten(1, 2)  # [N, 4 K, h, w]
+    for _ in range(_ROUNDS):
+        sums = _summed(sums, 2 * _REACH + 1)
+    sums = sums.view(n, 4, count * h * w)
+    colours = sums[:, :3] / sums[:, 3:]
+    likeliest = _summed(chances, _SPECK_PX).max(dim=1).indices
+    first = likeliest.flatten(1) * (h * w)  # of the class's colours
+    (top, down), (left, right) = (_between_cells(size, mean.device) for size in (height, width))
+    made = torch.zeros_like(mean).flatten(2)
+    for row, share_y in ((top, 1 - down), (top + 1, down)):
+        for column, share_x in ((left, 1 - right), (left + 1, right)):
+            place = first + (row[:, None] * w + column).flatten()
+            made += colours.gather(2, place[:, None].expand(-1, 3, -1)) * (share_y[:, None] * share_x).flatten()
+    return made.view_as(mean)
+
+
+def _summed(x: Tensor, side: int) -> Tensor:
+    """Over squares about each place of [N, C, h, w]; pooling would take five times as long."""
+    return F.conv2d(x, x.new_ones(x.shape[1], 1, side, side), padding=side // 2, groups=x.shape[1])
+
+
+def _between_cells(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """For each of so many pixels, the cell before it and how far it is on the way to the next one."""
+    place = ((torch.arange(size, device=device) + 0.5) / _CELL_PX - 0.5).clamp(0, size // _CELL_PX - 1)
+    cell = place.long().clamp(max=size // _CELL_PX - 2)
+    return cell, place - cell
+
+
+def _smooth(x: Tensor) -> Tensor:
+    """[N, C, H, W], without what changes from pixel to pixel."""
+    kernel = x.new_tensor(_SMOOTH).expand(x.shape[1], 1, 1, -1)
+    for weight, sides in ((kernel, (2, 2, 0, 0)), (kernel.transpose(2, 3), (0, 0, 2, 2))):
+        x = F.conv2d(F.pad(x, sides, mode="replicate"), weight, groups=x.shape[1])
+    return x
 
 
 def filled(seen: Seen) -> Tensor:

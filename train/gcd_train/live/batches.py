@@ -173,7 +173,7 @@ class FrameBatches:
 
     def _drawn(self, name: str, count: int, random: Random) -> Pictures:
         """Of "source" or "target", with earlier frames that are not too far away, by motion that is not quite right."""
-        chosen, frames = random.integers(len(self._clips), size=count), random.integers(14, size=count)
+        chosen, frames = random.integers((len(self._clips), self._clips.frames), size=(count, 2)).T
         before = frames - random.integers(1, _MOST_GAP + 1, size=count)
         compared = (before >= 0) & (random.random(count) < _REFERENCE_SHARE)
         before = before.clip(0)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -237,9 +237,10 @@ def live_model(weights: str, *, device: str = "auto") -> LiveSynthesizer:
 
 
 def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
-    """The live model as it ships, with what may be wrong, and painting otherwise: in several steps, or the mean."""
-    plain, mean = LiveModel(networks=networks), deepcopy(networks)
-    zeroed(mean.paint.detail.out)
+    """The live model as it ships, with what may be wrong, and painting in several steps, the mean, or it made crisp."""
+    plain, mean, crisp = LiveModel(networks=networks), deepcopy(networks), deepcopy(networks)
+    mean.paint.first_step = partial(mean.paint.first_step, detail=False)
+    zeroed(crisp.paint.detail.out)
     made = [
         plain,
         replace(plain, name="live-depth-0.9", depth_scale=0.9),
@@ -249,5 +250,6 @@ def live_methods(networks: LiveNetworks) -> dict[str, LiveModel]:
         replace(plain, name="live-2-steps", steps=2),
         replace(plain, name="live-4-steps", steps=4),
         replace(plain, name="live-mean", networks=mean),
+        replace(plain, name="live-crisp", networks=crisp),
     ]
     return {each.name: each for each in made}

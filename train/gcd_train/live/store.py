@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.errors import DataError
 from gcd_train.live.clips import Array, LiveClip, clip_paths, read_clip, tensor_of
 from gcd_train.live.draws import Poses
 
@@ -112,6 +113,11 @@ class TrainingClips:
     def __len__(self) -> int:
         return len(self.paths)
 
+    @property
+    def frames(self) -> int:
+        """T."""
+        return len(self._cameras["source"][0].poses)
+
     def cameras(self, camera: str, clips: Numbers) -> list[Camera]:
         """ "source" or "target" of each of N clips."""
         return [self._cameras[camera][i] for i in clips]
@@ -134,4 +140,7 @@ def _read_pixels(path: Path, frames: slice, names: Sequence[str]) -> dict[str, A
 
 def training_paths(folder: Path) -> list[Path]:
     """The clips of a data folder that may be learned from: scenes below a million. Raises DataError."""
-    return [path for path in clip_paths(folder) if int(path.stem.split("-")[0]) < 1_000_000]
+    paths = [path for path in clip_paths(folder) if int(path.stem.split("-")[0]) < 1_000_000]
+    if not paths:
+        raise DataError(f"{folder} holds held-out scenes alone; film some below seed 1000000 to learn from")
+    return paths
