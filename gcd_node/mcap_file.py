@@ -1,31 +1,27 @@
-"""The MCAP files of recordings: how one is written, where it goes, and how much room all of them may take.
+"""The MCAP files of recordings: how one is written, and how much room all of them may take.
 
 Chunks of 64 KiB, and one at least once a second: what a reader can lose of a file that was never finished is the last.
 """
 
 import contextlib
-import itertools
 import logging
 import os
-import platform
 import time
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from gcd_client.protocol import PROTO
-from gcd_node.config import NodeConfig, RecordConfig
-from gcd_node.ros_messages import IMAGE_TOPIC, RosMessage, definition
+from gcd_node.config import RecordConfig
+from gcd_node.ros_messages import RosMessage, definition, serialized
 
 _LOG = logging.getLogger(__name__)
 _CHUNK_BYTES = 64 * 1024
 _LARGEST_SEQUENCE = 2**32
 _MB = 10**6
-_PACKAGES = ("gcd-node", "torch", "numpy", "opencv-contrib-python-headless", "mcap")
 
 
 class RoomError(Exception):
@@ -56,40 +52,16 @@ def check_room(config: RecordConfig, root: Path) -> float:
     return free_mb
 
 
-def new_folder(root: Path, node_id: str, boot_id: str) -> Path:
-    """A folder for one recording, such as `20261121T184000Z_gcd_1a2b3c4d`: names sort by time, none is taken twice.
-    Raises OSError."""
-    name = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{node_id}_{boot_id[:8]}"
-    names = itertools.chain((name,), (f"{name}_{count}" for count in itertools.count(2)))
-    folder = next(path for each in names if not (path := root / each).exists())
-    folder.mkdir()
-    return folder
-
-
-def node_facts(recording: str, part: int, config: NodeConfig, boot_id: str) -> dict[str, str]:
-    """Who recorded what, with which settings and versions. input_topic: left out if inputs are not recorded."""
-    record = config.record
-    facts = {"format": "1", "recording": recording, "part": str(part), "node_id": config.node_id, "boot_id": boot_id}
-    facts |= {"proto": PROTO, "what": ",".join(record.what), "python": platform.python_version()}
-    if "inputs" in record.what:
-        facts |= {"input_topic": IMAGE_TOPIC, "input_encoding": record.input_encoding}
-    for package in _PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            facts[f"version/{package}"] = version(package)
-    return facts
-
-
 class McapFile:
-    """A file being written. size, messages: so far. begun_ns: UTC."""
+    """A file being written. size, messages: so far. begun_ns: UTC. is_whole: whether it was closed with an end."""
 
     def __init__(self, path: Path) -> None:
         """Create `path`. Raises OSError: it is there already, or cannot be."""
-        self._path, self.begun_ns = path, time.time_ns()
+        self.path, self.begun_ns, self.is_whole = path, time.time_ns(), False
         self._file = path.open("xb")
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library=f"gcd-node; mcap-python/{version('mcap')}")
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._ids: dict[str, int] = {}  # of a type its schema's, of a topic its channel's
         self.size = self.messages = 0
         self._flushed = (0, 0)  # size and messages that are on the disk for certain
 
@@ -103,16 +75,16 @@ class McapFile:
 
     def write(self, messages: Iterable[RosMessage]) -> None:
         """Add messages that belong together: all of them, or none if one cannot be made. Raises OSError."""
-        for each in tuple(messages):
-            if each.kind not in self._schemas:
-                text = definition(each.kind).encode()
-                self._schemas[each.kind] = self._writer.register_schema(each.kind, "ros2msg", text)
-            if each.topic not in self._channels:
-                self._channels[each.topic] = self._writer.register_channel(each.topic, "cdr", self._schemas[each.kind])
+        for each, data in [(each, serialized(each.fields)) for each in messages]:
+            kind = each.fields.__msgtype__
+            if kind not in self._ids:
+                self._ids[kind] = self._writer.register_schema(kind, "ros2msg", definition(kind).encode())
+            if each.topic not in self._ids:
+                self._ids[each.topic] = self._writer.register_channel(each.topic, "cdr", self._ids[kind])
             self._writer.add_message(
-                channel_id=self._channels[each.topic],
+                channel_id=self._ids[each.topic],
                 log_time=each.log_ns,
-                data=each.data,  # pyright: ignore[reportArgumentType]  it is copied
+                data=data,  # pyright: ignore[reportArgumentType]  it is copied
                 publish_time=each.sent_ns,
                 sequence=each.sequence % _LARGEST_SEQUENCE,
             )
@@ -128,19 +100,21 @@ class McapFile:
         self.size = self._file.tell()
         self._flushed = self.size, self.messages
 
-    def finish(self) -> bool:
-        """Write index and end, and close; see cut_back() for where that fails. Returns whether the file has an end."""
+    def close(self, *, is_broken: bool = False) -> None:
+        """Write index and end. is_broken: a write has failed; then the file ends behind what was flushed, without an
+        index, and if that is nothing, it is removed."""
         try:
-            self._writer.finish()
-            self.flush(sync=True)
-            self._file.close()
+            if not is_broken:
+                self._writer.finish()
+                self.flush(sync=True)
+                self._file.close()
+                self.is_whole = True
         except Exception as error:
-            _LOG.warning("%s: %s", self._path, error)
-            return self.cut_back()
-        return True
+            _LOG.warning("%s: %s", self.path, error)
+        if not self.is_whole:
+            self._cut_back()
 
-    def cut_back(self) -> bool:
-        """After an error: end the file behind what was flushed, without an index. Returns whether it has an end."""
+    def _cut_back(self) -> None:
         self.size, self.messages = self._flushed
         builder = RecordBuilder()
         DataEnd(data_section_crc=0).write(builder)
@@ -148,8 +122,8 @@ class McapFile:
         end = builder.end() + MCAP0_MAGIC
         with contextlib.suppress(OSError), contextlib.closing(self._file.raw):  # what is buffered has no place any more
             if self.size == 0:
-                self._path.unlink()
-                return False
+                self.path.unlink()
+                return
             os.ftruncate(self._file.fileno(), self.size)
             self.size += os.pwrite(self._file.fileno(), end, self.size)
-        return self.size == self._flushed[0] + len(end)
+        self.is_whole = self.size == self._flushed[0] + len(end)

@@ -21,7 +21,7 @@ from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Lifecycle, Parts, State, Transitions, Verb
 from gcd_node.messages import MessageSink
 from gcd_node.pipeline import Summary
-from gcd_node.recorder import Recorder, RecordingSink
+from gcd_node.recorder import Recorder
 from gcd_node.service import ServiceManager, Watchdog
 from gcd_node.sources.live import backoff_s
 from gcd_node.status import Announcer
@@ -68,9 +68,8 @@ class Node:
         """
         self._config, self._once, self._on_configured = config, once, on_configured
         self.health, live, boot_id = Health(), LiveConfig(config), uuid.uuid4().hex
-        self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit)
-        self._sink = RecordingSink(sink, self.recorder)
-        self._announcer = Announcer(config.node_id, boot_id, self._sink, self.health)
+        self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit, sink)
+        self._announcer = Announcer(config.node_id, boot_id, self.recorder, self.health)
         self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
         self._transitions = Transitions(
             live, self._announcer, parts, self.recorder, lambda: self._inbox.put("over"), on_window
@@ -101,7 +100,7 @@ class Node:
 
     def stop(self) -> None:
         """End in order, soon: no new window begins, the one in work is abandoned at its next layer."""
-        self._sink.stop_waiting()
+        self.recorder.stop_waiting()
         self._inbox.put("stop")
 
     def handle(self, command: Command, role: Role) -> Outcome:

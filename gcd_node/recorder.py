@@ -4,32 +4,34 @@ A recording has a thread of its own. Between it and the node is a queue, so that
 and never frames, views or memory.
 """
 
+import contextlib
 import errno
+import itertools
 import logging
 import math
+import platform
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
+from gcd_client.protocol import PROTO, EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_node.auth import Client
 from gcd_node.config import NodeConfig, to_toml
 from gcd_node.errors import NodeError
 from gcd_node.frame import Frame, LensModel, SourceInfo
 from gcd_node.health import Level, RecordHealth
-from gcd_node.mcap_file import McapFile, RoomError, check_room, new_folder, node_facts
+from gcd_node.mcap_file import McapFile, RoomError, check_room
 from gcd_node.messages import MessageSink, PublisherStats
 from gcd_node.ros_messages import (
     COMMAND_TOPIC,
     IMAGE_TOPIC,
-    Source,
     command_messages,
     input_messages,
-    is_recorded,
     note_messages,
     view_messages,
     view_topic,
@@ -41,20 +43,27 @@ _QUEUED_BYTES, _QUEUED_ITEMS = 64 * 2**20, 4096
 _LOCKSTEP_S, _PATIENCE_S = 5.0, 10.0
 _FLUSH_S, _SYNC_EVERY, _SHARP_NS, _DRIFT_NS = 1.0, 5, 100_000, 1_000_000  # sync every so many flushes
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_PACKAGES = ("gcd-node", "torch", "numpy", "opencv-contrib-python-headless", "mcap")
 
 Tell: TypeAlias = Callable[[str, Level, Mapping[str, object]], None]  # publishes an event: code, level, fields
 
 
 class Recorder:
-    """Of one life of a node. Every method may be called from any thread; none waits for the disk, but in lockstep."""
+    """Of one life of a node: a MessageSink before another one, that records what passes, once it was published.
 
-    def __init__(self, config: NodeConfig, boot_id: str, live: Callable[[], NodeConfig], tell: Tell) -> None:
+    Every method may be called from any thread; none waits for the disk, but in lockstep. Previews are not recorded: the
+    frames themselves are.
+    """
+
+    def __init__(
+        self, config: NodeConfig, boot_id: str, live: Callable[[], NodeConfig], tell: Tell, sink: MessageSink
+    ) -> None:
         """live: the configuration in force. tell: publishes an event; called from the recorder's thread."""
-        self.config, self.boot_id, self.live, self.tell = config, boot_id, live, tell
+        self.config, self.boot_id, self.live, self.tell, self._sink = config, boot_id, live, tell, sink
         self._order = threading.Lock()
         self._recording: _Recording | None = None
         self._head: dict[str, _Item] = {}
-        self._source: Source | None = None
+        self._source: SourceInfo | None = None
         self._utc_offset_ns: int | None = None
 
     @property
@@ -82,11 +91,6 @@ class Recorder:
         self._recording.stop("ASKED", _PATIENCE_S)
         return True
 
-    def hurry(self) -> None:
-        """Make nobody wait for the disk any more, in lockstep either."""
-        if self._recording is not None:
-            self._recording.queue.hurry()
-
     def close(self, patience_s: float) -> None:
         """End for good: what waits is written for at most so long, and the last file is finished."""
         if self._recording is not None:
@@ -97,14 +101,17 @@ class Recorder:
         """How the recording does, or did."""
         return RecordHealth() if self._recording is None else self._recording.report()
 
-    # What the node tells.
+    # What comes in.
 
     def source(self, info: SourceInfo, lens: LensModel | None) -> None:
         """Frames are of this source from here on. lens: the calibration in use for its pictures."""
         hfov_deg = self.config.source.hfov_deg or info.hfov_deg
-        self._source = source = Source(info=info, lens=lens, hfov_deg=hfov_deg)
+        self._source = replace(info, lens=lens, hfov_deg=hfov_deg)
         if "inputs" in self.config.record.what:
-            facts = source.facts()
+            facts = {"kind": info.kind, "id": info.id, "stamp_uncertainty_us": str(info.stamp_uncertainty_us)}
+            facts |= {"calibrated": "no" if lens is None else "yes"} | (
+                {"hfov_deg": repr(hfov_deg)} if hfov_deg else {}
+            )
             self._put("/src/camera_info", 0, lambda file: file.describe("gcd-node/source", facts), is_head=True)
 
     def frame(self, frame: Frame) -> None:
@@ -112,35 +119,51 @@ class Recorder:
         if self._recording is None or self._source is None or "inputs" not in self.config.record.what:
             return
         source, record = self._source, self.config.record
-        is_live = source.info.clock == "realtime"
+        is_live = source.clock == "realtime"
         stamp_ns = frame.stamp_ns + self._to_utc_ns() if is_live else frame.stamp_ns
         at_ns = stamp_ns if is_live else time.time_ns()
         size = frame.image.nbytes
         self._put(IMAGE_TOPIC, size, lambda file: file.write(input_messages(frame, source, stamp_ns, at_ns, record)))
 
-    def view(self, message: ViewMessage) -> None:
-        """A view has left."""
-        if self._recording is not None and "views" in self.config.record.what and is_recorded(message):
-            size = len(message.payload)
-            self._put(view_topic(message), size, lambda file: file.write(view_messages(message, self.config)))
-
-    def note(self, kind: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
-        """A status, an event or the metadata was said."""
-
-        def write(file: McapFile) -> None:
-            log_ns = header.t_publish_ns
-            if kind == "meta" and isinstance(weights := fields.get("weights"), Mapping):
-                facts = {key: str(value) for key, value in weights.items()}
-                file.describe("gcd-node/weights", facts | {"cfg_digest": str(fields.get("cfg_digest"))})
-                log_ns = max(log_ns, file.begun_ns)  # it is said again at the head of each file
-            file.write(note_messages(kind, header, fields, log_ns))
-
-        self._put(f"/gcd/{kind}", 0, write, is_head=kind == "meta")
-
     def command(self, request: bytes, reply: bytes, client: Client) -> None:
         """A request was answered."""
         at_ns = time.time_ns()
         self._put(COMMAND_TOPIC, 0, lambda file: file.write(command_messages(request, reply, client, at_ns)))
+
+    # What goes out; see MessageSink.
+
+    def send(self, message: ViewMessage) -> object:
+        sent, topic = self._sink.send(message), view_topic(message)
+        if topic is not None and "views" in self.config.record.what:
+            self._put(topic, len(message.payload), lambda file: file.write(view_messages(message, self.config)))
+        return sent
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None:
+        self._sink.preview(made)
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
+        self._sink.end(message, delay_ms=delay_ms)
+
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        def write(file: McapFile) -> None:
+            log_ns = header.t_publish_ns
+            if topic == "meta" and isinstance(weights := fields.get("weights"), Mapping):
+                facts = {key: str(value) for key, value in weights.items()}
+                file.describe("gcd-node/weights", facts | {"cfg_digest": str(fields.get("cfg_digest"))})
+                log_ns = max(log_ns, file.begun_ns)  # it is said again at the head of each file
+            file.write(note_messages(topic, header, fields, log_ns))
+
+        self._sink.note(topic, header, fields)
+        self._put(f"/gcd/{topic}", 0, write, is_head=topic == "meta")
+
+    def stop_waiting(self) -> None:
+        self._sink.stop_waiting()
+        if self._recording is not None:
+            self._recording.queue.stop_waiting()
+
+    @property
+    def stats(self) -> PublisherStats:
+        return self._sink.stats
 
     def _put(self, topic: str, size: int, write: Callable[[McapFile], None], *, is_head: bool = False) -> None:
         item = _Item(topic=topic, size=size, write=write, is_head=is_head)
@@ -157,37 +180,6 @@ class Recorder:
         if held_ns is None or (after_ns - before_ns < _SHARP_NS and abs(offset_ns - held_ns) > _DRIFT_NS):
             self._utc_offset_ns = held_ns = offset_ns
         return held_ns
-
-
-class RecordingSink:
-    """Implements MessageSink over another one, and shows the recorder what leaves. What is published goes first.
-    Previews are not recorded: the recorder has the frames themselves."""
-
-    def __init__(self, sink: MessageSink, recorder: Recorder) -> None:
-        self._sink, self._recorder = sink, recorder
-
-    def send(self, message: ViewMessage) -> object:
-        sent = self._sink.send(message)
-        self._recorder.view(message)
-        return sent
-
-    def preview(self, made: Callable[[], ViewMessage]) -> None:
-        self._sink.preview(made)
-
-    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
-        self._sink.end(message, delay_ms=delay_ms)
-
-    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
-        self._sink.note(topic, header, fields)
-        self._recorder.note(topic, header, fields)
-
-    def stop_waiting(self) -> None:
-        self._sink.stop_waiting()
-        self._recorder.hurry()
-
-    @property
-    def stats(self) -> PublisherStats:
-        return self._sink.stats
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -209,7 +201,6 @@ class _Queue:
         self._waits, self._end_s = waits, math.inf
         self._changed = threading.Condition()
         self._items: deque[_Item] = deque()
-        self._bytes = 0
         self.dropped: Counter[str] = Counter()
 
     @property
@@ -230,10 +221,8 @@ class _Queue:
             while not self._has_room(item):
                 oldest = next(each for each in self._items if each.size)
                 self._items.remove(oldest)
-                self._bytes -= oldest.size
                 self.drop(oldest)
             self._items.append(item)
-            self._bytes += item.size
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> _Item | None:
@@ -242,12 +231,10 @@ class _Queue:
             self._changed.wait_for(lambda: bool(self._items) or self._end_s < math.inf, max(0.0, timeout_s))
             if self.over or not self._items:
                 return None
-            item = self._items.popleft()
-            self._bytes -= item.size
             self._changed.notify_all()
-            return item
+            return self._items.popleft()
 
-    def hurry(self) -> None:
+    def stop_waiting(self) -> None:
         """Make nobody wait any more."""
         with self._changed:
             self._waits = False
@@ -256,7 +243,7 @@ class _Queue:
     def close(self, patience_s: float) -> None:
         """Take nothing more in; what is in there may be taken for so long. Without any, it counts as dropped now."""
         self._end_s = min(self._end_s, time.monotonic() + patience_s)
-        self.hurry()
+        self.stop_waiting()
         if patience_s <= 0:
             with self._changed:
                 self.drop(*self._items)
@@ -268,7 +255,8 @@ class _Queue:
             self.dropped.update(item.topic for item in items)
 
     def _has_room(self, item: _Item) -> bool:
-        return self._bytes == 0 or self._bytes + item.size <= _QUEUED_BYTES  # one always finds room
+        waiting = sum(each.size for each in self._items)
+        return waiting == 0 or waiting + item.size <= _QUEUED_BYTES  # one always finds room
 
 
 class _Recording:
@@ -278,13 +266,9 @@ class _Recording:
         """head: what was said before and still holds."""
         self._recorder, self._config, self._head = recorder, recorder.config.record, dict(head)
         self.queue = _Queue(waits=recorder.config.source.pace == "lockstep")
-        self._file: McapFile | None = None
-        self._name: str | None = None  # of the file, below the folder of recordings
-        self._parts = self._bytes = self._written = 0  # of all files that are closed
-        self._whole = True
+        self._files: list[McapFile] = []
         self._stop: str | None = None
         self._failure: tuple[str, str] | None = None  # code and message
-        self._is_broken = False  # the file, since a write failed
         self.thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self.thread.start()
 
@@ -295,41 +279,54 @@ class _Recording:
 
     def report(self) -> RecordHealth:
         """How it does."""
-        file, under_way = self._file, "recording" if self._stop is None else "stopping"
+        files, under_way = tuple(self._files), "recording" if self._stop is None else "stopping"
         return RecordHealth(
             state="failed" if self._failure else under_way if self.thread.is_alive() else "off",
-            file=self._name,
-            bytes=self._bytes + (0 if file is None else file.size),
-            written=self._written + (0 if file is None else file.messages),
+            file=f"{files[-1].path.parent.name}/{files[-1].path.name}" if files else None,
+            bytes=sum(each.size for each in files),
+            written=sum(each.messages for each in files),
             dropped=dict(self.queue.dropped),
         )
 
     # What follows runs in the recorder thread alone.
 
     def _run(self) -> None:
+        is_broken = False  # since a write failed
         try:
             root = Path(self._config.folder or "").expanduser()
             root.mkdir(parents=True, exist_ok=True)
             check_room(self._config, root)
-            folder = new_folder(root, self._recorder.config.node_id, self._recorder.boot_id)
-            file = self._open(folder)
-            self._tell("REC_STARTED", Level.OK, {"file": self._name})
-            self._work(root, folder, file)
+            name = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{self._recorder.config.node_id}"
+            name = f"{name}_{self._recorder.boot_id[:8]}"  # names sort by time; none is taken twice
+            names = itertools.chain((name,), (f"{name}_{count}" for count in itertools.count(2)))
+            folder = next(path for each in names if not (path := root / each).exists())
+            folder.mkdir()
+            self._open(folder)
+            self._tell("REC_STARTED", Level.OK, {"file": self.report().file})
+            self._work(root, folder)
         except RoomError as limit:
             self._failure = limit.code, str(limit)
         except OSError as error:
-            self._is_broken = True
-            remedy = "look at the disk" if self._parts else "check folder in [record], its permissions and its disk"
+            is_broken = True
+            remedy = "look at the disk" if self._files else "check folder in [record], its permissions and its disk"
             self._failure = "DISK_FULL" if error.errno in _FULL else "DISK_ERROR", f"{error}; {remedy}"
         except Exception as error:
-            self._is_broken = True
+            is_broken = True
             _LOG.exception("the recording broke")
             self._failure = "INTERNAL", f"{type(error).__name__}; see the log"
-        self._end()
+        self.queue.close(0.0)
+        if self._files:
+            self._files[-1].close(is_broken=is_broken)
+        reason, message = self._failure or (self._stop or "INTERNAL", "")
+        done, finished = self.report(), bool(self._files) and all(each.is_whole for each in self._files)
+        fields = {"reason": reason, "file": done.file, "bytes": done.bytes, "written": done.written}
+        fields |= {"dropped": dict(done.dropped), "finished": finished} | ({"message": message} if message else {})
+        self._tell("REC_STOPPED", Level.WARN if self._failure else Level.OK, fields)
 
-    def _work(self, root: Path, folder: Path, file: McapFile) -> None:
+    def _work(self, root: Path, folder: Path) -> None:
         config, flush_s, flushes = self._config, time.monotonic() + _FLUSH_S, 0
         while not self.queue.over:
+            file = self._files[-1]
             item = self.queue.take(flush_s - time.monotonic())
             if item is not None:
                 self._write(file, item)
@@ -339,10 +336,10 @@ class _Recording:
                 check_room(config, root)
             age_s = (time.time_ns() - file.begun_ns) / 1e9
             if 0 < config.rotate_mb <= file.size / _MB or 0 < config.rotate_s <= age_s:
-                before = self._name
-                self._close(file)
-                file = self._open(folder)
-                self._tell("REC_ROTATED", Level.OK, {"file": self._name, "before": before})
+                before = self.report().file
+                file.close()
+                self._open(folder)
+                self._tell("REC_ROTATED", Level.OK, {"file": self.report().file, "before": before})
 
     def _write(self, file: McapFile, item: _Item) -> None:
         if item.is_head:
@@ -355,35 +352,24 @@ class _Recording:
             _LOG.warning("something on %s is not recorded: %s", item.topic, error)
             self.queue.drop(item)
 
-    def _open(self, folder: Path) -> McapFile:
+    def _open(self, folder: Path) -> None:
         """Every file begins with all it takes to read it alone."""
-        path = folder / f"{folder.name}_{self._parts:04d}.mcap"
-        file = self._file = McapFile(path)
-        self._name = f"{folder.name}/{path.name}"
-        config = self._recorder.live()
-        file.describe("gcd-node", node_facts(folder.name, self._parts, config, self._recorder.boot_id))
+        config, part = self._recorder.live(), len(self._files)
+        file = McapFile(folder / f"{folder.name}_{part:04d}.mcap")
+        self._files.append(file)
+        facts = {"format": "1", "recording": folder.name, "part": str(part), "node_id": config.node_id}
+        facts |= {"boot_id": self._recorder.boot_id, "proto": PROTO, "what": ",".join(config.record.what)}
+        facts |= {"python": platform.python_version()}
+        if "inputs" in config.record.what:
+            facts |= {"input_topic": IMAGE_TOPIC, "input_encoding": config.record.input_encoding}
+        for package in _PACKAGES:
+            with contextlib.suppress(PackageNotFoundError):
+                facts[f"version/{package}"] = version(package)
+        file.describe("gcd-node", facts)
         file.attach("config.toml", "application/toml", to_toml(config).encode())
-        self._parts += 1
         for item in tuple(self._head.values()):
             self._write(file, item)
         file.flush()
-        return file
-
-    def _close(self, file: McapFile) -> None:
-        self._whole &= file.cut_back() if self._is_broken else file.finish()
-        self._file = None
-        self._bytes, self._written = self._bytes + file.size, self._written + file.messages
-
-    def _end(self) -> None:
-        self.queue.close(0.0)
-        if self._file is not None:
-            self._close(self._file)
-        reason, message = self._failure or (self._stop or "INTERNAL", "")
-        done = self.report()
-        fields: dict[str, object] = {"reason": reason, "file": done.file, "bytes": done.bytes, "written": done.written}
-        fields |= {"dropped": dict(done.dropped), "finished": self._whole and self._parts > 0}
-        level = Level.WARN if self._failure else Level.OK
-        self._tell("REC_STOPPED", level, fields | ({"message": message} if message else {}))
 
     def _tell(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
         try:

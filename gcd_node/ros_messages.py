@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -15,35 +16,41 @@ from gcd_client.images import depth_m, encode_jpegs, images
 from gcd_client.protocol import OriginHeader, StatusTopic, ViewHeader, ViewMessage, kind_of, to_text
 from gcd_node.auth import Client
 from gcd_node.config import NodeConfig, RecordConfig
-from gcd_node.frame import Frame, LensModel, SourceInfo
+from gcd_node.frame import Frame, SourceInfo
 from gcd_node.health import Level
 from gcd_node.verbs import VERBS
 
 IMAGE_TOPIC, COMMAND_TOPIC = "/src/image", "/gcd/command"
-_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-_CAMERA_INFO, _STRING = "sensor_msgs/msg/CameraInfo", "std_msgs/msg/String"
 _VIEW_NAMES = {"win": "image", "cls": "classes", "std": "std", "vis": "visibility", "depth": "depth"}
 _LATEST_S = 2**31 - 1  # builtin_interfaces/Time ends in 2038
 _LONGEST_ARGS = 4096
-_WORSE: Mapping[str, Mapping[str, Level]] = {
-    "source": {"lost": Level.ERROR, "stalled": Level.WARN},
-    "model": {"failed": Level.ERROR, "degraded": Level.WARN},
-    "rec": {"failed": Level.WARN},
+_WORSE: Mapping[tuple[str, str], Level] = {
+    ("source", "lost"): Level.ERROR,
+    ("source", "stalled"): Level.WARN,
+    ("model", "failed"): Level.ERROR,
+    ("model", "degraded"): Level.WARN,
+    ("rec", "failed"): Level.WARN,
 }
-"""Levels of a part of the node by its state."""
+"""Levels of a part of the node in a state that is not all right."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RosMessage:
-    """One message of a recording. kind: its type. log_ns: UTC, its place on the time line. sent_ns: when it left the
-    node, of inputs when they were captured. sequence: the source's frame number, of headers the window's, else 0."""
+    """One message of a recording. fields: of a class of rosbags. log_ns: UTC, its place on the time line. sent_ns: when
+    it left the node, of inputs when they were captured. sequence: the source's frame number, of headers the window's,
+    else 0."""
 
     topic: str
-    kind: str
-    data: memoryview
+    fields: Any
     log_ns: int
     sent_ns: int
     sequence: int = 0
+
+
+def _types() -> Any:
+    from gcd_node.sources.ros_bags import ros2_types  # only now: a node that records nothing needs none
+
+    return ros2_types()
 
 
 def definition(kind: str) -> str:
@@ -51,101 +58,87 @@ def definition(kind: str) -> str:
     return _types().generate_msgdef(kind, ros_version=2)[0]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Source:
-    """A source, and what is known of its camera: its lens, else its field of view, else neither."""
+def serialized(fields: Any) -> memoryview:
+    """A message as CDR."""
+    return _types().serialize_cdr(fields, fields.__msgtype__, little_endian=True)
 
-    info: SourceInfo
-    lens: LensModel | None
-    hfov_deg: float | None
 
-    def facts(self) -> dict[str, str]:
-        """What its pictures do not say, for a replay. calibrated: whether camera_info holds a lens."""
-        info, calibrated = self.info, "no" if self.lens is None else "yes"
-        facts = {"kind": info.kind, "id": info.id, "stamp_uncertainty_us": str(info.stamp_uncertainty_us)}
-        return facts | {"calibrated": calibrated} | ({"hfov_deg": repr(self.hfov_deg)} if self.hfov_deg else {})
-
-    def camera_info(self, head: Any, size: tuple[int, int]) -> Any:
-        """sensor_msgs/CameraInfo of pictures of `size` (width, height); k is zero, by ROS's rule, if unknown."""
-        if self.lens is not None and self.lens.fits(*size):
-            lens = self.lens.resized(*size)
-            kind = "plumb_bob" if lens.distortion == "none" else lens.distortion
-            return _camera_info(head, size, kind, lens.coefficients or (0.0,) * 5, lens.matrix.flatten())
-        if self.lens is None and self.hfov_deg is not None:
-            focal = size[0] / 2 / math.tan(math.radians(self.hfov_deg / 2))
-            k = (focal, 0.0, (size[0] - 1) / 2, 0.0, focal, (size[1] - 1) / 2, 0.0, 0.0, 1.0)
-            return _camera_info(head, size, "plumb_bob", (0.0,) * 5, k)
-        return _camera_info(head, size, "", (), (0.0,) * 9)
+# Inputs and views.
 
 
 def input_messages(
-    frame: Frame, source: Source, stamp_ns: int, log_ns: int, record: RecordConfig
+    frame: Frame, info: SourceInfo, stamp_ns: int, log_ns: int, record: RecordConfig
 ) -> Iterator[RosMessage]:
-    """A frame and its camera. stamp_ns: when it was captured, UTC of a live source."""
-    head = _header(stamp_ns, f"{source.info.kind}_optical")
+    """A frame and its camera. info: with the lens and the field of view in use. stamp_ns: when it was captured, UTC of
+    a live source."""
+    head, size = _header(stamp_ns, f"{info.kind}_optical"), frame.size
     if record.input_encoding == "raw":
-        yield _message(IMAGE_TOPIC, _IMAGE, _image(head, frame.image), log_ns, sequence=frame.seq)
+        picture = _image(head, frame.image)
     else:
-        coded, _ = encode_jpegs(frame.image[None], record.jpeg_quality)
-        yield _message(IMAGE_TOPIC, _COMPRESSED, _jpeg(head, coded), log_ns, sequence=frame.seq)
-    camera = source.camera_info(head, frame.size)
-    yield _message("/src/camera_info", _CAMERA_INFO, camera, log_ns, sequence=frame.seq)
+        picture = _jpeg(head, encode_jpegs(frame.image[None], record.jpeg_quality)[0])
+    if info.lens is not None and info.lens.fits(*size):
+        lens = info.lens.resized(*size)
+        kind = "plumb_bob" if lens.distortion == "none" else lens.distortion
+        camera = _camera_info(head, size, lens.matrix, kind, lens.coefficients or (0.0,) * 5)
+    elif info.lens is None and info.hfov_deg is not None:
+        focal = size[0] / 2 / math.tan(math.radians(info.hfov_deg / 2))
+        camera = _camera_info(head, size, (focal, 0, (size[0] - 1) / 2, 0, focal, (size[1] - 1) / 2, 0, 0, 1))
+    else:
+        camera = _camera_info(head, size, (0.0,) * 9, "", ())  # unknown, by ROS's rule
+    for topic, fields in ((IMAGE_TOPIC, picture), ("/src/camera_info", camera)):
+        yield RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=log_ns, sequence=frame.seq)
 
 
-def is_recorded(message: ViewMessage) -> bool:
-    """Whether a view message has pixels that no other one of its window has."""
-    return message.topic.startswith("view/") and kind_of(message.topic) in _VIEW_NAMES
-
-
-def view_topic(message: ViewMessage) -> str:
-    """Where its pixels go."""
-    return f"/view/{message.header.view_id}/{_VIEW_NAMES[kind_of(message.topic)]}"
+def view_topic(message: ViewMessage) -> str | None:
+    """Where the pixels of a view go; None if another message of its window has them."""
+    name = _VIEW_NAMES.get(kind_of(message.topic)) if message.topic.startswith("view/") else None
+    return None if name is None else f"/view/{message.header.view_id}/{name}"
 
 
 def view_messages(message: ViewMessage, config: NodeConfig) -> Iterator[RosMessage]:
-    """A window: its frames and their camera, its header, age and poses. Raises MessageError: it cannot be decoded."""
+    """A window: its frames and their camera, its header, age and poses. Raises MessageError: it cannot be decoded.
+
+    It leaves the node as one; on the time line its frames follow each other as they were taken, from then on, and end
+    before the next window begins. In lockstep there is no rhythm to keep.
+    """
     header, kind = message.header, kind_of(message.topic)
-    place, at_ns = f"/view/{header.view_id}", header.t_publish_ns
+    place, at_ns, frames = f"/view/{header.view_id}", header.t_publish_ns, header.shape[0]
+    heads = [_head(header, index) for index in range(frames)]
     if kind in ("win", "std"):
         name = "header" if kind == "win" else "std_header"
         yield _text(f"{place}/{name}", to_text(header, {}), at_ns, at_ns, header.window_id)
     if kind == "win":
-        yield _message(
-            f"{place}/age_ms", "std_msgs/msg/Float64", _make("std_msgs/msg/Float64", data=header.age_ms), at_ns
-        )
+        age = _make("std_msgs/msg/Float64", data=header.age_ms)
+        yield RosMessage(topic=f"{place}/age_ms", fields=age, log_ns=at_ns, sent_ns=at_ns)
         if header.source_from_view is not None and header.pose_units == "m":
-            moved = [_transform(header, i, numbers) for i, numbers in enumerate(header.source_from_view)]
-            yield _message("/tf", "tf2_msgs/msg/TFMessage", _make("tf2_msgs/msg/TFMessage", transforms=moved), at_ns)
-    size = (header.shape[2], header.shape[1])
-    for index, (type_, picture) in enumerate(_pictures(message, config.record.jpeg_quality)):
-        yield _of_frame(header, index, view_topic(message), type_, picture, config)
-        if kind == "win" and header.intrinsics is not None:
-            camera = _camera_info(_head(header, index), size, "plumb_bob", (0.0,) * 5, header.intrinsics)
-            yield _of_frame(header, index, f"{place}/camera_info", _CAMERA_INFO, camera, config)
-
-
-def _of_frame(header: ViewHeader, index: int, topic: str, kind: str, fields: Any, config: NodeConfig) -> RosMessage:
-    """A window leaves the node as one; on the time line its frames follow each other as they were taken, from then on,
-    and end before the next window begins. In lockstep there is no rhythm to keep."""
-    frames, sequences = header.shape[0], header.src.seq
+            moved = [_transform(header, _head(header, i).stamp, pose) for i, pose in enumerate(header.source_from_view)]
+            transforms = _make("tf2_msgs/msg/TFMessage", transforms=moved)
+            yield RosMessage(topic="/tf", fields=transforms, log_ns=at_ns, sent_ns=at_ns)
     paced = config.source.pace == "realtime"
     step_s = (config.window.stride or frames) / (frames * header.src.fps_cond) if paced else 0.0
-    log_ns = header.t_publish_ns + round(index * step_s * 1e9)
-    return _message(topic, kind, fields, log_ns, header.t_publish_ns, sequences[min(index, len(sequences) - 1)])
+    pictures = _pictures(message, heads, config.record.jpeg_quality)
+    for index, (head, picture) in enumerate(zip(heads, pictures, strict=True)):
+        parts = {view_topic(message) or "": picture}
+        if kind == "win" and header.intrinsics is not None:
+            parts[f"{place}/camera_info"] = _camera_info(head, (header.shape[2], header.shape[1]), header.intrinsics)
+        log_ns, sequence = at_ns + round(index * step_s * 1e9), header.src.seq[min(index, len(header.src.seq) - 1)]
+        for topic, fields in parts.items():
+            yield RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=at_ns, sequence=sequence)
 
 
-def _pictures(message: ViewMessage, quality: int) -> Iterator[tuple[str, Any]]:
+def _pictures(message: ViewMessage, heads: Sequence[Any], quality: int) -> list[Any]:
     header = message.header
     if header.encoding not in ("rgb8", "jpeg"):
-        is_depth = header.encoding == "invdepth16"
-        for index, pixels in enumerate(depth_m(message)[..., None] if is_depth else images(message)):
-            yield _IMAGE, _image(_head(header, index), pixels)
-        return
+        pixels = depth_m(message)[..., None] if header.encoding == "invdepth16" else images(message)
+        return [_image(head, each) for head, each in zip(heads, pixels, strict=True)]
     payload, offsets = message.payload, header.offsets
     if offsets is None:
         payload, offsets = encode_jpegs(images(message), quality)
-    for index in range(header.shape[0]):
-        yield _COMPRESSED, _jpeg(_head(header, index), memoryview(payload)[offsets[index] : offsets[index + 1]])
+    parts = [memoryview(payload)[begin:end] for begin, end in pairwise(offsets)]
+    return [_jpeg(head, part) for head, part in zip(heads, parts, strict=True)]
+
+
+# What the node says and is asked.
 
 
 def note_messages(
@@ -155,28 +148,22 @@ def note_messages(
     sent_ns = header.t_publish_ns
     yield _text(f"/gcd/{kind}", to_text(header, fields), log_ns, sent_ns)
     if kind == "status":
-        array = "diagnostic_msgs/msg/DiagnosticArray"
         parts = list(_diagnostics(header.node_id, fields))
-        yield _message("/diagnostics", array, _make(array, header=_header(sent_ns, ""), status=parts), sent_ns)
+        array = _make("diagnostic_msgs/msg/DiagnosticArray", header=_header(sent_ns, ""), status=parts)
+        yield RosMessage(topic="/diagnostics", fields=array, log_ns=sent_ns, sent_ns=sent_ns)
 
 
 def _diagnostics(node_id: str, fields: Mapping[str, Any]) -> Iterator[Any]:
     """One line for the node and one for each of its parts, whose message is its state, so that it can be plotted."""
-    reasons = ", ".join(map(str, fields.get("reasons", ())))
-    plain = {key: value for key, value in fields.items() if not isinstance(value, Mapping | list)}
-    level, state = Level(int(fields.get("level", 0))), str(fields.get("state", ""))
-    yield _diagnostic(node_id, "node", level, state, {**plain, "reasons": reasons})
-    for name, part in fields.items():
-        if isinstance(part, Mapping):
-            state = str(part.get("state", ""))
-            yield _diagnostic(node_id, name, _WORSE.get(name, {}).get(state, Level.OK), state, part)
-
-
-def _diagnostic(node_id: str, name: str, level: Level, state: str, values: Mapping[str, Any]) -> Any:
-    pairs = [_make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in _flat(values, "")]
-    kind = "diagnostic_msgs/msg/DiagnosticStatus"
-    name = f"{node_id}: {name}"
-    return _make(kind, level=int(level), name=name, message=state, hardware_id=node_id, values=pairs)
+    node = {key: value for key, value in fields.items() if not isinstance(value, Mapping | list)}
+    node["reasons"] = ", ".join(map(str, fields.get("reasons", ())))
+    parts = {"node": node} | {name: part for name, part in fields.items() if isinstance(part, Mapping)}
+    for name, part in parts.items():
+        state = str(part.get("state", ""))
+        level = int(fields.get("level", 0)) if part is node else _WORSE.get((name, state), Level.OK)
+        pairs = [_make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in _flat(part, "")]
+        status = {"name": f"{node_id}: {name}", "message": state, "hardware_id": node_id, "values": pairs}
+        yield _make("diagnostic_msgs/msg/DiagnosticStatus", level=int(level), **status)
 
 
 def _flat(fields: Mapping[str, Any], place: str) -> Iterator[tuple[str, object]]:
@@ -209,28 +196,16 @@ def _object(text: bytes) -> dict[str, Any]:
         return {}
 
 
-# --- ROS messages ------------------------------------------------------------------------------------------------
-
-
-def _types() -> Any:
-    from gcd_node.sources.ros_bags import ros2_types  # only now: a node that records nothing needs none
-
-    return ros2_types()
+# Parts of messages.
 
 
 def _make(kind: str, **fields: Any) -> Any:
     return _types().types[kind](**fields)
 
 
-def _message(
-    topic: str, kind: str, fields: Any, log_ns: int, sent_ns: int | None = None, sequence: int = 0
-) -> RosMessage:
-    data, sent_ns = _types().serialize_cdr(fields, kind, little_endian=True), log_ns if sent_ns is None else sent_ns
-    return RosMessage(topic=topic, kind=kind, data=data, log_ns=log_ns, sent_ns=sent_ns, sequence=sequence)
-
-
 def _text(topic: str, text: bytes, log_ns: int, sent_ns: int, sequence: int = 0) -> RosMessage:
-    return _message(topic, _STRING, _make(_STRING, data=text.decode()), log_ns, sent_ns, max(0, sequence))
+    fields = _make("std_msgs/msg/String", data=text.decode())
+    return RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=sent_ns, sequence=max(0, sequence))
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:
@@ -245,62 +220,56 @@ def _head(header: ViewHeader, index: int) -> Any:
 
 
 def _jpeg(head: Any, coded: bytes | memoryview) -> Any:
-    return _make(_COMPRESSED, header=head, format="jpeg", data=np.frombuffer(coded, np.uint8))
+    data = np.frombuffer(coded, np.uint8)
+    return _make("sensor_msgs/msg/CompressedImage", header=head, format="jpeg", data=data)
 
 
 def _image(head: Any, pixels: NDArray[Any]) -> Any:
     """u8 [H, W, 3] as rgb8 and [H, W, 1] as mono8; depth in metres [H, W, 1] as 32FC1 (REP 118)."""
     height, width, channels = pixels.shape
     encoding = "32FC1" if pixels.dtype == np.float32 else "rgb8" if channels == 3 else "mono8"
-    return _make(
-        _IMAGE,
-        header=head,
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=0,
-        step=width * channels * pixels.itemsize,
-        data=np.ascontiguousarray(pixels).reshape(-1).view(np.uint8),
-    )
+    shape = {"height": height, "width": width, "step": width * channels * pixels.itemsize}
+    data = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
+    return _make("sensor_msgs/msg/Image", header=head, encoding=encoding, is_bigendian=0, data=data, **shape)
 
 
 def _camera_info(
-    head: Any, size: tuple[int, int], distortion: str, d: Sequence[float], k: Sequence[float] | NDArray[np.float64]
+    head: Any,
+    size: tuple[int, int],
+    k: Sequence[float] | NDArray[np.float64],
+    distortion: str = "plumb_bob",
+    d: Sequence[float] = (0.0,) * 5,
 ) -> Any:
-    p = np.zeros((3, 4))
-    p[:, :3] = np.reshape(k, (3, 3))
-    roi = _make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    """size: width and height. k: row by row."""
+    matrix, p = np.array(k, np.float64).reshape(3, 3), np.zeros((3, 4))
+    p[:, :3] = matrix
     return _make(
-        _CAMERA_INFO,
+        "sensor_msgs/msg/CameraInfo",
         header=head,
         height=size[1],
         width=size[0],
         distortion_model=distortion,
         d=np.array(d, np.float64),
-        k=np.array(k, np.float64),
+        k=matrix.reshape(-1),
         r=np.eye(3).reshape(-1),
         p=p.reshape(-1),
         binning_x=0,
         binning_y=0,
-        roi=roi,
+        roi=_make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
     )
 
 
-def _transform(header: ViewHeader, index: int, numbers: Sequence[float]) -> Any:
+def _transform(header: ViewHeader, stamp: Any, numbers: Sequence[float]) -> Any:
     """Where the virtual camera stands in the source camera's axes."""
     pose = np.asarray(numbers, np.float64).reshape(4, 4)
     turn = cv2.Rodrigues(pose[:3, :3])[0].reshape(3)  # the axis, as long as the angle
     angle = float(np.linalg.norm(turn))
     x, y, z = (turn * (math.sin(angle / 2) / angle if angle > 0 else 0.5)).tolist()
-    place = dict(zip("xyz", pose[:3, 3].tolist(), strict=True))
-    seen = _head(header, index)
+    place = _make("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3].tolist(), strict=True)))
+    rotation = _make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=math.cos(angle / 2))
     return _make(
         "geometry_msgs/msg/TransformStamped",
-        header=_make("std_msgs/msg/Header", stamp=seen.stamp, frame_id=header.src_frame_id),
+        header=_make("std_msgs/msg/Header", stamp=stamp, frame_id=header.src_frame_id),
         child_frame_id=header.frame_id,
-        transform=_make(
-            "geometry_msgs/msg/Transform",
-            translation=_make("geometry_msgs/msg/Vector3", **place),
-            rotation=_make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=math.cos(angle / 2)),
-        ),
+        transform=_make("geometry_msgs/msg/Transform", translation=place, rotation=rotation),
     )

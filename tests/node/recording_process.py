@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from fakes import HEIGHT, WIDTH
+from fakes import HEIGHT, WIDTH, Box
 from recordings import files, recorder_config, salvaged
 
 from gcd_node.frame import Frame, SourceInfo
@@ -21,7 +21,7 @@ FPS = 100.0
 def main() -> None:
     folder, count = Path(sys.argv[1]), int(sys.argv[2])
     config = recorder_config(folder, source='kind = "v4l2"')
-    recorder = Recorder(config, "0" * 32, lambda: config, lambda *_: None)
+    recorder = Recorder(config, "0" * 32, lambda: config, lambda *_: None, Box())
     info = SourceInfo(kind="v4l2", id="test", width=WIDTH, height=HEIGHT, fps_nominal=FPS, clock="realtime")
     recorder.source(info, None)
     recorder.start()

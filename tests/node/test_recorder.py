@@ -256,7 +256,8 @@ def test_a_file_on_a_broken_disk_is_whole_up_to_its_last_flush(tmp_path: Path, m
     file.write(note_messages("event", origin(), {"code": "lost"}, 100))
     for name in ("fdatasync", "pwrite"):
         monkeypatch.setattr(os, name, broken)
-    assert not file.finish()
+    file.close()
+    assert not file.is_whole
     assert len(salvaged(tmp_path / "a.mcap", "/gcd/event")) == file.messages == 100
 
 
@@ -285,7 +286,7 @@ class Hanging:
         monkeypatch.setattr(McapFile, "write", lambda file, each: (self.released.wait(100.0), write(file, each))[1])
         config = recorder_config(folder, source=source, record=RAW)
         self.told: list[str] = []
-        self.recorder = Recorder(config, "0" * 32, lambda: config, lambda code, *_: self.told.append(code))
+        self.recorder = Recorder(config, "0" * 32, lambda: config, lambda code, *_: self.told.append(code), Box())
         info = SourceInfo(kind="v4l2", id="t", width=100, height=100, fps_nominal=10.0, clock="realtime")
         self.recorder.source(info, None)
         self.recorder.start()
