@@ -48,7 +48,7 @@ class RosMessage:
 
 
 def _types() -> Any:
-    from gcd_node.sources.ros_bags import ros2_types  # only now: a node that records nothing needs none
+    from gcd_node.sources.log_reader import ros2_types  # only now: a node that records nothing needs none
 
     return ros2_types()
 

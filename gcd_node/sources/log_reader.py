@@ -1,51 +1,41 @@
-"""Messages of robot logs, front to back: MCAP files, ROS 2 bags (folders and .db3 files) and ROS 1 bags; and the
-pictures and depth in them.
+"""Messages of robot logs, front to back: MCAP files, ROS 2 bags (folders and .db3 files) and ROS 1 bags.
 
 `mcap` and `rosbags` read what is there; how much and how long is limited here, because a log of a few kB can unfold
 into gigabytes. ROS messages are read by the definitions that ship with rosbags, whatever the log says of them. What is
 damaged in a way that is not looked for raises whatever the library does that found it.
 """
 
+import bz2
 import functools
 import io
 import logging
 import re
-import struct
+import shutil
+import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar, cast
+from typing import IO, Any, cast
 
-import cv2
+import lz4.frame
 import msgspec
-import numpy as np
 import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
-from numpy.typing import NDArray
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader as Ros2Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from gcd_model import printable
+from gcd_model import FileError, printable, read_small
 from gcd_node.errors import SourceError
-from gcd_node.frame import MAX_PIXELS, Image
-from gcd_node.sources.files import decode_picture, raw_picture, raw_rows
-from gcd_node.sources.ros_bags import (
-    MAX_BYTES,
-    bag_messages,
-    files_of,
-    kind_of_log,
-    ros1_types,
-    ros2_types,
-    unfolded,
-    unpacked,
-)
 
 _LOG = logging.getLogger(__name__)
-_Record = TypeVar("_Record", Schema, Channel, Metadata)
 
 CODED_IMAGES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
 VIDEOS = frozenset({"foxglove.CompressedVideo", "foxglove_msgs/msg/CompressedVideo"})
@@ -54,13 +44,12 @@ CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _READABLE = IMAGES | CAMERAS | {ODOMETRY, TRANSFORMS}
 
+MAX_BYTES = 96 * 2**20
+"""Of a record, of an unfolded chunk, and of an unfolded message."""
 _MAX_KEPT = 16 * 2**20  # of all topics and definitions together
+_HEADS = {b"\x89MCAP0\r\n": ".mcap", b"#ROSBAG V": ".bag", b"SQLite format 3\0": ".db3"}
+_MODE = re.compile(r"compression_mode:\s*[\"']?(message|file)", re.IGNORECASE)
 _ROS1_TYPE = re.compile(r"^(\w+)/(\w+)$")
-_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-_CODECS = ("jpeg", "png", "webp")
-_DEPTH = ("16UC", "32FC", "64FC", "16SC", "32SC")
-_PNG = b"\x89PNG\r\n\x1a\n"
-_VIDEO_DECODERS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}
 
 
 class LogLimitError(SourceError):
@@ -99,9 +88,9 @@ class LogReader:
         """
         self._path, self._search_s, self._stopped = path, search_s, stopped
         try:
-            self._files, self._packed = files_of(path) if path.is_dir() else ((path,), "")
-            if kind_of_log(path) is None:
-                raise SourceError(f"{path} is no log, or empty; give an MCAP file, a ROS bag or the folder of one")
+            self._files, self._packed = _files_of(path) if path.is_dir() else ([path], "")
+            if not self._files or (not path.is_dir() and _kind_of(path) is None):
+                raise SourceError(f"{path} is no log, empty or missing; give an MCAP file, a ROS bag or its folder")
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise SourceError(f"cannot read the log {path}: {reason}; check path and permissions") from error
@@ -122,49 +111,47 @@ class LogReader:
         """
         for file in self._files:
             try:
-                with unpacked(file) if self._packed == "file" else nullcontext(file) as plain:
-                    yield from self._messages(plain)
+                with _unpacked(file) if self._packed == "file" else nullcontext(file) as plain:
+                    kind = _kind_of(plain)
+                    yield from (
+                        self._bag(plain, is_ros1=kind == ".bag") if kind in (".bag", ".db3") else self._mcap(plain)
+                    )
             except zstandard.ZstdError as error:
                 raise SourceError(f"{file} cannot be unpacked: {line_of(error)}") from error
             except OSError as error:
                 raise SourceError(f"cannot read {file}: {error.strerror or error}; check the disk") from error
-
-    def _messages(self, file: Path) -> Iterator[LogMessage]:
-        kind = kind_of_log(file)
-        if kind is None and not file.is_file():
-            raise SourceError(f"{file} is no log; take it out of the folder")
-        yield from self._bag(file, is_ros1=kind == ".bag") if kind in (".bag", ".db3") else self._mcap(file)
 
     def _check(self) -> None:
         if time.monotonic() > self._end_s or self._stopped():
             raise LogLimitError(f"nothing was found in {self._search_s:g} s of reading")
 
     def _mcap(self, file: Path) -> Iterator[LogMessage]:
-        schemas: dict[int, Schema] = {0: Schema(id=0, data=b"", encoding="", name="")}
-        channels: dict[int, Channel] = {}
-        readable: dict[int, tuple[str, Callable[[bytes], Any]]] = {}
+        known: dict[tuple[type, int], Schema | Channel] = {}
+        readable: dict[int, tuple[str, str, Callable[[bytes], Any]]] = {}  # topic, type and what reads it
         for record in self._records(functools.partial(file.open, "rb")):
             if isinstance(record, Message):
                 if record.channel_id in readable:
-                    kind, decode = readable[record.channel_id]
+                    topic, kind, decode = readable[record.channel_id]
                     yield LogMessage(
-                        topic=channels[record.channel_id].topic,
+                        topic=topic,
                         kind=kind,
                         sequence=record.sequence,
                         log_ns=record.log_time,
                         sent_ns=record.publish_time,
-                        decode=functools.partial(self._unpacked, decode, record.data),
+                        decode=functools.partial(self._decoded, decode, record.data),
                     )
-            elif isinstance(record, Schema) and schemas.get(record.id) != record:  # many writers repeat them
-                schemas[record.id] = self._kept(record)
-            elif isinstance(record, Channel) and channels.get(record.id) != record:
-                channels[record.id] = self._kept(record)
-                kind, decode = _decoder_of(record, schemas.get(record.schema_id, schemas[0]))
-                self.topics[record.topic] = kind
-                if decode is not None:
-                    readable[record.id] = kind, decode
+            elif isinstance(record, Schema | Channel):
+                if known.get(key := (type(record), record.id)) != record:  # many writers repeat them
+                    self._keep(record)
+                    known[key] = record
+                    if isinstance(record, Channel):
+                        kind, decode = _decoder_of(record, known.get((Schema, record.schema_id)))
+                        self.topics[record.topic] = kind
+                        if decode is not None:
+                            readable[record.id] = record.topic, kind, decode
             elif isinstance(record, Metadata) and record.name.startswith("gcd-node"):
-                self.metadata[record.name] = self._kept(record).metadata
+                self._keep(record)
+                self.metadata[record.name] = record.metadata
 
     def _records(self, open_stream: Callable[[], IO[bytes]], *, in_chunk: bool = False) -> Iterator[McapRecord]:
         """Everything before the index, chunks unfolded; of what was cut or is damaged, what is whole."""
@@ -194,20 +181,30 @@ class LogReader:
             )
             self.damaged += in_chunk
 
-    def _kept(self, record: _Record) -> _Record:
-        """The same, its bytes counted. Raises LogLimitError."""
+    def _keep(self, record: McapRecord) -> None:
         self._kept_bytes += len(msgspec.json.encode(vars(record)))
         if self._kept_bytes > _MAX_KEPT:
             raise LogLimitError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")
-        return record
 
     def _bag(self, path: Path, *, is_ros1: bool) -> Iterator[LogMessage]:
         decode = ros1_types().deserialize_ros1 if is_ros1 else ros2_types().deserialize_cdr
         try:
-            for topic, kind, at_ns, data in bag_messages(path, is_ros1=is_ros1, topics=self.topics, kinds=_READABLE):
-                self._check()
-                read = functools.partial(self._unpacked, functools.partial(decode, typename=kind), data)
-                yield LogMessage(topic=topic, kind=kind, sequence=0, log_ns=at_ns, sent_ns=at_ns, decode=read)
+            with Ros1Reader(path) if is_ros1 else Ros2Reader(path) as reader:
+                self.topics |= {each.topic: each.msgtype for each in reader.connections}
+                if isinstance(reader, Ros1Reader):  # which lets a chunk unfold to whatever it holds
+                    for place, chunk in reader.chunks.items():
+                        kinds = {bz2.decompress: "bz2", lz4.frame.decompress: "lz4"}
+                        if kind := kinds.get(chunk.decompressor):
+                            limited = functools.partial(unfolded, compression=kind)
+                            reader.chunks[place] = chunk._replace(decompressor=limited)
+                wanted = [each for each in reader.connections if each.msgtype in _READABLE]
+                for connection, at_ns, data in reader.messages(connections=wanted) if wanted else ():
+                    self._check()
+                    kind = connection.msgtype
+                    read = functools.partial(self._decoded, functools.partial(decode, typename=kind), data)
+                    yield LogMessage(
+                        topic=connection.topic, kind=kind, sequence=0, log_ns=at_ns, sent_ns=at_ns, decode=read
+                    )
         except (LogLimitError, OSError):
             raise
         except Exception as error:  # of rosbags, SQLite or a decompressor
@@ -215,9 +212,72 @@ class LogReader:
                 f"{path} cannot be read as a ROS bag: {line_of(error)}; try ros2 bag reindex, or rosbag reindex"
             ) from error
 
-    def _unpacked(self, decode: Callable[[bytes], Any], data: bytes) -> Any:
+    def _decoded(self, decode: Callable[[bytes], Any], data: bytes) -> Any:
         """What a message says, unfolded first where each is packed for itself."""
         return decode(unfolded(data, "zstd") if self._packed == "message" else data)
+
+
+# Files, and how they are packed.
+
+
+def _kind_of(file: Path) -> str | None:
+    """By its first bytes: ".mcap", ".bag" of ROS 1, ".db3" of ROS 2; None if it is none, or no regular file."""
+    if not file.is_file():  # to open a pipe would wait for its writer
+        return None
+    with file.open("rb") as stream:
+        head = stream.read(max(map(len, _HEADS)))
+    return next((kind for begin, kind in _HEADS.items() if head.startswith(begin)), None)
+
+
+def _files_of(folder: Path) -> tuple[list[Path], str]:
+    """What is read one after another, the files of one recording in the order of their numbers; and what is packed:
+    each "message", each "file", or "". Raises SourceError: there are several logs."""
+    metadata, mode = folder / "metadata.yaml", None
+    if metadata.is_file():
+        try:
+            mode = _MODE.search(read_small(metadata))
+        except FileError as error:
+            raise SourceError(f"{metadata} {error}; run ros2 bag reindex") from error
+    packed = "" if mode is None else mode[1].lower()
+    found: list[Path] = []
+    for suffix in (".mcap", ".db3"):
+        pattern = f"*{suffix}{'.zstd' if packed == 'file' else ''}"
+        files = [file for file in folder.glob(pattern) if file.is_file()]
+        found = found or sorted(files, key=lambda file: (len(file.name), file.name))
+    if not metadata.is_file() and len({re.sub(r"_?\d*$", "", file.stem) for file in found}) > 1:
+        raise SourceError(f"{folder} is a folder of several logs; give one of them, such as {found[0].name}")
+    return found, packed
+
+
+@contextmanager
+def _unpacked(file: Path) -> Generator[Path]:
+    """A file that was packed whole, in a folder of its own for as long. It takes half of the free room at most."""
+    with tempfile.TemporaryDirectory(prefix="gcd-node-") as folder:
+        most, plain = shutil.disk_usage(folder).free // 2, Path(folder, file.stem)
+        with file.open("rb") as packed, plain.open("wb") as out:
+            for part in zstandard.ZstdDecompressor().read_to_iter(packed):
+                most -= len(part)
+                if most < 0:
+                    raise SourceError(f"{file} unpacks to more than half of the room in {folder}; unpack it elsewhere")
+                out.write(part)
+        yield plain
+
+
+def unfolded(data: bytes, compression: str, most: int | None = None) -> bytes:
+    """The content of a packed message or chunk: "zstd", "lz4" or "bz2". most: bytes, None for MAX_BYTES.
+
+    Raises SourceError if there are more.
+    """
+    most = MAX_BYTES if most is None else most
+    if compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as unfolding:
+            content = io.BufferedReader(cast(io.RawIOBase, unfolding)).read(most + 1)
+    else:
+        decompressor = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
+        content = cast(Any, decompressor).decompress(data, max_length=most + 1)
+    if len(content) > most:
+        raise SourceError(f"a packed part holds more than {most} bytes")
+    return content
 
 
 class _LimitedStream:
@@ -247,8 +307,10 @@ def _unfolded(chunk: Chunk) -> IO[bytes]:
     return io.BytesIO(records)
 
 
-def _decoder_of(channel: Channel, schema: Schema) -> tuple[str, Callable[[bytes], Any] | None]:
+def _decoder_of(channel: Channel, schema: Any) -> tuple[str, Callable[[bytes], Any] | None]:
     """The type of a channel's messages, and what reads them; None if nothing does, or nobody needs them."""
+    if schema is None:
+        return "", None
     encoding = channel.message_encoding
     kind = _ROS1_TYPE.sub(r"\1/msg/\2", schema.name) if encoding == "ros1" else schema.name
     if kind not in _READABLE:
@@ -268,87 +330,21 @@ def line_of(error: Exception) -> str:
     return printable(" ".join(str(error)[:2000].split()), 200) or type(error).__name__
 
 
-# Pictures.
+# Types of messages.
 
 
-class ImageDecoder:
-    """Pictures of one topic. Of a video it must be given every message, in order."""
-
-    def __init__(self) -> None:
-        self._video: Any = None
-
-    def decode(self, kind: str, fields: Any) -> tuple[Image, str] | None:
-        """The picture, u8 [H, W, 3] RGB, and what it was coded as; None while a video waits for its key frame.
-
-        Args:
-            kind: of IMAGES. fields: of the message.
-        Raises:
-            SourceError: damaged, too large, in a layout that is not read, or PyAV is not installed.
-        """
-        if kind in VIDEOS:
-            return self._decode_video(str(fields.format).lower(), _bytes_of(fields.data))
-        if kind not in CODED_IMAGES:
-            return raw_picture(fields), str(fields.encoding)
-        format_ = str(fields.format)
-        if format_.startswith(_DEPTH) or "compressedDepth" in format_:
-            raise SourceError(f"{format_[:40]!r} is a map of depths, not a picture")
-        picture = decode_picture(_bytes_of(fields.data), _COLOUR)
-        if "compressed rgb" not in format_:  # the order image_transport handed to the coder, which takes all for BGR
-            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-        codec = next((each for each in _CODECS if each in format_.lower()), "jpeg")
-        return np.ascontiguousarray(picture, np.uint8), codec
-
-    def _decode_video(self, codec: str, data: bytes) -> tuple[Image, str] | None:
-        try:
-            import av
-        except ImportError as error:
-            raise SourceError(f"to read {codec[:20]} video, PyAV is needed: pip install 'gcd-node[video]'") from error
-        if codec not in _VIDEO_DECODERS:
-            raise SourceError(f"video in {codec[:20]!r} is not read; known are {', '.join(_VIDEO_DECODERS)}")
-        if self._video is None:
-            self._video = av.CodecContext.create(_VIDEO_DECODERS[codec], "r")
-            self._video.thread_count = 1  # more would keep frames back
-            self._video.options = {"max_pixels": str(MAX_PIXELS)}
-        frames = self._video.decode(av.Packet(data))
-        return (frames[-1].to_ndarray(format="rgb24"), codec) if frames else None
+@functools.cache
+def ros2_types() -> Typestore:
+    """ROS 2 messages: those in this file are the same in every distribution."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    video = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+    store.register(get_types_from_msg(video, "foxglove_msgs/msg/CompressedVideo"))
+    return store
 
 
-def depth_of(kind: str, fields: Any) -> NDArray[Any]:
-    """A depth picture as it was sent, [H, W]: uint16 millimetres or float32 metres.
-
-    Raises:
-        SourceError: damaged, or no depth.
-    """
-    if kind in CODED_IMAGES:
-        return _decoded_depth(str(fields.format), _bytes_of(fields.data))
-    types = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-    if kind in VIDEOS or fields.encoding not in types:
-        raise SourceError(f"depth is read from 16UC1, mono16 and 32FC1, got {getattr(fields, 'encoding', kind)!r}")
-    order = ">" if getattr(fields, "is_bigendian", 0) else "<"
-    stored = np.dtype(order + types[fields.encoding])
-    rows = np.ascontiguousarray(raw_rows(fields, stored.itemsize, fields.height))
-    return rows.view(stored).astype(stored.newbyteorder("="))
-
-
-def _bytes_of(data: Any) -> bytes:
-    """Of a message, whose own definition may have anything in their place. Raises SourceError."""
-    if isinstance(data, np.ndarray) and data.dtype == np.uint8:
-        return data.tobytes()
-    if not isinstance(data, bytes | bytearray | memoryview):
-        raise SourceError(f"its data are no bytes, but {type(data).__name__}")
-    return bytes(data)
-
-
-def _decoded_depth(format_: str, coded: bytes) -> NDArray[Any]:
-    """A 16-bit PNG of millimetres; behind the 12 bytes of image_transport's compressedDepth also of inverse depth."""
-    start = coded.find(_PNG, 0, 64)
-    levels = decode_picture(coded[max(start, 0) :], cv2.IMREAD_UNCHANGED)
-    if start < 0 or levels.dtype != np.uint16 or levels.ndim != 2:
-        raise SourceError(f"depth in {format_[:40]!r} must be a PNG of one channel of 16 bits")
-    if not format_.startswith("32FC1"):
-        return levels
-    if start < 12:
-        raise SourceError("depth in 32FC1 lacks the numbers that scale it: it is damaged")
-    a, b = struct.unpack_from("<ff", coded, 4)  # level = a / metres + b
-    with np.errstate(all="ignore"):
-        return np.where(levels > 0, a / (levels - np.float32(b)), 0).astype(np.float32)
+@functools.cache
+def ros1_types() -> Typestore:
+    """The same of ROS 1."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store

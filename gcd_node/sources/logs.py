@@ -2,36 +2,23 @@
 
 import contextlib
 import logging
-import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_model import printable
 from gcd_node.errors import SourceError, TooShortError
-from gcd_node.frame import MAX_FPS, Frame, LensModel, SourceInfo, lens_of_message
+from gcd_node.frame import MAX_FPS, Frame, SourceInfo
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.files import Pace, Recording
-from gcd_node.sources.log_reader import (
-    CAMERAS,
-    IMAGES,
-    ODOMETRY,
-    TRANSFORMS,
-    ImageDecoder,
-    LogLimitError,
-    LogMessage,
-    LogReader,
-    depth_of,
-    line_of,
-)
+from gcd_node.sources.log_messages import Cameras, ImageDecoder, depth_of, head_of, pose_of
+from gcd_node.sources.log_reader import IMAGES, ODOMETRY, LogLimitError, LogMessage, LogReader, line_of
 
 _LOG = logging.getLogger(__name__)
 _SEARCH_S = 15.0  # of reading, for what is needed to begin, and from one picture to the next
@@ -42,8 +29,6 @@ _LATEST_NS = 2**63  # in the year 2262
 _HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
 _WAIT_NS, _MOST_WAITING = 500_000_000, 30  # of the log's time, for what was recorded after the picture it belongs to
 _LOWEST_FPS = 0.05
-_AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # body_from_camera by REP 103
-_OWN, _OWN_SOURCE = "gcd-node", "gcd-node/source"  # metadata of this node's recordings
 
 
 class LogSource(Recording):
@@ -75,8 +60,8 @@ class LogSource(Recording):
         self.info, self.topic = self._found.info, self._found.topic
 
     def _one_pass(self) -> Iterator[Frame]:
-        reader = LogReader(self._path, _SEARCH_S, self._stopped.is_set)
-        matcher, count, before = _Matcher(self._found), 0, self.corrupt
+        reader, matcher, count = LogReader(self._path, _SEARCH_S, self._stopped.is_set), _Matcher(self._found), 0
+        before = self.corrupt
         try:
             for message in reader.messages():
                 for frame in matcher.take(message):
@@ -135,7 +120,7 @@ class _Matcher:
             self._waiting.append((message.log_ns, Frame(image=decoded[0], stamp_ns=stamp_ns, seq=self._seq)))
 
     def _stamp_ns(self, message: LogMessage, fields: Any) -> int:
-        stamp_ns = _head_of(fields)[0] if self._found.header_stamps else message.sent_ns
+        stamp_ns = head_of(fields)[0] if self._found.header_stamps else message.sent_ns
         if stamp_ns >= _LATEST_NS:
             raise SourceError(f"a message states {stamp_ns} ns since 1970 as its time: it is damaged")
         return stamp_ns
@@ -191,7 +176,7 @@ class _Topic:
     def add(self, message: LogMessage) -> None:
         """Count a message; pictures are decoded until one could be. Raises as a library does if it is damaged."""
         fields = message.decode()
-        stamp_ns, self.frame_id = _head_of(fields)
+        stamp_ns, self.frame_id = head_of(fields)
         if not self.codec and (decoded := self.decoder.decode(message.kind, fields)) is not None:
             self.size, self.codec = decoded[0].shape[1::-1], decoded[1]
         self.header_ns.append(stamp_ns)
@@ -213,33 +198,42 @@ class _Survey:
 
     def __init__(self, path: Path, topic: str | None, depth_topic: str | None, odometry_topic: str | None) -> None:
         """See LogSource."""
-        self._path, self._wanted, self.depth_topic, self.odometry_topic = path, topic, depth_topic, odometry_topic
-        self._reader = LogReader(path, _SEARCH_S)
-        self._topics: dict[str, _Topic] = {}
-        self._cameras, self._body, limit, end_ns = Cameras(), "", "", None
+        self._path, self.depth_topic, self.odometry_topic = path, depth_topic, odometry_topic
+        self._reader, self._topics = LogReader(path, _SEARCH_S), dict[str, _Topic]()
+        self._cameras, self._body, limit = Cameras(), "", ""
         try:
-            for message in self._reader.messages():
-                self._add(message)
-                end_ns = end_ns or message.log_ns + _SURVEYED_NS
-                if message.log_ns > end_ns and self._is_enough():
-                    break
+            self._read(topic)
         except LogLimitError as error:
             limit = f"; {error}: cut it to the pictures: mcap filter LOG -y TOPIC -o NEW"
         for name in (depth_topic, odometry_topic):
             if name is not None and name not in self._reader.topics:
                 raise SourceError(f"{path} has no topic {name!r}; it has {_shown(self._reader.topics)}{limit}")
-        self._wanted = self._wanted or self._own("input_topic")
-        usable = self._usable()
+        recording = self._reader.metadata.get("gcd-node")  # what one of this node says of itself
+        own_topic = None if recording is None else recording.get("input_topic")
+        wanted = topic or own_topic
+        usable = self._usable(wanted)
         if len(usable) != 1:
-            raise SourceError(f"{path} {self._trouble(usable)}{limit}")
-        self.topic = usable[0]
-        chosen = self._topics[self.topic]
+            raise SourceError(f"{path} {self._trouble(wanted, usable)}{limit}")
+        self.topic, chosen = usable[0], self._topics[usable[0]]
         # stamps of this node's recordings may begin at 0
-        self.header_stamps = self._own("recording") is not None or chosen.has_header_stamps
+        self.header_stamps = recording is not None or chosen.has_header_stamps
         self.info = self._describe(chosen)
+        if self.topic == own_topic:
+            self.info = _as_recorded(self.info, self._reader.metadata.get("gcd-node/source", {}))
         self.body_from_camera = np.eye(4)
         if odometry_topic is not None:
             self.body_from_camera = self._cameras.body_from_camera(self._body, chosen.frame_id)
+
+    def _read(self, wanted: str | None) -> None:
+        """As much as it takes."""
+        companions, end_ns = {self.depth_topic, self.odometry_topic} - {None}, None
+        for message in self._reader.messages():
+            self._add(message)
+            end_ns = end_ns or message.log_ns + _SURVEYED_NS
+            if message.log_ns > end_ns and companions <= self._reader.topics.keys():
+                own = self._reader.metadata.get("gcd-node", {}).get("input_topic")
+                if any(len(self._topics[name].sent_ns) > 1 for name in self._usable(wanted or own)):
+                    return
 
     def _add(self, message: LogMessage) -> None:
         topic = None
@@ -259,28 +253,18 @@ class _Survey:
             else:
                 topic.reason = line_of(error)
 
-    def _own(self, key: str, name: str = _OWN) -> str | None:
-        """What a recording of this node says of itself."""
-        return self._reader.metadata.get(name, {}).get(key)
-
-    def _usable(self) -> list[str]:
-        wanted = self._wanted or self._own("input_topic")
+    def _usable(self, wanted: str | None) -> list[str]:
         return [name for name, topic in self._topics.items() if topic.codec and wanted in (None, name)]
 
-    def _is_enough(self) -> bool:
-        companions = all(each in (None, *self._reader.topics) for each in (self.depth_topic, self.odometry_topic))
-        return companions and any(len(self._topics[name].sent_ns) > 1 for name in self._usable())
-
-    def _trouble(self, usable: list[str]) -> str:
+    def _trouble(self, wanted: str | None, usable: list[str]) -> str:
         """Why it cannot be played, to be read after its name."""
         if usable:
             return f"has pictures on {len(usable)} topics, {_shown(usable)}: say which with topic in [source]"
         for name, topic in self._topics.items():
-            if self._wanted in (None, name):
+            if wanted in (None, name):
                 return f"has no picture on {name} that can be decoded: {topic.reason}"
         kinds = [f"{name} ({kind})" for name, kind in self._reader.topics.items()]
-        has = f"it has pictures on {_shown(self._topics)}" if self._topics else f"its topics are {_shown(kinds)}"
-        return f"has no pictures{'' if self._wanted is None else f' on the topic {self._wanted!r}'}; {has}"
+        return f"has no pictures{'' if wanted is None else f' on the topic {wanted!r}'}; its topics are {_shown(kinds)}"
 
     def _describe(self, chosen: _Topic) -> SourceInfo:
         stamps = chosen.header_ns if self.header_stamps else chosen.sent_ns
@@ -290,7 +274,7 @@ class _Survey:
         fps = 1e9 / median(steps)
         if not _LOWEST_FPS <= fps <= MAX_FPS:
             raise SourceError(f"pictures on {self.topic} of {self._path} come {fps:g} times a second by their stamps")
-        info = SourceInfo(
+        return SourceInfo(
             kind="mcap",
             id=self._path.name,
             width=chosen.size[0],
@@ -301,97 +285,21 @@ class _Survey:
             lens=self._cameras.lens(self.topic, chosen.frame_id, chosen.size),
             stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if self.header_stamps else round(1e6 / fps),
         )
-        return self._as_recorded(info) if self.topic == self._own("input_topic") else info
 
-    def _as_recorded(self, info: SourceInfo) -> SourceInfo:
-        """With what was known of the source when it was recorded. A field of view is not made a lens of: that would be
-        another way to the model's picture."""
-        with contextlib.suppress(TypeError, ValueError):  # none was written, or by somebody else
-            info = replace(info, stamp_uncertainty_us=int(self._own("stamp_uncertainty_us", _OWN_SOURCE) or ""))
-        if self._own("calibrated", _OWN_SOURCE) == "yes":
-            return info
-        with contextlib.suppress(TypeError, ValueError):
-            hfov_deg = float(self._own("hfov_deg", _OWN_SOURCE) or "")
-            return replace(info, lens=None, hfov_deg=hfov_deg if 0 < hfov_deg < 180 else None)
-        return replace(info, lens=None)
+
+def _as_recorded(info: SourceInfo, facts: Mapping[str, str]) -> SourceInfo:
+    """With what was known of the source when this node recorded it. A field of view is not made a lens of: that would
+    be another way to the model's picture."""
+    with contextlib.suppress(KeyError, ValueError):  # none was written, or by somebody else
+        info = replace(info, stamp_uncertainty_us=int(facts["stamp_uncertainty_us"]))
+    if facts.get("calibrated") == "yes":
+        return info
+    with contextlib.suppress(KeyError, ValueError):
+        hfov_deg = float(facts["hfov_deg"])
+        return replace(info, lens=None, hfov_deg=hfov_deg if 0 < hfov_deg < 180 else None)
+    return replace(info, lens=None)
 
 
 def _shown(names: Iterable[str]) -> str:
     """A few names, as a terminal can show them."""
     return ", ".join(printable(name, _SHOWN) for name in sorted(names)[:_LISTED]) or "none"
-
-
-# What messages say.
-
-
-def _head_of(fields: Any) -> tuple[int, str]:
-    """A message's stamp in nanoseconds, 0 if nobody filled it in, and its frame_id."""
-    head = getattr(fields, "header", fields)
-    time = head.stamp if hasattr(head, "stamp") else head.timestamp
-    seconds, nanoseconds = (time.sec, time.nanosec) if hasattr(time, "sec") else (time.seconds, time.nanos)
-    return max(0, int(seconds) * 1_000_000_000 + int(nanoseconds)), str(head.frame_id)
-
-
-class Cameras:
-    """What a log says of the robot's cameras: their lenses, and where they are by /tf_static."""
-
-    def __init__(self) -> None:
-        self._infos: dict[str, tuple[str, Any]] = {}  # by topic: frame_id and fields
-        self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}  # of a frame: parent, parent_from_frame
-
-    def add(self, message: LogMessage) -> None:
-        """Keep what a message says."""
-        if message.kind in CAMERAS and message.topic not in self._infos:
-            fields = message.decode()
-            self._infos[message.topic] = _head_of(fields)[1], fields
-        elif message.kind == TRANSFORMS and message.topic.endswith("tf_static"):
-            for each in message.decode().transforms:
-                pose = pose_of(each.transform.translation, each.transform.rotation)
-                self._parents[each.child_frame_id] = each.header.frame_id, pose
-
-    def lens(self, topic: str, frame_id: str, size: tuple[int, int]) -> LensModel | None:
-        """Of pictures on `topic`: the calibration in the nearest folder above it, as ROS drivers send it; else the one
-        of the same frame. None if there is none that fits."""
-        place = topic.split("/")
-        above = [name for name in self._infos if place[: name.count("/")] == name.split("/")[:-1]]
-        named = [name for name, (frame, _) in self._infos.items() if frame and frame == frame_id]
-        name = max(above, key=lambda each: each.count("/")) if above else next(iter(named), None)
-        if name is None:
-            return None
-        # by the conventions of image_pipeline, pictures on image_rect... are undistorted already
-        rectified = any(part.startswith("image_rect") for part in place)
-        try:
-            lens = lens_of_message(self._infos[name][1], rectified=rectified)
-            return None if lens is None else lens.resized(*size)
-        except Exception as error:  # the log's own definition may lack anything
-            _LOG.warning("the calibration on %s is not used, state one in [source]: %s", name, line_of(error))
-            return None
-
-    def body_from_camera(self, body: str, camera: str) -> NDArray[np.float64]:
-        """[4, 4], between two frames; if it is not known, the camera is taken to look ahead from the body's origin."""
-        (body_root, root_from_body), (camera_root, root_from_camera) = self._root(body), self._root(camera)
-        if body_root != camera_root:
-            _LOG.warning("/tf_static does not say where %s is on %s: taken to look ahead from there", camera, body)
-            return _AHEAD
-        return np.linalg.inv(root_from_body) @ root_from_camera
-
-    def _root(self, frame: str) -> tuple[str, NDArray[np.float64]]:
-        """What a frame hangs on in the end, and root_from_frame."""
-        pose = np.eye(4)
-        for _ in range(len(self._parents)):
-            if frame in self._parents:
-                frame, parent_from_frame = self._parents[frame]
-                pose = parent_from_frame @ pose
-        return frame, pose
-
-
-def pose_of(place: Any, turn: Any) -> NDArray[np.float64]:
-    """parent_from_child, [4, 4], of a ROS position or translation and a quaternion. Raises SourceError: it is none."""
-    axis, norm = np.array([turn.x, turn.y, turn.z]), math.hypot(turn.x, turn.y, turn.z, turn.w)
-    pose = np.eye(4)
-    pose[:3, 3] = place.x, place.y, place.z
-    if not (0.5 < norm < 2 and np.isfinite(pose).all()):
-        raise SourceError(f"a pose has a quaternion of length {norm:g}: nobody filled it in")
-    sine = float(np.linalg.norm(axis))
-    pose[:3, :3] = cv2.Rodrigues(axis * (2 * math.atan2(sine, turn.w) / sine if sine > 0 else 2.0))[0]
-    return pose

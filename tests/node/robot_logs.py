@@ -20,8 +20,8 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from gcd_node.frame import Frame, Image
+from gcd_node.sources.log_reader import ros1_types
 from gcd_node.sources.logs import LogSource
-from gcd_node.sources.ros_bags import ros1_types
 
 START_NS = 1_750_000_000_123_456_789
 PERIOD_NS = 100_000_000

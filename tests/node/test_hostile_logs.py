@@ -22,9 +22,9 @@ from runs import copied, made_run
 from gcd_node.errors import DamagedRunError, SourceError
 from gcd_node.replay.compare import compare
 from gcd_node.replay.run import MANIFEST, open_run
-from gcd_node.sources import logs, ros_bags
+from gcd_node.sources import log_reader, logs
+from gcd_node.sources.log_reader import unfolded
 from gcd_node.sources.logs import LogSource
-from gcd_node.sources.ros_bags import unfolded
 
 MOST_BYTES = 2**31  # of a process that meets such a log
 BIG = 200 * 2**20
@@ -76,7 +76,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
 
 READER = """
 import json, pathlib, sys, time
-from gcd_node.sources import logs, ros_bags
+from gcd_node.sources import logs
 logs._SEARCH_S = 0.4
 for path in sys.argv[1:]:
     begun = time.monotonic()
@@ -166,7 +166,7 @@ def test_a_bag_that_unfolds_to_more_than_it_may_is_refused(
     mode = {"message": CompressionMode.MESSAGE, "file": CompressionMode.FILE}.get(name, CompressionMode.NONE)
     path = write_bag(tmp_path / name, sent, compression=mode, folded=True)
     assert len(list(LogSource(path).frames())) == 3
-    monkeypatch.setattr(ros_bags, "MAX_BYTES", 500)
+    monkeypatch.setattr(log_reader, "MAX_BYTES", 500)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(SourceError):
         list(LogSource(path).frames())
