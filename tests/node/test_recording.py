@@ -50,7 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Said], Box, Path
     return said(path), box, path
 
 
-def test_everything_decodes_and_is_counted_by_the_index(run: tuple[list[Said], Box, Path]) -> None:
+def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(run: tuple[list[Said], Box, Path]) -> None:
     heard, _, path = run
     counts, found = Counter(each.topic for each in heard), summary(path)
     assert found.statistics is not None
@@ -69,11 +69,7 @@ def test_everything_decodes_and_is_counted_by_the_index(run: tuple[list[Said], B
     }
     assert counts["/gcd/status"] == counts["/diagnostics"] > 0
     assert counts["/gcd/meta"] == 1
-
-
-def test_every_message_is_one_of_ros_2_so_that_it_can_be_played_there(run: tuple[list[Said], Box, Path]) -> None:
-    """`ros2 bag play` refuses files in which some messages are CDR and others not (rosbag2 issue 1245)."""
-    heard, _, path = run
+    # `ros2 bag play` refuses files in which some messages are CDR and others not (rosbag2 issue 1245)
     assert {(each.encoding, each.schema) for each in heard} == {("cdr", "ros2msg")}
     with AnyReader([path]) as reader:  # by the definitions in the file
         values = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
@@ -128,7 +124,7 @@ def test_visibility_and_depth_come_back_as_they_were_published(tmp_path: Path) -
         assert np.array_equal(pixels, wanted, equal_nan=dtype is np.float32)
 
 
-def test_headers_are_the_wire_s_own(run: tuple[list[Said], Box, Path]) -> None:
+def test_headers_and_poses_are_the_wire_s_own(run: tuple[list[Said], Box, Path]) -> None:
     heard, box, _ = run
     for topic, kind in (("header", "win"), ("std_header", "std")):
         assert [each.told for each in of(heard, f"/view/main/{topic}")] == [
@@ -137,9 +133,6 @@ def test_headers_are_the_wire_s_own(run: tuple[list[Said], Box, Path]) -> None:
     ages = [each.value.data for each in of(heard, "/view/main/age_ms")]
     assert ages == [message.header.age_ms for message in box.of("win")]
 
-
-def test_the_virtual_camera_stands_where_the_header_says(run: tuple[list[Said], Box, Path]) -> None:
-    heard, box, _ = run
     header = box.of("win")[1].header
     assert header.source_from_view is not None
     transforms = of(heard, "/tf")[1].value.transforms
@@ -168,12 +161,7 @@ def test_a_recording_says_who_made_it_with_what(tmp_path: Path) -> None:
 
 
 def test_a_view_that_was_published_as_jpeg_is_not_coded_again(tmp_path: Path) -> None:
-    text = recorder_config(tmp_path)
-    config = parse_config(
-        f'[source]\nkind="synthetic"\npace="lockstep"\n[model]\nweights="fake"\n[view.main]\n'
-        f'[publish]\nencoding="jpeg"\n[record]\nfolder="{text.record.folder}"\nkeep_free_mb=0\nautostart=true'.encode(),
-        "test",
-    )
+    config = recorder_config(tmp_path, record='[publish]\nencoding = "jpeg"')
     _, box = recorded(config, FakeSource(14))
     (message,) = box.of("win")
     assert b"".join(each.value.data for each in of(said(files(tmp_path)[0]), "/view/main/image")) == message.payload
