@@ -85,23 +85,28 @@ class _Matcher:
     def __init__(self, found: "_Survey") -> None:
         self._found, self._decoder = found, ImageDecoder()
         self._waiting: deque[tuple[int, Frame]] = deque()  # and when each was recorded
-        self._depth = _Nearest(found.depth_topic, found.info.fps_nominal, 32)
-        self._odometry = _Nearest(found.odometry_topic, found.info.fps_nominal, 2048)
+        most = {found.depth_topic: 32, found.odometry_topic: 2048}
+        # stamp, type and fields of the latest, by topic
+        self._latest = {topic: deque[tuple[int, str, Any]](maxlen=n) for topic, n in most.items() if topic is not None}
         self._seq = -1
         self.corrupt = 0
 
     def take(self, message: LogMessage) -> Iterator[Frame]:
         """Frames that are complete with this message."""
-        companion = next((each for each in (self._depth, self._odometry) if message.topic == each.topic), None)
+        latest = self._latest.get(message.topic)
         try:
-            if companion is not None:
+            if latest is not None:
                 fields = message.decode()
-                companion.newest_ns = self._stamp_ns(message, fields)
-                companion.kept.append((companion.newest_ns, message.kind, fields))
+                latest.append((self._stamp_ns(message, fields), message.kind, fields))
             elif message.topic == self._found.topic and message.kind in IMAGES:
-                self._add_picture(message)
+                fields = message.decode()
+                decoded, stamp_ns = self._decoder.decode(message.kind, fields), self._stamp_ns(message, fields)
+                if decoded is not None:
+                    # numbers rise: as they were recorded, or counted on, as many recorders leave them 0
+                    self._seq = max(message.sequence, self._seq + 1)
+                    self._waiting.append((message.log_ns, Frame(image=decoded[0], stamp_ns=stamp_ns, seq=self._seq)))
         except Exception as error:  # of a library, or SourceError: the message is damaged
-            self.corrupt += companion is None
+            self.corrupt += latest is None
             _LOG.debug("a message on %s is left out: %s", message.topic, line_of(error))
         while self._waiting and self._is_complete(message.log_ns):
             yield self._complete()
@@ -111,14 +116,6 @@ class _Matcher:
         while self._waiting:
             yield self._complete()
 
-    def _add_picture(self, message: LogMessage) -> None:
-        fields = message.decode()
-        decoded, stamp_ns = self._decoder.decode(message.kind, fields), self._stamp_ns(message, fields)
-        if decoded is not None:
-            # numbers rise: as they were recorded, or counted on, as many recorders leave them 0
-            self._seq = max(message.sequence, self._seq + 1)
-            self._waiting.append((message.log_ns, Frame(image=decoded[0], stamp_ns=stamp_ns, seq=self._seq)))
-
     def _stamp_ns(self, message: LogMessage, fields: Any) -> int:
         stamp_ns = head_of(fields)[0] if self._found.header_stamps else message.sent_ns
         if stamp_ns >= _LATEST_NS:
@@ -127,12 +124,13 @@ class _Matcher:
 
     def _is_complete(self, now_ns: int) -> bool:
         recorded_ns, frame = self._waiting[0]
-        has_come = all(each.topic is None or each.newest_ns >= frame.stamp_ns for each in (self._depth, self._odometry))
+        has_come = all(latest and latest[-1][0] >= frame.stamp_ns for latest in self._latest.values())
         return has_come or len(self._waiting) > _MOST_WAITING or now_ns - recorded_ns > _WAIT_NS
 
     def _complete(self) -> Frame:
         _, frame = self._waiting.popleft()
-        depth, odometry = self._depth.take(frame.stamp_ns), self._odometry.take(frame.stamp_ns)
+        depth = self._nearest(self._found.depth_topic, frame.stamp_ns)
+        odometry = self._nearest(self._found.odometry_topic, frame.stamp_ns)
         try:
             if depth is not None:
                 frame = replace(frame, depth=clean_depth(depth_of(*depth), frame.image.shape[:2]))
@@ -144,21 +142,13 @@ class _Matcher:
             _LOG.warning("frame %d goes without depth or odometry: %s", frame.seq, line_of(error))
         return frame
 
-
-class _Nearest:
-    """The latest messages of a topic, to find the one that was stamped nearest to a picture."""
-
-    def __init__(self, topic: str | None, fps: float, most: int) -> None:
-        self.topic, self.newest_ns = topic, -1
-        self._half_ns = 0.5e9 / fps
-        self.kept: deque[tuple[int, str, Any]] = deque(maxlen=most)  # stamp, type and fields
-
-    def take(self, stamp_ns: int) -> tuple[str, Any] | None:
-        """Type and fields of the nearest, None if it is farther than half a frame period."""
-        while self.kept and self.kept[0][0] < stamp_ns - self._half_ns:
-            self.kept.popleft()
-        nearest = min(self.kept, key=lambda each: abs(each[0] - stamp_ns), default=None)
-        return None if nearest is None or abs(nearest[0] - stamp_ns) > self._half_ns else nearest[1:]
+    def _nearest(self, topic: str | None, stamp_ns: int) -> tuple[str, Any] | None:
+        """Type and fields of the message stamped nearest, None if it is farther than half a frame period."""
+        latest, half_ns = self._latest.get(topic or ""), 0.5e9 / self._found.info.fps_nominal
+        while latest and latest[0][0] < stamp_ns - half_ns:
+            latest.popleft()
+        nearest = min(latest or (), key=lambda each: abs(each[0] - stamp_ns), default=None)
+        return None if nearest is None or abs(nearest[0] - stamp_ns) > half_ns else nearest[1:]
 
 
 @dataclass(slots=True)

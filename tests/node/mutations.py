@@ -69,47 +69,33 @@ class Mutator:
 def outcomes(read: Callable[[bytes], str], inputs: Mutator, *refusals: type[Exception]) -> Counter[str]:
     """Read ROUNDS inputs; how many ended how. What is no documented error fails the test, and so does growth."""
     ended: Counter[str] = Counter()
+
+    def read_some(count: int) -> None:
+        for part in (inputs.next() for _ in range(count)):
+            line = None
+            try:
+                outcome = read(part)
+            except refusals as known:
+                outcome, line = "refused", str(known)
+            except Exception as other:
+                raise AssertionError(f"{type(other).__name__} for {part[:2000]!r}") from other
+            ended[outcome] += 1
+            assert line is None or 0 < len(line) < 2000
+        gc.collect()
+
     few = max(1, min(ROUNDS // 4, MOST_TRACED))
-    grown = _traced_growth(lambda: _read(few, read, inputs, refusals, ended))
+    tracemalloc.start()  # reading is four times as slow then
+    try:
+        read_some(few)
+        before = tracemalloc.get_traced_memory()[0]
+        read_some(few)
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
     before_mb = psutil.Process().memory_info().rss / 2**20
-    _read(ROUNDS - 2 * few, read, inputs, refusals, ended)
-    gc.collect()
+    read_some(ROUNDS - 2 * few)
     grown_mb = psutil.Process().memory_info().rss / 2**20 - before_mb
     _LOG.info("%s; grown by %d bytes, resident %.1f MiB", dict(ended), grown, grown_mb)
-    assert ended.total() == ROUNDS
     assert grown < GROWN_BYTES
     assert grown_mb < GROWN_MB
     return ended
-
-
-def _traced_growth(work: Callable[[], None]) -> int:
-    """Bytes that the second run of some work leaves behind; it is four times as slow when it is watched."""
-    tracemalloc.start()
-    try:
-        work()
-        gc.collect()
-        before = tracemalloc.get_traced_memory()[0]
-        work()
-        gc.collect()
-        return tracemalloc.get_traced_memory()[0] - before
-    finally:
-        tracemalloc.stop()
-
-
-def _read(
-    count: int,
-    read: Callable[[bytes], str],
-    inputs: Mutator,
-    refusals: tuple[type[Exception], ...],
-    ended: Counter[str],
-) -> None:
-    for _ in range(count):
-        part = inputs.next()
-        try:
-            outcome, error = read(part), None
-        except refusals as known:
-            outcome, error = "refused", known
-        except Exception as other:
-            raise AssertionError(f"{type(other).__name__} for {part[:2000]!r}") from other
-        assert error is None or 0 < len(str(error)) < 2000
-        ended[outcome] += 1

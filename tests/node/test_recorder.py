@@ -2,14 +2,13 @@
 
 import errno
 import hashlib
+import multiprocessing
 import os
-import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,6 @@ from recordings import (
 from rig import Rig
 from wire_messages import origin
 
-import gcd_node
 from gcd_client.control import Code
 from gcd_node import recorder as recorder_module
 from gcd_node import ros_messages
@@ -49,6 +47,7 @@ pytestmark = pytest.mark.timeout(180)
 
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 RAW = 'input_encoding = "raw"'
+LIVE = SourceInfo(kind="v4l2", id="t", width=100, height=100, fps_nominal=10.0, clock="realtime")
 START_S = 120.0  # what a busy machine may take to start a process
 
 
@@ -189,17 +188,25 @@ def test_the_input_is_played_though_there_are_views_and_a_view_where_it_is_named
 # --- kill -9, full disks -----------------------------------------------------------------------------------------
 
 
+def record_for_ever(folder: Path) -> None:
+    config, draw = recorder_config(folder, source='kind = "v4l2"'), np.random.default_rng(0)
+    recorder = Recorder(config, "0" * 32, lambda: config, lambda *_: None, Box())
+    recorder.source(LIVE, None)
+    recorder.start()
+    for seq in count():
+        image = draw.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+        recorder.frame(Frame(image=image, stamp_ns=time.monotonic_ns(), seq=seq))
+        time.sleep(0.01)
+
+
 def test_after_kill_9_everything_written_is_readable_and_plays(tmp_path: Path) -> None:
-    tests = str(Path(__file__).parent)
-    paths = f"{Path(gcd_node.__file__).parent.parent}:{tests}:{os.environ.get('PYTHONPATH', '')}"
-    command = [sys.executable, f"{tests}/recording_process.py", str(tmp_path), "40"]
-    recorder = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": paths})
+    recorder = multiprocessing.get_context("spawn").Process(target=record_for_ever, args=(tmp_path,))
+    recorder.start()
     try:
-        assert recorder.stdout is not None
-        assert recorder.stdout.readline() == "written\n"
+        until(lambda: files(tmp_path) and len(salvaged(files(tmp_path)[0], "/src/image")) >= 40, START_S)
     finally:
-        recorder.send_signal(signal.SIGKILL)
-        recorder.communicate(timeout=START_S)
+        recorder.kill()
+        recorder.join()
     (path,) = files(tmp_path)
     found = salvaged(path, "/src/image")
     assert len(found) >= 40
@@ -287,8 +294,7 @@ class Hanging:
         config = recorder_config(folder, source=source, record=RAW)
         self.told: list[str] = []
         self.recorder = Recorder(config, "0" * 32, lambda: config, lambda code, *_: self.told.append(code), Box())
-        info = SourceInfo(kind="v4l2", id="t", width=100, height=100, fps_nominal=10.0, clock="realtime")
-        self.recorder.source(info, None)
+        self.recorder.source(LIVE, None)
         self.recorder.start()
         until(lambda: "REC_STARTED" in self.told)
 
