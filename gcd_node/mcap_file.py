@@ -102,7 +102,9 @@ class McapFile:
 
     def close(self, *, is_broken: bool = False) -> None:
         """Write index and end. is_broken: a write has failed; then the file ends behind what was flushed, without an
-        index, and if that is nothing, it is removed."""
+        index, and if that is nothing, it is removed. Once is enough."""
+        if self._file.closed:
+            return
         try:
             if not is_broken:
                 self._writer.finish()

@@ -206,10 +206,8 @@ def stamps(frames: Sequence[Frame]) -> list[int]:
     return [frame.stamp_ns for frame in frames]
 
 
-def of_pictures(
-    path: Path, pictures: Sequence[Fields], kind: str = COMPRESSED, topic: str = "/front/image"
-) -> LogSource:
-    """A log of these, open."""
+def of_pictures(path: Path, pictures: Sequence[Fields], kind: str = COMPRESSED) -> LogSource:
+    """A log of these on /front/image, open."""
     with ros_log(path) as log:
         for fields in pictures:
             log.say("/front/image", kind, fields)

@@ -264,6 +264,7 @@ def test_a_file_on_a_broken_disk_is_whole_up_to_its_last_flush(tmp_path: Path, m
     for name in ("fdatasync", "pwrite"):
         monkeypatch.setattr(os, name, broken)
     file.close()
+    file.close(is_broken=True)  # as when the next one cannot be opened
     assert not file.is_whole
     assert len(salvaged(tmp_path / "a.mcap", "/gcd/event")) == file.messages == 100
 
