@@ -70,41 +70,18 @@ class RecordHealth:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class StageSummary:
-    """How long a stage takes. p50_s, p99_s: over the last minute (at most 512 values, at least the last 16 there are),
-    seconds. count, total_s: since the start."""
-
-    p50_s: float
-    p99_s: float
-    count: int
-    total_s: float
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Snapshot:
     """A node's health at one moment.
 
-    findings: every reason with its level, the worst first (docs/deploy.md explains each).
-    missing: what keeps the node from being ready; empty if it is.
     status: the fields of a status message (wire protocol, section 4) but its heartbeat; what is unknown is left out.
-    frames: arrived whole since the start.
+    findings: every reason with its level, the worst first (docs/deploy.md explains each).
+    frames: arrived whole since the start. stages_s: how long each stage has taken since the start, in all.
     """
 
-    findings: dict[str, Level]
-    missing: tuple[str, ...]
     status: dict[str, Any]
-    stages: Mapping[str, StageSummary]
+    findings: dict[str, Level]
     frames: int
-
-    @property
-    def level(self) -> Level:
-        """The worst of all findings."""
-        return max(self.findings.values(), default=Level.OK)
-
-    @property
-    def ready(self) -> bool:
-        """Whether views come, or would if somebody subscribed."""
-        return not self.missing
+    stages_s: dict[str, float]
 
 
 class Health:
@@ -115,10 +92,9 @@ class Health:
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock, self._lock = clock, threading.Lock()
-        self._state = "unconfigured"
+        self._state, self._lost = "unconfigured", False
         self._source: SourceState = "closed"
         self._model: ModelState = "absent"
-        self._lost = False
         self._counts: Counter[str] = Counter()
         self._stages: dict[Stage, StageTimes] = {name: StageTimes() for name in get_args(Stage)}
         self._stamps: deque[int] = deque(maxlen=_RATE_FRAMES)
@@ -128,11 +104,10 @@ class Health:
         self._measures: dict[str, float | None] = {}
         self._rec = RecordHealth()
         self._raised: dict[str, Level] = {}
-        self._views: dict[str, int | None] = {}
+        self._views: dict[str, int | None] = {}  # when each was published last
         self._window_s: float | None = None
-        self._due_from_ns = 0
-        self._heartbeat = 0
-        self._reported: tuple[object, ...] | None = None
+        self._due_from_ns = self._heartbeat = 0
+        self._reported: object = None
 
     def state(self, name: str) -> None:
         """The lifecycle's state, lower case (lifecycle.State.label)."""
@@ -259,66 +234,64 @@ class Health:
     # What follows is called with the lock held.
 
     def _snapshot(self, now_ns: int) -> Snapshot:
-        stages = {name: summary for name, times in self._stages.items() if (summary := times.summary(now_ns))}
-        findings, missing = self._findings(now_ns), self._missing(now_ns)
-        counts = self._counts
+        findings, missing, counts = self._findings(now_ns), self._missing(now_ns), self._counts
+        stages = {str(name): times.summary(now_ns) for name, times in self._stages.items() if times.count}
+        render, memory_mb, ood = stages.get("render", {}), *map(self._measures.get, ("gpu_mem_mb", "ood_score"))
+        views = {view_id: None if at is None else round((now_ns - at) / 1e6) for view_id, at in self._views.items()}
+        age_ns = None if self._arrival_ns is None else max(0, now_ns - self._arrival_ns)
         status: dict[str, Any] = {
             "state": self._state,
             "level": int(max(findings.values(), default=Level.OK)),
             "reasons": list(findings),
             "ready": not missing,
             "not_ready": list(missing),
-            "source": self._source_status(now_ns),
+            "source": _known(
+                state=self._source,
+                fps=self._fps(),
+                last_frame_age_ms=None if age_ns is None else round(age_ns / 1e6, 1),
+                dropped=counts["source"],
+                reconnects=counts["reconnects"],
+                corrupt=counts["corrupt"],
+            ),
             "window": {
                 "built": counts["built"],
                 "rejected": counts["window"],
                 "reason_counts": dict(self._faults),
                 "skipped": counts["slot"],
             },
-            "model": self._model_status(stages.get("render")),
+            "model": _known(
+                state=self._model,
+                ms_p50=render.get("p50_ms"),
+                ms_p99=render.get("p99_ms"),
+                gpu_mem_mb=None if memory_mb is None else round(memory_mb, 1),
+                oom_count=counts["oom_count"],
+                backoff_s=0.0,  # of protocol 1.0: no model is tried again later
+                nan_windows=counts["nan_windows"],
+                bad_depths=counts["bad_depths"] or None,
+                ood_score=None if ood is None else round(ood, 3),
+            ),
             "publish": {"dropped": counts["queue"], **{name: counts[name] for name in ("sent", "subs", "bytes")}},
             "drops": {hop: counts[hop] for hop in get_args(Hop)},
-            "stages": {
-                name: {"p50_ms": _ms(stage.p50_s), "p99_ms": _ms(stage.p99_s), "count": stage.count}
-                for name, stage in stages.items()
-            },
-            "views": {
-                view_id: {} if at is None else {"last_ms": round((now_ns - at) / 1e6)}
-                for view_id, at in self._views.items()
-            },
+            "stages": stages,
+            "views": {view_id: _known(last_ms=age_ms) for view_id, age_ms in views.items()},
             "rec": self._rec.to_status(),
         }
-        return Snapshot(findings=findings, missing=missing, status=status, stages=stages, frames=counts["frames"])
+        stages_s = {str(name): times.total_s for name, times in self._stages.items()}
+        return Snapshot(status=status, findings=findings, frames=counts["frames"], stages_s=stages_s)
 
-    def _essence(self, now_ns: int) -> tuple[object, ...]:
+    def _essence(self, now_ns: int) -> object:
         """What is worth a status message at once."""
         model = "ready" if self._model == "busy" else self._model
         states = self._state, self._source, model, self._rec.state
-        return states, tuple(self._findings(now_ns).items()), self._missing(now_ns)
+        return states, self._findings(now_ns), self._missing(now_ns)
 
-    def _source_status(self, now_ns: int) -> dict[str, object]:
-        status: dict[str, object] = {"state": self._source, "dropped": self._counts["source"]}
-        status |= {name: self._counts[name] for name in ("reconnects", "corrupt")}
+    def _fps(self) -> float | None:
+        """By the latest stamps; None if there are too few."""
         if self._source in ("stalled", "lost"):
-            status["fps"] = 0.0
-        elif len(self._stamps) > 1:
-            status["fps"] = round((len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0]), 2)
-        if self._arrival_ns is not None:
-            status["last_frame_age_ms"] = round(max(0, now_ns - self._arrival_ns) / 1e6, 1)
-        return status
-
-    def _model_status(self, render: StageSummary | None) -> dict[str, object]:
-        counts = self._counts
-        status: dict[str, object] = {name: counts[name] for name in ("oom_count", "nan_windows")}
-        status |= {"state": self._model, "backoff_s": 0.0}  # of protocol 1.0: no model is tried again later
-        if render is not None:
-            status |= {"ms_p50": _ms(render.p50_s), "ms_p99": _ms(render.p99_s)}
-        if counts["bad_depths"]:
-            status["bad_depths"] = counts["bad_depths"]
-        for name, digits in (("gpu_mem_mb", 1), ("ood_score", 3)):
-            if (value := self._measures.get(name)) is not None:
-                status[name] = round(value, digits)
-        return status
+            return 0.0
+        if len(self._stamps) < 2:
+            return None
+        return round((len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0]), 2)
 
     def _findings(self, now_ns: int) -> dict[str, Level]:
         rules = (
@@ -361,9 +334,9 @@ class Health:
 
     def _patience_ns(self, now_ns: int) -> float:
         """How old the last view may be: two windows, or two renderings if those take longer, and at least a second."""
-        render = self._stages["render"].summary(now_ns)
-        slowest_s = max(self._window_s or 0.0, 0.0 if render is None else render.p99_s)
-        return 1e9 * max(_LEAST_PATIENCE_S, 2 * slowest_s)
+        render = self._stages["render"]
+        slowest_s = render.summary(now_ns)["p99_ms"] / 1000 if render.count else 0.0
+        return 1e9 * max(_LEAST_PATIENCE_S, 2 * slowest_s, 2 * (self._window_s or 0.0))
 
 
 class StageTimes:
@@ -371,26 +344,26 @@ class StageTimes:
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, float]] = deque(maxlen=512)
-        self._count, self._total_s = 0, 0.0
+        self.count, self.total_s = 0, 0.0
 
     def add(self, now_ns: int, seconds: float) -> None:
         """Take note of one duration; a negative one counts as 0 (two clocks disagree), one that is no number not."""
         if math.isfinite(seconds):
             self._recent.append((now_ns, max(0.0, seconds)))
-            self._count += 1
-            self._total_s += max(0.0, seconds)
+            self.count += 1
+            self.total_s += max(0.0, seconds)
 
-    def summary(self, now_ns: int) -> StageSummary | None:
-        """The figures now; None before the first value. Quantiles by nearest rank."""
-        if not self._recent:
-            return None
+    def summary(self, now_ns: int) -> dict[str, float]:
+        """For a status message, once there is a value: quantiles by nearest rank over the last minute (at most 512
+        values, at least the last 16 there are), ms, and the count since the start."""
         recent = [seconds for at_ns, seconds in self._recent if now_ns - at_ns <= 60_000_000_000]
         if len(recent) < _LEAST_DURATIONS:
             recent = [seconds for _, seconds in list(self._recent)[-_LEAST_DURATIONS:]]
         recent.sort()
         p50_s, p99_s = (recent[math.ceil(part * len(recent)) - 1] for part in (0.5, 0.99))
-        return StageSummary(p50_s=p50_s, p99_s=p99_s, count=self._count, total_s=self._total_s)
+        return {"p50_ms": round(1000 * p50_s, 2), "p99_ms": round(1000 * p99_s, 2), "count": self.count}
 
 
-def _ms(seconds: float) -> float:
-    return round(1000 * seconds, 2)
+def _known(**fields: object) -> dict[str, object]:
+    """Without those that are None."""
+    return {name: value for name, value in fields.items() if value is not None}

@@ -5,6 +5,7 @@ import logging
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from http import HTTPStatus
 from socket import socket
 from socketserver import ThreadingMixIn
 from typing import Any, TypeAlias, get_args
@@ -24,6 +25,7 @@ _CALLER_TIMEOUT_S = 5.0
 
 Respond: TypeAlias = Callable[[str, list[tuple[str, str]]], object]
 App: TypeAlias = Callable[[dict[str, Any], Respond], Iterable[bytes]]
+Kind: TypeAlias = type[GaugeMetricFamily | CounterMetricFamily]
 
 
 class _Handler(WSGIRequestHandler):
@@ -91,33 +93,24 @@ def make_app(health: Health) -> App:
     registry = CollectorRegistry()
     registry.register(_HealthCollector(health))
     ProcessCollector(registry=registry)
-
-    def live(_: dict[str, Any], respond: Respond) -> Iterable[bytes]:
-        return _json(respond, "200 OK", {"live": True})
-
-    def ready(_: dict[str, Any], respond: Respond) -> Iterable[bytes]:
-        snapshot = health.snapshot()
-        fields = {key: snapshot.status[key] for key in ("ready", "not_ready", "level", "reasons")}
-        return _json(respond, "200 OK" if snapshot.ready else "503 Service Unavailable", fields)
-
-    pages: dict[str, App] = {"/healthz": live, "/readyz": ready, "/metrics": make_wsgi_app(registry)}
+    metrics = make_wsgi_app(registry)
 
     def app(environ: dict[str, Any], respond: Respond) -> Iterable[bytes]:
-        page, head = pages.get(environ["PATH_INFO"]), environ["REQUEST_METHOD"] == "HEAD"
-        if page is None:
-            respond("404 Not Found", [("Content-Type", "text/plain; charset=utf-8")])
-            return [f"there are {', '.join(pages)}\n".encode()]
-        if head:
-            environ["REQUEST_METHOD"] = "GET"
-        body = page(environ, lambda status, headers: respond(status, [*headers, ("Cache-Control", "no-store")]))
-        return [] if head else body
+        match environ["PATH_INFO"]:
+            case "/metrics":
+                return metrics(environ, respond)
+            case "/healthz":
+                code, fields = HTTPStatus.OK, {"live": True}
+            case "/readyz":
+                status = health.snapshot().status
+                code = HTTPStatus.OK if status["ready"] else HTTPStatus.SERVICE_UNAVAILABLE
+                fields = {key: status[key] for key in ("ready", "not_ready", "level", "reasons")}
+            case _:
+                code, fields = HTTPStatus.NOT_FOUND, {"pages": ["/healthz", "/readyz", "/metrics"]}
+        respond(f"{code.value} {code.phrase}", [("Content-Type", "application/json"), ("Cache-Control", "no-store")])
+        return [json.dumps(fields).encode() + b"\n"]
 
     return app
-
-
-def _json(respond: Respond, status: str, fields: Mapping[str, object]) -> Iterable[bytes]:
-    respond(status, [("Content-Type", "application/json")])
-    return [json.dumps(fields).encode() + b"\n"]
 
 
 class _HealthCollector(Collector):
@@ -128,23 +121,28 @@ class _HealthCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         snapshot = self._health.snapshot()
-        yield from _numbers(snapshot)
-        yield from _states(snapshot)
-        yield from _labelled(snapshot)
+        for kind, name, text, value in _numbers(snapshot):
+            if value is not None:  # unknown
+                yield kind(f"gcd_{name}", text, value)
+        for kind, name, text, label, values in _labelled(snapshot):
+            family = kind(f"gcd_{name}", text, labels=[label])
+            for each, number in values.items():
+                family.add_metric([each], number)
+            yield family
         stages = SummaryMetricFamily("gcd_stage_seconds", "How long each stage takes.", labels=["stage"])
-        for name, stage in snapshot.stages.items():  # quantiles of the last minute, count and sum since the start
-            for part, seconds in (("0.5", stage.p50_s), ("0.99", stage.p99_s)):
-                stages.add_sample("gcd_stage_seconds", {"stage": name, "quantile": part}, seconds)
-            stages.add_metric([name], stage.count, stage.total_s)
+        for name, stage in snapshot.status["stages"].items():  # quantiles of the last minute, count and sum of all
+            for part, ms in (("0.5", stage["p50_ms"]), ("0.99", stage["p99_ms"])):
+                stages.add_sample("gcd_stage_seconds", {"stage": name, "quantile": part}, ms / 1000)
+            stages.add_metric([name], stage["count"], snapshot.stages_s[name])
         yield stages
 
 
-def _numbers(snapshot: Snapshot) -> Iterator[Metric]:
-    status = snapshot.status
+def _numbers(snapshot: Snapshot) -> Iterable[tuple[Kind, str, str, float | None]]:
+    """Kind, name, text and value; None while it is unknown."""
+    status, gauge, counter = snapshot.status, GaugeMetricFamily, CounterMetricFamily
     source, model, publish = status["source"], status["model"], status["publish"]
     age_ms, memory_mb = source.get("last_frame_age_ms"), model.get("gpu_mem_mb")
-    gauge, counter = GaugeMetricFamily, CounterMetricFamily
-    for family, name, text, value in (
+    return (
         (gauge, "level", "0 OK, 1 WARN, 2 ERROR; the worst of gcd_reason_level.", status["level"]),
         (gauge, "ready", "1 if views come, or would if somebody subscribed.", int(status["ready"])),
         (gauge, "source_fps", "Frames a second by the latest stamps.", source.get("fps")),
@@ -159,37 +157,23 @@ def _numbers(snapshot: Snapshot) -> Iterator[Metric]:
         (counter, "windows_built", "Windows of frames.", status["window"]["built"]),
         (counter, "messages_sent", "Messages that left on the data socket.", publish["sent"]),
         (counter, "bytes_sent", "Bytes that left on the data socket.", publish["bytes"]),
-    ):
-        if value is not None:  # unknown
-            yield family(f"gcd_{name}", text, value)
+    )
 
 
-def _states(snapshot: Snapshot) -> Iterator[Metric]:
-    status = snapshot.status
-    for name, known, now in (
+def _labelled(snapshot: Snapshot) -> Iterable[tuple[Kind, str, str, str, Mapping[str, float]]]:
+    """Kind, name, text, label and the value for each of its values."""
+    status, gauge, counter = snapshot.status, GaugeMetricFamily, CounterMetricFamily
+    states = (
         ("node", [state.label for state in State], status["state"]),
         ("source", get_args(SourceState), status["source"]["state"]),
         ("model", get_args(ModelState), status["model"]["state"]),
-    ):
+    )
+    for name, known, now in states:
         text = f"1 for the state of the {name}, 0 for others."
-        yield _with_label(GaugeMetricFamily, f"{name}_state", text, "state", {each: int(each == now) for each in known})
-
-
-def _labelled(snapshot: Snapshot) -> Iterator[Metric]:
-    status, gauge, counter = snapshot.status, GaugeMetricFamily, CounterMetricFamily
-    ages_s = {view_id: view["last_ms"] / 1000 for view_id, view in status["views"].items() if view}
-    reasons = {code: int(level) for code, level in snapshot.findings.items()}
+        yield gauge, f"{name}_state", text, "state", {each: int(each == now) for each in known}
     faults = status["window"]["reason_counts"]
-    yield _with_label(gauge, "reason_level", "Level of each reason there is now.", "code", reasons)
-    yield _with_label(counter, "window_faults", "What spoilt windows.", "reason", faults)
-    yield _with_label(counter, "dropped", "Frames, windows or messages given up.", "hop", status["drops"])
-    yield _with_label(gauge, "view_last_published_seconds", "Since a view was published.", "view", ages_s)
-
-
-def _with_label(
-    kind: type[GaugeMetricFamily | CounterMetricFamily], name: str, text: str, label: str, values: Mapping[str, float]
-) -> Metric:
-    family = kind(f"gcd_{name}", text, labels=[label])
-    for value, number in values.items():
-        family.add_metric([value], number)
-    return family
+    ages_s = {view_id: view["last_ms"] / 1000 for view_id, view in status["views"].items() if view}
+    yield gauge, "reason_level", "Level of each reason there is now.", "code", snapshot.findings
+    yield counter, "window_faults", "What spoilt windows.", "reason", faults
+    yield counter, "dropped", "Frames, windows or messages given up.", "hop", status["drops"]
+    yield gauge, "view_last_published_seconds", "Since a view was published.", "view", ages_s

@@ -77,7 +77,8 @@ class Node:
         self._commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self.request)
         self._life = Lifecycle()
         self._work: threading.Thread | None = None
-        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s, service)
+        self._service = service or ServiceManager({})
+        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s)
         self._waits = backoff_s(config.source.kind)
         self._stop_s: float | None = None
         self._retry_s: float | None = None
@@ -150,7 +151,7 @@ class Node:
             if self._on_its_own:
                 self._begin("configure")
             else:
-                self._watchdog.ready()
+                self._service.ready()
             while self.state is not State.FINALIZED and self._left_s(0.0) > 0:
                 self._handle_message()
                 self._tick()
@@ -184,7 +185,8 @@ class Node:
         stream = self._transitions.stream
         if stream is not None:
             stream.tick()
-        self._watchdog.check(0.0 if stream is None else stream.worker.silent_s)
+        if self._watchdog.check(0.0 if stream is None else stream.worker.silent_s):
+            self._service.alive()
         self.health.recording(self.recorder.report())
         if self._retry_s is not None and time.monotonic() >= self._retry_s and self.state is State.INACTIVE:
             self._retry_s = None
@@ -194,7 +196,7 @@ class Node:
     def _prepare_stop(self) -> None:
         if self._stop_s is None:
             self._stop_s = time.monotonic()
-            self._watchdog.stopping()
+            self._service.stopping()
         self._transitions.interrupt()
 
     def _left_s(self, least_s: float) -> float:
@@ -213,7 +215,7 @@ class Node:
         self._life.begin(verb)
         self._publish_state()
         if verb == "configure":
-            self._watchdog.loading()
+            self._service.loading()
         self._work = threading.Thread(target=self._perform, args=(verb, requested), name=verb, daemon=True)
         self._work.start()
 
@@ -269,7 +271,7 @@ class Node:
                 self._try("activate")
         elif done.verb == "activate":
             self._waits = backoff_s(self._config.source.kind)
-            self._watchdog.ready()
+            self._service.ready()
             if self._transitions.has_ended:  # before the node was active
                 self._try("deactivate")
         elif done.verb == "deactivate" and not done.requested and self._stop_s is None:
@@ -281,7 +283,7 @@ class Node:
 
     def _after_failure(self, error: Exception, verb: Verb) -> None:
         """Give up, try again later, or wait for a command."""
-        self._watchdog.ready()
+        self._service.ready()
         if self._stop_s is not None and verb != "shutdown":
             return
         if self._once or isinstance(error, SourceLostError):

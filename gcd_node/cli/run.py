@@ -240,7 +240,7 @@ def world_warning(health: Callable[[], "Health"]) -> Callable[[], None]:
         nonlocal due_s
         if (now_s := time.monotonic()) < due_s:
             return
-        is_foreign = "world" in health().snapshot().findings
+        is_foreign = "world" in health().snapshot().status["reasons"]
         due_s = now_s + (_QUIET_S if is_foreign else _LOOK_S)
         if is_foreign:
             _LOG.warning("world: this is another one than the model learned from: depth and classes are guesses")

@@ -9,6 +9,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -36,20 +37,19 @@ def server(health: Health) -> Iterator[MetricsServer]:
         yield opened
 
 
-def get(server: MetricsServer, path: str, accept: str = "*/*", method: str = "GET") -> tuple[int, str, bytes]:
-    """Status, content type and body; of an error too."""
-    request = urllib.request.Request(server.url + path, headers={"Accept": accept}, method=method)
+def get(server: MetricsServer, path: str) -> tuple[int, Any]:
+    """Status and body, of an error too; a body of JSON read."""
     try:
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            return answer.status, answer.headers["Content-Type"], answer.read()
+        with urllib.request.urlopen(server.url + path, timeout=20) as answer:
+            code, body = answer.status, answer.read()
     except urllib.error.HTTPError as error:
-        return error.code, error.headers["Content-Type"], error.read()
+        code, body = error.code, error.read()
+    return code, body.decode() if path == "/metrics" else json.loads(body)
 
 
 def samples(server: MetricsServer) -> dict[tuple[str, ...], float]:
     """Every sample by its name and its labels' values."""
-    body = get(server, "/metrics")[2].decode()
-    families = text_string_to_metric_families(body)
+    families = text_string_to_metric_families(get(server, "/metrics")[1])
     found = [each for family in families for each in family.samples]
     return {(each.name, *(value for _, value in sorted(each.labels.items())[::-1])): each.value for each in found}
 
@@ -66,21 +66,15 @@ def make_ready(health: Health) -> None:
 
 
 def test_a_node_is_ready_only_once_views_come(server: MetricsServer, health: Health) -> None:
-    status, _, body = get(server, "/readyz")
-    assert status == 503
-    assert json.loads(body) == {
-        "ready": False,
-        "not_ready": ["NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY", "VIEWS_NOT_FRESH"],
-        "level": 0,
-        "reasons": [],
-    }
+    missing = ["NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY", "VIEWS_NOT_FRESH"]
+    assert get(server, "/readyz") == (503, {"ready": False, "not_ready": missing, "level": 0, "reasons": []})
     make_ready(health)
-    status, _, body = get(server, "/readyz")
-    assert (status, json.loads(body)["ready"]) == (200, True)
+    assert get(server, "/readyz") == (200, {"ready": True, "not_ready": [], "level": 0, "reasons": []})
     health.source("lost")
-    status, _, body = get(server, "/readyz")
-    told = json.loads(body)
-    assert (status, told["not_ready"], told["level"], told["reasons"]) == (503, ["SRC_NOT_STREAMING"], 2, ["SRC_LOST"])
+    missing = ["SRC_NOT_STREAMING"]
+    assert get(server, "/readyz") == (503, {"ready": False, "not_ready": missing, "level": 2, "reasons": ["SRC_LOST"]})
+    assert get(server, "/healthz") == (200, {"live": True})
+    assert get(server, "/")[0] == 404
 
 
 def test_metrics_hold_what_the_health_was_told(server: MetricsServer, health: Health) -> None:
@@ -130,8 +124,8 @@ def test_every_metric_is_explained_in_the_docs(
 ) -> None:
     make_ready(health)
     health.measure("gpu_mem_mb", 1.0)
-    body = get(server, "/metrics")[2].decode()
-    ours = {family.name for family in text_string_to_metric_families(body) if family.name.startswith("gcd_")}
+    families = text_string_to_metric_families(get(server, "/metrics")[1])
+    ours = {family.name for family in families if family.name.startswith("gcd_")}
     text = (request.config.rootpath / "docs" / "deploy.md").read_text()
     assert len(ours) > 20
     assert [name for name in sorted(ours) if f"`{name}" not in text] == []

@@ -24,22 +24,22 @@ def test_a_life_as_systemd_hears_it(tmp_path: Path, is_abstract: bool) -> None:
     bound, told = (f"\0{name}", f"@{name}") if is_abstract else (str(tmp_path / "notify"),) * 2
     with service_manager(bound) as receive:
         service = ServiceManager({"NOTIFY_SOCKET": told})
-        assert (service.extend_start(90.0), service.ready(), service.alive(), service.stopping()) == (
-            True,
-            True,
-            False,
-            True,
-        )
-        assert receive() == ["EXTEND_TIMEOUT_USEC=90000000", "READY=1", "STOPPING=1"]
+        service.loading()
+        for _ in range(2):
+            service.ready()
+        service.alive()  # it watches nobody
+        service.stopping()
+        assert receive() == ["EXTEND_TIMEOUT_USEC=300000000", "READY=1", "STOPPING=1"]
 
 
 def test_the_watchdog_is_fed_four_times_a_period_however_often_it_is_called(tmp_path: Path) -> None:
     times, path = itertools.count(100.0, 0.125), str(tmp_path / "notify")
     environment = {"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "30000000", "WATCHDOG_PID": str(os.getpid())}
     service = ServiceManager(environment, lambda: next(times))
-    assert not service.alive()  # nobody there: it is tried again
+    service.alive()  # nobody there: it is tried again
     with service_manager(path) as receive:
-        assert sum(service.alive() for _ in range(241)) == 5
+        for _ in range(241):
+            service.alive()
         assert receive() == ["WATCHDOG=1"] * 5
 
 
@@ -48,7 +48,8 @@ def test_a_socket_that_cannot_be_reached_is_logged_once_and_the_node_goes_on(
     address: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "30000000"})
-    assert [service.ready(), service.alive(), service.alive(), service.stopping()] == [False] * 4
+    for tell in (service.ready, service.alive, service.alive, service.stopping):
+        tell()
     assert len(caplog.records) == 1
 
 
@@ -77,8 +78,8 @@ def lines(text: str) -> list[dict[str, Any]]:
 
 
 def test_a_line_says_when_where_and_what(log: logging.Logger, stream: io.StringIO) -> None:
-    before = datetime.now(UTC)
-    log.warning("window %d took %.1f s", 7, 2.5, extra={"code": "SRC_LOST", "view": None, "level": "forged"})
+    before, event = datetime.now(UTC), {"code": "SRC_LOST", "level": 2, "view": None}
+    log.warning("window %d took %.1f s", 7, 2.5, extra={"event": event, "level": "forged"})
     (line,) = lines(stream.getvalue())
     assert before <= datetime.fromisoformat(line.pop("time")) <= datetime.now(UTC)
     assert line == {
@@ -87,21 +88,16 @@ def test_a_line_says_when_where_and_what(log: logging.Logger, stream: io.StringI
         "logger": "gcd_node.test",
         "message": "window 7 took 2.5 s",
         "thread": threading.current_thread().name,
-        "code": "SRC_LOST",
-        "view": None,
+        "event": event,
     }
 
 
-@pytest.mark.parametrize(
-    "value",
-    [float("nan"), b"\xff", {1: {2}}, 2**53, "\ud800", 'a\n{"level": 1}'],
-    ids=["nan", "bytes", "dict", "large", "surrogate", "lines"],
-)
+@pytest.mark.parametrize("value", [b"\xff", {1: {2}}, "\ud800", 'a\n{"level": 1}'])
 def test_whatever_is_logged_is_one_line_of_json(log: logging.Logger, stream: io.StringIO, value: object) -> None:
-    log.error("%s and %d", value, extra={"value": value})
+    log.error("%s and %d", value, extra={"event": {"value": value}})
     log.error("x" * 1_000_000)
     line, long = lines(stream.getvalue())
-    assert isinstance(line["value"], str)
+    assert line["message"].startswith("%s and %d ")  # arguments that do not fit
     assert len(long["message"]) == 16_000
 
 
