@@ -26,20 +26,13 @@ _UPDATE = "--gcd-update"
 
 
 class ReplayedRun:
-    """A launch file that was replayed in a test."""
+    """A launch file that was replayed in a test. folder: the run, as `gcd-node replay --out` writes it; in the test's
+    tmp_path. manifest: what it states of itself, seeds, stamps, digests, totals."""
 
     def __init__(self, run: "RunFolder", config: pytest.Config) -> None:
+        self.folder: Path = run.path
+        self.manifest: Manifest = run.manifest
         self._run, self._config = run, config
-
-    @property
-    def folder(self) -> Path:
-        """The run, as `gcd-node replay --out` writes it; lies in the test's tmp_path."""
-        return self._run.path
-
-    @property
-    def manifest(self) -> "Manifest":
-        """What the run states of itself: seeds, stamps, digests, totals."""
-        return self._run.manifest
 
     def assert_same_as(
         self, golden: str | Path, *, min_psnr: float | None = None, max_class_share: float = 0.0
@@ -92,7 +85,7 @@ def _renew(run: "RunFolder", golden: Path) -> bool:
             raise OutputError(f"{golden} is there and is no golden run (it has no {MANIFEST}); name another folder")
         with contextlib.suppress(DamagedRunError):
             comparison = compare(open_run(golden), run)
-            if comparison.first_divergence is None and not comparison.facts:
+            if not comparison.failures() and not comparison.facts:
                 return False
         try:
             shutil.rmtree(golden)

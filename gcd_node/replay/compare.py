@@ -4,7 +4,7 @@ JSON."""
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import cv2
 import msgspec
@@ -79,28 +79,22 @@ class ViewComparison:
     same_seed: bool = True
     distance: Distance | None = None
 
-    @property
-    def identical(self) -> bool:
-        """Whether nothing at all differs."""
-        return self.within(Tolerance())
-
     def within(self, tolerance: Tolerance) -> bool:
         """Whether all that must agree does, and the pictures are near enough."""
-        distance = self.distance
-        if self.facts or distance is None:
+        if self.facts or self.distance is None:
             return False
         least_db = math.inf if tolerance.min_psnr_db is None else tolerance.min_psnr_db
-        share = max(distance.shares.values(), default=0.0)
-        return distance.worst_psnr_db >= least_db and share <= tolerance.max_class_share
+        share = max(self.distance.shares.values(), default=0.0)
+        return self.distance.worst_psnr_db >= least_db and share <= tolerance.max_class_share
 
     def __str__(self) -> str:
-        parts = [] if self.only_in is None else [f"only in {self.only_in}"]
-        if self.distance is not None:
-            far, shares = self.distance, self.distance.shares
+        parts = [f"window {self.window_id}, view {self.view_id}: "]
+        parts += [f"only in {self.only_in}; "] if self.only_in else []
+        if (far := self.distance) is not None:
             worst = f"frame {far.worst_frame} {far.worst_psnr_db:.2f} dB"
-            parts += [f"{far.psnr_db:.2f} dB, {worst}, up to {far.largest} levels"] if far.largest else []
-            parts += [f"{share:.3%} of the {_MAP_NAMES[kind]}" for kind, share in shares.items() if share]
-        return "; ".join(parts + [f"other {fact}" for fact in self.facts]) or "identical"
+            parts += [f"{far.psnr_db:.2f} dB, {worst}, up to {far.largest} levels; "] if far.largest else []
+            parts += [f"{share:.3%} of the {_MAP_NAMES[kind]}; " for kind, share in far.shares.items() if share]
+        return "".join(parts + [f"other {fact}; " for fact in self.facts]).removesuffix("; ")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,14 +107,9 @@ class RunComparison:
     facts: dict[str, tuple[str, str]]
     views: tuple[ViewComparison, ...]
 
-    @property
-    def first_divergence(self) -> ViewComparison | None:
-        """The first view of the first window that is not identical; None if all are."""
-        return next(iter(self.failures(Tolerance())), None)
-
-    def failures(self, tolerance: Tolerance) -> tuple[ViewComparison, ...]:
-        """Every view that is not near enough."""
-        return tuple(view for view in self.views if not view.within(tolerance))
+    def failures(self, tolerance: Tolerance | None = None) -> tuple[ViewComparison, ...]:
+        """Every view that is not near enough; without a tolerance, that is not identical."""
+        return tuple(view for view in self.views if not view.within(tolerance or Tolerance()))
 
 
 def compare(a: RunFolder, b: RunFolder) -> RunComparison:
@@ -131,46 +120,42 @@ def compare(a: RunFolder, b: RunFolder) -> RunComparison:
         DamagedRunError: see read_windows(); or the configuration of a manifest is not TOML.
     """
     views: list[ViewComparison] = []
-    same_size = a.manifest.size == b.manifest.size
-    for window_id, in_a, in_b in _paired_windows(a, b):
-        ids_a, ids_b = ({} if each is None else each[0].views for each in (in_a, in_b))
-        for view_id in dict.fromkeys((*ids_a, *ids_b)):
-            if in_a is not None and in_b is not None and view_id in ids_a and view_id in ids_b:
-                views.append(_compare_view(view_id, in_a, in_b, same_size=same_size))
-            else:
-                only_in = "A" if view_id in ids_a else "B"
-                views.append(ViewComparison(window_id=window_id, view_id=view_id, only_in=only_in))
-    return RunComparison(a=a, b=b, facts=_different_facts(a.manifest, b.manifest), views=tuple(views))
-
-
-_Window: TypeAlias = tuple[WindowEntry, dict[str, ViewPixels]]
-
-
-def _paired_windows(a: RunFolder, b: RunFolder) -> Iterator[tuple[int, _Window | None, _Window | None]]:
-    """The windows of two runs by window_id; None where one has no such window."""
     rest_a, rest_b = read_windows(a), read_windows(b)
     ids_a, ids_b = ({window.window_id for window in run.manifest.windows} for run in (a, b))
     for window_id in sorted(ids_a | ids_b):
-        yield window_id, next(rest_a) if window_id in ids_a else None, next(rest_b) if window_id in ids_b else None
+        window_a, views_a = next(rest_a) if window_id in ids_a else (None, {})
+        window_b, views_b = next(rest_b) if window_id in ids_b else (None, {})
+        for view_id in dict.fromkeys((*views_a, *views_b)):
+            pixels_a, pixels_b = views_a.get(view_id), views_b.get(view_id)
+            if window_a is None or window_b is None or pixels_a is None or pixels_b is None:
+                only_in = "B" if pixels_a is None else "A"
+                views.append(ViewComparison(window_id=window_id, view_id=view_id, only_in=only_in))
+            else:
+                same_size = a.manifest.size == b.manifest.size
+                distance = _distance(pixels_a, pixels_b) if same_size else None
+                facts = [] if same_size else ["size"]
+                facts += [name for kind, name in _MAP_NAMES.items() if (kind in pixels_a) != (kind in pixels_b)]
+                views.append(_compare_view(view_id, window_a, window_b, facts, distance))
     for rest in (rest_a, rest_b):
         next(rest, None)  # to look at their ends
+    facts_a, facts_b = dict(_facts(a.manifest)), dict(_facts(b.manifest))
+    pairs = {name: (facts_a.get(name, _ABSENT), facts_b.get(name, _ABSENT)) for name in facts_a | facts_b}
+    different = {printable(name): (printable(one), printable(two)) for name, (one, two) in pairs.items() if one != two}
+    return RunComparison(a=a, b=b, facts=different, views=tuple(views))
 
 
-def _compare_view(view_id: str, a: _Window, b: _Window, *, same_size: bool) -> ViewComparison:
-    (window_a, views_a), (window_b, views_b) = a, b
-    entry_a, entry_b = window_a.views[view_id], window_b.views[view_id]
-    pixels_a, pixels_b = views_a[view_id], views_b[view_id]
-    facts = [name for name in ("stamps", "seqs", "epoch") if getattr(window_a, name) != getattr(window_b, name)]
-    facts += ["ood"] if entry_a.ood != entry_b.ood else []
-    facts += [] if same_size else ["size"]
-    facts += [name for kind, name in _MAP_NAMES.items() if (kind in pixels_a) != (kind in pixels_b)]
+def _compare_view(
+    view_id: str, a: WindowEntry, b: WindowEntry, facts: list[str], distance: Distance | None
+) -> ViewComparison:
+    moments = [name for name in ("stamps", "seqs", "epoch") if getattr(a, name) != getattr(b, name)]
+    moments += ["ood"] if a.views[view_id].ood != b.views[view_id].ood else []
     return ViewComparison(
-        window_id=window_a.window_id,
+        window_id=a.window_id,
         view_id=view_id,
-        facts=tuple(facts),
-        same_input=window_a.input_sha256 == window_b.input_sha256,
-        same_seed=entry_a.seed == entry_b.seed,
-        distance=_distance(pixels_a, pixels_b) if same_size else None,
+        facts=(*moments, *facts),
+        same_input=a.input_sha256 == b.input_sha256,
+        same_seed=a.views[view_id].seed == b.views[view_id].seed,
+        distance=distance,
     )
 
 
@@ -201,14 +186,9 @@ def _share(kind: str, a: Pixels, b: Pixels) -> float:
     return float(np.maximum(far, (a != b).any(axis=(1, 2)) / one[0].size).mean())
 
 
-def _different_facts(a: Manifest, b: Manifest) -> dict[str, tuple[str, str]]:
-    """What differs: settings, weights, recording, versions, machine, size, totals, troubles; in this order."""
-    all_a, all_b = dict(_facts(a)), dict(_facts(b))
-    pairs = {name: (all_a.get(name, _ABSENT), all_b.get(name, _ABSENT)) for name in all_a | all_b}
-    return {printable(name): (printable(a), printable(b)) for name, (a, b) in pairs.items() if a != b}
-
-
 def _facts(manifest: Manifest) -> Iterator[tuple[str, str]]:
+    """What a run was made from: settings, weights, recording, versions, machine, size, totals, troubles; in this
+    order."""
     try:
         config = decode_toml(manifest.config)
     except FileError as error:
@@ -230,58 +210,44 @@ def _flat(group: str, table: Mapping[str, object], place: str = "") -> Iterator[
             yield f"{group} {place}{key}", value if isinstance(value, str) else msgspec.json.encode(value).decode()
 
 
-# In words.
-
-
-def verdict(comparison: RunComparison, tolerance: Tolerance) -> str:
-    """How the comparison ends, in one line."""
-    total = len(comparison.views)
-    same, far = sum(view.identical for view in comparison.views), len(comparison.failures(tolerance))
-    if same == total:
-        return f"identical: all {total} views"
-    if not far:
-        return f"near enough: {same} of {total} views are identical, the others {tolerance}"
-    return f"DIFFERENT: {far} of {total} views are not {tolerance}"
-
-
-def divergence(comparison: RunComparison) -> str | None:
-    """Where the runs first differ and what that says, in one line; None if they are identical."""
-    first = comparison.first_divergence
-    if first is None:
-        return None
-    cause = "" if first.only_in else "; the model was given the same pictures"
-    if not first.same_input:
-        cause = "; the model was given other pictures already: look at the recording and its decoder"
-    elif not first.same_seed:
-        cause += " and another seed, as any other setting brings one"
-    return f"first divergence: window {first.window_id}, view {first.view_id}: {first}{cause}"
-
-
 def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
     """The whole comparison in words: verdict, causes, first divergence, and the first views that are too far apart."""
-    lines = [verdict(comparison, tolerance)]
+    total, different, failures = len(comparison.views), comparison.failures(), comparison.failures(tolerance)
+    lines = [f"DIFFERENT: {len(failures)} of {total} views are not {tolerance}"]
+    if not different:
+        lines = [f"identical: all {total} views"]
+    elif not failures:
+        lines = [f"near enough: {total - len(different)} of {total} views are identical, the others {tolerance}"]
     if comparison.facts:
         lines += ["what A and B were made from differs (A, B):"]
         lines += [f"  {name}: {a}, {b}" for name, (a, b) in comparison.facts.items()]
-    first, failures = divergence(comparison), comparison.failures(tolerance)
-    lines += [] if first is None else [first]
-    lines += [f"  window {each.window_id}, view {each.view_id}: {each}" for each in failures[:_LINES]]
+    if different:
+        first = different[0]
+        cause = "" if first.only_in else "; the model was given the same pictures"
+        if not first.same_input:
+            cause = "; the model was given other pictures already: look at the recording and its decoder"
+        elif not first.same_seed:
+            cause += " and another seed, as any other setting brings one"
+        lines.append(f"first divergence: {first}{cause}")
+    lines += [f"  {each}" for each in failures[:_LINES]]
     lines += [f"  and {len(failures) - _LINES} more"] if len(failures) > _LINES else []
     return "\n".join(lines)
 
 
 def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:
     """Everything as plain values for JSON, which has null for the PSNR of identical pictures, infinite here."""
-    first, views = comparison.first_divergence, [asdict(view) for view in comparison.views]
-    for plain, view in zip(views, comparison.views, strict=True):
-        plain |= {"identical": view.identical, "passed": view.within(tolerance)}
+    different = comparison.failures()
+    first = {"window_id": different[0].window_id, "view_id": different[0].view_id} if different else None
     return {
         "a": str(comparison.a.path),
         "b": str(comparison.b.path),
         "passed": not comparison.failures(tolerance),
-        "identical": first is None,
+        "identical": not different,
         **asdict(tolerance),
         "facts": [{"name": name, "a": a, "b": b} for name, (a, b) in comparison.facts.items()],
-        "first_divergence": None if first is None else {"window_id": first.window_id, "view_id": first.view_id},
-        "views": views,
+        "first_divergence": first,
+        "views": [
+            {**asdict(view), "identical": view.within(Tolerance()), "passed": view.within(tolerance)}
+            for view in comparison.views
+        ],
     }

@@ -3,7 +3,7 @@
 import hashlib
 import platform
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -103,7 +103,7 @@ def replay(
         return source
 
     with new_folder(out) as folder, _repeatable():
-        with RunWriter(folder, on_window) as writer:
+        with closing(RunWriter(folder, on_window)) as writer:
             noting = Parts(open_source=open_and_note, load_model=parts.load_model)
             node = Node(config, noting, writer, on_configured=traits.append, on_window=writer.finish_window)
             summary = node.run()
@@ -132,8 +132,8 @@ def _repeatable() -> Generator[None]:
 class RunWriter:
     """A message sink that needs no reader: takes the rgb8 messages of a lockstep node and keeps windows and their maps.
 
-    Single frames are part of their window, and deviations of its samples: neither is kept. Use it as a context
-    manager; at its end the videos are finished. size, fps: of its windows, None before the first.
+    Single frames are part of their window, and deviations of its samples: neither is kept. size, fps: of its windows,
+    None before the first.
     """
 
     def __init__(self, folder: Path, on_window: Callable[[WindowReport], None] | None) -> None:
@@ -142,32 +142,30 @@ class RunWriter:
         self.classes: tuple[ClassRecord, ...] = ()
         self.size: SizeEntry | None = None
         self.fps = 0.0
+        self.stats = PublisherStats()  # nobody reads
         self._folder, self._on_window = folder, on_window
         self._videos: dict[Path, VideoWriter] = {}
         self._views: dict[str, ViewEntry] = {}  # of the window in work
-        self._sent = 0
 
-    def __enter__(self) -> "RunWriter":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Finish the videos."""
         for video in self._videos.values():
             video.close()
 
     def send(self, message: ViewMessage) -> bool:
         """Take a view; see MessageSink. Raises OutputError if its video cannot be begun."""
-        self._sent += 1
         header, kind = message.header, kind_of(message.topic)
         if kind not in ("win", "cls", "vis", "depth"):
             return True
         frames, height, width, channels = header.shape
         pixels: Pixels = np.frombuffer(message.payload, np.uint8)
+        pixels = pixels.reshape((frames, height, width, 3) if channels == 3 else (frames, height, -1))
+        sha256, quality = pixel_digest(pixels), header.quality
         if kind == "win":
             self.size = SizeEntry(frames=frames, height=height, width=width)
-            quality = header.quality
             self._views[header.view_id] = ViewEntry(
                 view_rev=header.view_rev,
-                sha256={},
+                sha256={"win": sha256},
                 seed=quality.seed,
                 steps=quality.steps,
                 ood=quality.ood,
@@ -175,12 +173,11 @@ class RunWriter:
             )
         elif kind == "cls":
             self.classes = tuple(header.classes or ())
-        pixels = pixels.reshape((frames, height, width, 3) if channels == 3 else (frames, height, -1))
+        self._views[header.view_id].sha256[kind] = sha256
         path = pixels_path(self._folder, header.view_id, kind)
         if path not in self._videos:
             self._videos[path] = VideoWriter(path, header.src.fps_cond)
         self._videos[path].add(pixels)
-        self._views[header.view_id].sha256[kind] = pixel_digest(pixels)
         return True
 
     def finish_window(self, report: WindowReport) -> None:
@@ -207,11 +204,6 @@ class RunWriter:
             detail = fields["rung"] if "rung" in fields else f"seeds {', '.join(map(str, fields['seeds']))}"
             self.troubles.append(TroubleEntry(code=fields["code"], window_id=fields["window_id"], detail=detail))
 
-    @property
-    def stats(self) -> PublisherStats:
-        """Messages taken; see MessageSink."""
-        return PublisherStats(sent=self._sent)
-
     # Nobody looks, and nobody is waited for:
 
     def preview(self, made: Callable[[], ViewMessage]) -> None: ...
@@ -219,9 +211,6 @@ class RunWriter:
     def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None: ...
 
     def stop_waiting(self) -> None: ...
-
-
-# What a run is made from.
 
 
 def _manifest(config: NodeConfig, info: SourceInfo, traits: Traits, writer: RunWriter, summary: Summary) -> Manifest:

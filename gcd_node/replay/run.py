@@ -39,11 +39,7 @@ KeptKind: TypeAlias = Literal["win", "cls", "vis", "depth"]
 _SUFFIXES: dict[KeptKind, str] = {"win": "", "cls": ".classes", "vis": ".visibility", "depth": ".depth"}
 
 
-class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    pass
-
-
-class SizeEntry(_Entry, frozen=True, kw_only=True):
+class SizeEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Of every view: T frames of H x W pixels."""
 
     frames: Count
@@ -57,7 +53,7 @@ class SizeEntry(_Entry, frozen=True, kw_only=True):
             )
 
 
-class TroubleEntry(_Entry, frozen=True, kw_only=True):
+class TroubleEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What the model could not do: MODEL_NAN, the window is missing; GPU_OOM, less was asked of it from here on."""
 
     code: str
@@ -65,7 +61,7 @@ class TroubleEntry(_Entry, frozen=True, kw_only=True):
     detail: str
 
 
-class TotalsEntry(_Entry, frozen=True, kw_only=True):
+class TotalsEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """frames: read. windows: rendered. rejected: what spoilt windows, and how many. nan_windows: missing for that."""
 
     frames: int
@@ -74,7 +70,7 @@ class TotalsEntry(_Entry, frozen=True, kw_only=True):
     nan_windows: int
 
 
-class ViewEntry(_Entry, frozen=True, kw_only=True):
+class ViewEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One view of one window.
 
     sha256: of its pixels by kind: of "win" u8 [T, H, W, 3] RGB, before any JPEG; of "cls" and "vis" u8 [T, H, W]; of
@@ -89,8 +85,12 @@ class ViewEntry(_Entry, frozen=True, kw_only=True):
     ood: tuple[str, ...]
     nan_frames: int
 
+    def __post_init__(self) -> None:
+        if "win" not in self.sha256:
+            raise ValueError("a view needs the digest of its pixels")
 
-class WindowEntry(_Entry, frozen=True, kw_only=True):
+
+class WindowEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One window.
 
     stamps: [sec, nanosec] of its T frames as the source gave them (one number would be changed by readers that hold
@@ -107,7 +107,7 @@ class WindowEntry(_Entry, frozen=True, kw_only=True):
     views: Annotated[dict[ViewId, ViewEntry], Meta(min_length=1)]
 
 
-class Manifest(_Entry, frozen=True, kw_only=True):
+class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole run.
 
     format: another number is another layout.
@@ -173,8 +173,6 @@ def open_run(path: Path) -> RunFolder:
         raise DamagedRunError(
             f"{file} is no manifest of a run as this version writes it: it {error}; replay the recording again"
         ) from error
-    if any("win" not in view.sha256 for window in manifest.windows for view in window.views.values()):
-        raise DamagedRunError(f"{file} has a view without a digest of its pixels; replay the recording again")
     return RunFolder(path=path, manifest=manifest)
 
 
