@@ -134,17 +134,14 @@ class ControlServer:
                 poller.poll()
                 self._guard.report_failures()
                 if self._socket.poll(0) and not self._closing.is_set():
-                    self._receive_safely()
+                    try:
+                        self._receive()
+                    except Exception:
+                        _LOG.exception("one request stays without a reply; the control socket goes on")
         except Exception:
             _LOG.exception("the control thread died")
         finally:
             unbind(self._socket, self.endpoint, _LINGER_MS)
-
-    def _receive_safely(self) -> None:
-        try:
-            self._receive()
-        except Exception:
-            _LOG.exception("one request stays without a reply; the control socket goes on")
 
     def _receive(self) -> None:
         received_ns = time.time_ns()
