@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.blocks import FineHead, Trunk, layout
+from gcd_model.live.blocks import FineHead, Trunk, layout, likeliest
 from gcd_model.live.config import SKY_M, DepthConfig
 
 INPUTS = 7
@@ -95,7 +95,7 @@ class DepthNet(nn.Module):
         n, _, height, width = inputs.shape
         if sweep is None:
             sweep = inputs.new_zeros(n, sweep_channels(self.config), height // SWEEP_SCALE, width // SWEEP_SCALE)
-        return self.trunk(inputs, beside=F.pixel_unshuffle(sweep.to(inputs), self._sweep_patch))
+        return self.trunk(inputs, beside=sweep.to(inputs))
 
     def forward(self, inputs: Tensor, sweep: Tensor | None = None, pixels: Tensor | None = None) -> DepthOutput:
         """What is seen.
@@ -111,7 +111,8 @@ class DepthNet(nn.Module):
         logits, offsets, *others = made.split([bins, bins - 1, self.classes, 1, 1, 1], dim=1)
         logits, (classes, moves, gate, trust) = logits.float(), (each.float() for each in others)
         if sweep is not None:
-            logits = logits - F.softplus(trust + _TRUST_AT_FIRST) * _TRUST * _doubt(sweep, inputs.shape[-1], pixels)
+            doubt = _doubt(sweep, inputs.shape[-1], pixels)
+            logits = torch.addcmul(logits, F.softplus(trust + _TRUST_AT_FIRST), doubt, value=-_TRUST)
         ground = inputs[:, -2:]
         if pixels is not None:
             ground = ground.flatten(2).gather(2, pixels[:, None].expand(-1, 2, -1))[..., None]
@@ -137,7 +138,7 @@ def _doubt(sweep: Tensor, width: int, pixels: Tensor | None) -> Tensor:
     sweep: [N, B + 1, H/2, W/2]. width: W. pixels: [N, M], of these alone.
     """
     costs = sweep[:, :-1].contiguous(memory_format=layout(sweep.device))
-    costs = F.avg_pool2d(costs, _DOUBT_PX, 1, _DOUBT_PX // 2, count_include_pad=False)
+    costs = F.avg_pool2d(costs, _DOUBT_PX, 1, _DOUBT_PX // 2, count_include_pad=False).contiguous()
     costs = costs - costs.amin(dim=1, keepdim=True)
     if pixels is None:
         return F.interpolate(costs, scale_factor=SWEEP_SCALE, mode="nearest")
@@ -198,7 +199,7 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     mass = solid.clone()
     mass[:, 1:] += solid[:, :-1]
     mass[:, :-1] += solid[:, 1:]
-    best, peak = mass.max(dim=1)  # [N, H, W]
+    best, peak = mass.amax(dim=1), likeliest(mass, dim=1).long()  # [N, H, W]
     around = peak[:, None] + torch.arange(-1, 2, device=peak.device).view(1, 3, 1, 1)
     inside = ((around >= 0) & (around < config.bins - 1)).to(solid.dtype)
     around = around.clamp(0, config.bins - 2)
@@ -222,16 +223,16 @@ def _smoothed(metres: Tensor, confidence: Tensor) -> Tensor:
     inverse = 1 / metres
     for _ in range(_SMOOTH_ROUNDS):
         for axis, sides in ((2, (_SMOOTH_PX, _SMOOTH_PX, 0, 0)), (1, (0, 0, _SMOOTH_PX, _SMOOTH_PX))):
-            log, size = inverse.log(), inverse.shape[axis]
-            wide = F.pad(torch.stack([inverse, log, confidence], dim=1), sides, mode="replicate")
-            total, weights = inverse * confidence, confidence
-            for step in range(1, _SMOOTH_PX + 1):
-                for shift in (step, -step):
-                    beside = wide.narrow(axis + 1, _SMOOTH_PX + shift, size)
-                    near = ((beside[:, 1] - log) / _SMOOTH_SPREAD).square()
-                    weight = beside[:, 2] * torch.exp(-near / 2)
-                    total, weights = total + weight * beside[:, 0], weights + weight
-            inverse = total / weights
+            wide, sure = F.pad(torch.stack([inverse, confidence], dim=1), sides, mode="replicate").unbind(dim=1)
+            log, size, share = wide.log().mul_(_SMOOTH_SPREAD**-1), wide.shape[axis], wide * sure
+            total, weights = share.clone(), sure.clone()
+            for step in range(1, _SMOOTH_PX + 1):  # every pixel and the one so many further, each as the other's
+                one, other = ((axis, 0, size - step), (axis, step, size - step))
+                near = (log.narrow(*other) - log.narrow(*one)).square_().mul_(-0.5).exp_()
+                for here, there in ((one, other), (other, one)):
+                    total.narrow(*here).addcmul_(near, share.narrow(*there))
+                    weights.narrow(*here).addcmul_(near, sure.narrow(*there))
+            inverse = (total / weights).narrow(axis, _SMOOTH_PX, size - 2 * _SMOOTH_PX)
     return 1 / inverse
 
 
@@ -285,23 +286,19 @@ def plane_sweep(
     n, _, height, width = here.shape
     moves = earlier_from_camera.to(here.device)
     turn, step = moves[:, :3, :3].float(), moves[:, :3, 3].float()
-    fx, fy, cx, cy = lenses[:, :, None].unbind(dim=1)  # [N, 1] each
-    x = ((torch.arange(width, device=here.device) + 0.5) * SWEEP_SCALE - cx) / fx
-    y = ((torch.arange(height, device=here.device) + 0.5) * SWEEP_SCALE - cy) / fy
+    fx, fy, cx, cy = lenses.unbind(dim=1)
+    into = torch.zeros_like(turn)  # pixels of a picture that reaches from -1 to 1
+    into[:, 0, 0], into[:, 0, 2] = 2 * fx / (width * SWEEP_SCALE), 2 * cx / (width * SWEEP_SCALE) - 1
+    into[:, 1, 1], into[:, 1, 2] = 2 * fy / (height * SWEEP_SCALE), 2 * cy / (height * SWEEP_SCALE) - 1
+    into[:, 2, 2] = 1
+    x = ((torch.arange(width, device=here.device) + 0.5) * SWEEP_SCALE - cx[:, None]) / fx[:, None]
+    y = ((torch.arange(height, device=here.device) + 0.5) * SWEEP_SCALE - cy[:, None]) / fy[:, None]
     u, v = x[:, None].expand(n, height, width), y[:, :, None].expand(n, height, width)
-    turned = turn @ torch.stack([u, v, torch.ones_like(u)], dim=1).flatten(2)  # [N, 3, h*w], of points 1 m ahead
-    shifts = step[:, None] * _inverse_depths(config).to(here.device)[:, None]  # [N, bins, 3]
-    points_x, points_y, points_z = (turned[:, None] + shifts[..., None]).unbind(dim=2)  # [N, bins, h*w] each
-    ahead = points_z > _BEHIND_M
-    z = points_z.clamp(min=_BEHIND_M)
-    place = torch.stack(
-        [
-            (points_x / z * fx[:, None] + cx[:, None]) / (width * SWEEP_SCALE / 2) - 1,
-            (points_y / z * fy[:, None] + cy[:, None]) / (height * SWEEP_SCALE / 2) - 1,
-        ],
-        dim=-1,
-    )  # [N, bins, h*w, 2]
-    inside = ahead & (place.abs() <= 1).all(dim=-1)
+    turned = into @ turn @ torch.stack([u, v, torch.ones_like(u)], dim=1).flatten(2)  # [N, 3, h*w], of points 1 m ahead
+    shifts = (into @ step[..., None]) * _inverse_depths(config).to(here.device)  # [N, 3, bins]
+    across, down, z = (turned[:, :, None] + shifts[..., None]).unbind(dim=1)  # [N, bins, h*w] each
+    inside = (z > _BEHIND_M) & (across.abs() <= z) & (down.abs() <= z)
+    place = torch.stack([across, down], dim=-1) / z.clamp(min=_BEHIND_M)[..., None]  # [N, bins, h*w, 2]
     looked_up = F.grid_sample(there, place, mode="bilinear", padding_mode="border", align_corners=False)
     difference = (looked_up - here.flatten(2)[:, :, None]).abs().mean(dim=1) * _CONTRAST  # [N, bins, h*w]
     costs = torch.where(inside, difference, _UNSEEN)

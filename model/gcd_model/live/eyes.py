@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gcd_model.errors import ShapeError
 from gcd_model.geometry import Intrinsics, invert_rigid
+from gcd_model.live.blocks import likeliest
 from gcd_model.live.config import SIZE_FACTOR, SKY_M
 from gcd_model.live.depth_net import Reference, depth_inputs, pixel_rays, plane_depth, read_depth, sweep_costs
 from gcd_model.live.ego_motion import EgoMotion
@@ -189,11 +190,6 @@ class Eyes:
                 f"{SIZE_FACTOR}, got {list(frame.shape)}"
             )
         return frame.to(self._device, torch.float32)
-
-
-def likeliest(chances: Tensor) -> Tensor:
-    """Of K choices [K, H, W]: uint8 [H, W]. (`max` is four times as fast as `argmax` here.)"""
-    return chances.max(dim=0).indices.to(torch.uint8)
 
 
 def _taken(depth: Tensor, learned: Tensor, lens: Intrinsics) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from gcd_model.geometry import Intrinsics, invert_rigid, require_rigid
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.eyes import SeenFrame
-from gcd_model.live.splat import Splat, Surfels, inverse_depth, relative_slopes, splat, unproject
+from gcd_model.live.splat import Splat, Surfels, inverse_depth, relative_slopes, splat, true_at, unproject
 
 _NEAREST_M = 0.1
 """What lies nearer to the source camera than this, or behind it, is outside its picture."""
@@ -72,11 +72,11 @@ class SurfelMemory:
 def _newest(stamp: Tensor, count: int) -> Tensor:
     """Numbers of the newest, in their order; of the oldest frame that still has room an even share is kept."""
     oldest = stamp.kthvalue(len(stamp) - count + 1).values
-    newer, at = stamp > oldest, torch.nonzero(stamp == oldest)[:, 0]
+    newer, at = stamp > oldest, true_at(stamp == oldest)
     room = count - int(newer.sum())
     even = torch.arange(room, device=stamp.device) * len(at) // max(room, 1)
     newer[at[even]] = True
-    return torch.nonzero(newer)[:, 0]
+    return true_at(newer)
 
 
 def _refuted(
@@ -87,16 +87,16 @@ def _refuted(
     What it sees is the plane of the pixel, not its middle alone: on a street the depth changes by half within a pixel.
     """
     camera_from_world = invert_rigid(world_from_camera.to("cpu", torch.float64)).to(position)
-    x, y, z = torch.addmm(camera_from_world[:3, 3], position, camera_from_world[:3, :3].T).T
+    x, y, z = torch.addmm(camera_from_world[:3, 3:], camera_from_world[:3, :3], position.T)
     u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
     inside = (z > _NEAREST_M) & (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)
     column, row = (torch.where(inside, each, 0.0).floor() for each in (u, v))
     pixel = (row * lens.width + column).long()
     inverse = inverse_depth(depth)
-    right, down = relative_slopes(inverse).flatten(1)[:, pixel]
-    plane = inverse.flatten()[pixel] * (1 + right * (u - column - 0.5) + down * (v - row - 0.5))
+    here, right, down = (each.flatten().index_select(0, pixel) for each in (inverse, *relative_slopes(inverse)))
+    plane = here * (1 + right * (u - column - 0.5) + down * (v - row - 0.5))
     refuted = inside & (z * plane <= 1 + _SAME_SURFACE)
-    return refuted if known is None else refuted & known.flatten()[pixel]
+    return refuted if known is None else refuted & known.flatten().index_select(0, pixel)
 
 
 # --- all that the source camera has shown: this frame's points, and those of earlier frames that stand still ---------

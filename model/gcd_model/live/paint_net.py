@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.layers import embedding_mlp, sinusoid
-from gcd_model.live.blocks import FineHead, Trunk, layout
+from gcd_model.live.blocks import FineHead, Trunk, in_planes, layout, likeliest
 from gcd_model.live.config import PaintConfig
 from gcd_model.live.splat import Splat
 
@@ -36,8 +36,6 @@ _MEAN_DEPTH_LOG = 2.5  # of unseen pixels at first: 12 m
 _LOG_VARIANCE = -3.0
 _CELL_PX, _REACH, _ROUNDS, _LEAST_SURE = 4, 3, 2, 1e-4
 """Colours of classes are averages of cells of so many pixels, so many cells around, so many times."""
-_SPECK_PX = 3
-"""Classes of single pixels do not count."""
 _SMOOTH = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 """What is drawn in detail loses the grids that heads of patches like to draw."""
 
@@ -143,20 +141,24 @@ class PaintNet(nn.Module):
             seen.log_depth / 3.0,
             known,
         ]
-        return torch.cat(
-            [
-                seen.colour,
-                torch.stack(facts, dim=1),
-                self.votes(seen.votes.to(self.votes.weight.dtype)).float(),
-                seen.painted * seen.painted_coverage[:, None],
-                seen.painted_coverage[:, None],
-                seen.rays,
-                torch.stack([ground, ground_known], dim=1),
-                torch.zeros_like(base) if noisy is None else noisy,
-                base,
-            ],
-            dim=1,
-        ).to(self.votes.weight.dtype, memory_format=layout(base.device))
+        return (
+            torch.cat(
+                [
+                    seen.colour,
+                    torch.stack(facts, dim=1),
+                    in_planes(self.votes, seen.votes.to(self.votes.weight.dtype)).float(),
+                    seen.painted * seen.painted_coverage[:, None],
+                    seen.painted_coverage[:, None],
+                    seen.rays,
+                    torch.stack([ground, ground_known], dim=1),
+                    torch.zeros_like(base) if noisy is None else noisy,
+                    base,
+                ],
+                dim=1,
+            )
+            .to(self.votes.weight.dtype)
+            .contiguous(memory_format=layout(base.device))
+        )
 
     def embedded(self, seen: Seen, sigma: Tensor) -> Tensor:
         """Noise levels [N] and where the cameras stand -> [N, E]."""
@@ -226,7 +228,7 @@ def crisp(mean: Tensor, classes: Tensor) -> Tensor:
     """
     n, count, height, width = classes.shape
     chances = classes.softmax(dim=1)
-    cells = F.avg_pool2d(torch.cat([mean, chances], dim=1), _CELL_PX)
+    cells = torch.cat([_cells(mean), _cells(chances)], dim=1)
     h, w = cells.shape[-2:]
     sure = cells[:, 3:].clamp(min=_LEAST_SURE).square().square().square()
     sums = torch.cat([cells[:, :3, None] * sure[:, None], sure[:, None]], dim=1).flatten(1, 2)  # [N, 4 K, h, w]
@@ -234,8 +236,8 @@ def crisp(mean: Tensor, classes: Tensor) -> Tensor:
         sums = _summed(sums, 2 * _REACH + 1)
     sums = sums.view(n, 4, count * h * w)
     colours = sums[:, :3] / sums[:, 3:]
-    likeliest = _summed(chances, _SPECK_PX).max(dim=1).indices
-    first = likeliest.flatten(1) * (h * w)  # of the class's colours
+    # classes of single pixels do not count
+    first = likeliest(_about(chances), dim=1).long().flatten(1) * (h * w)  # of the class's colours
     (top, down), (left, right) = (_between_cells(size, mean.device) for size in (height, width))
     made = torch.zeros_like(mean).flatten(2)
     for row, share_y in ((top, 1 - down), (top + 1, down)):
@@ -243,6 +245,22 @@ def crisp(mean: Tensor, classes: Tensor) -> Tensor:
             place = first + (row[:, None] * w + column).flatten()
             made += colours.gather(2, place[:, None].expand(-1, 3, -1)) * (share_y[:, None] * share_x).flatten()
     return made.view_as(mean)
+
+
+def _cells(x: Tensor) -> Tensor:
+    """Means of [N, C, H, W]: [N, C, H / _CELL_PX, W / _CELL_PX]; down and then across takes a third of pooling."""
+    return x.unflatten(2, (-1, _CELL_PX)).mean(dim=3).unflatten(3, (-1, _CELL_PX)).mean(dim=4)
+
+
+def _about(x: Tensor) -> Tensor:
+    """Over the eight places around each of [N, C, H, W] and itself; of many pixels slices are faster than `_summed`."""
+    rows = x.clone()
+    rows[..., 1:] += x[..., :-1]
+    rows[..., :-1] += x[..., 1:]
+    sums = rows.clone()
+    sums[..., 1:, :] += rows[..., :-1, :]
+    sums[..., :-1, :] += rows[..., 1:, :]
+    return sums
 
 
 def _summed(x: Tensor, side: int) -> Tensor:
@@ -259,9 +277,9 @@ def _between_cells(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
 
 def _smooth(x: Tensor) -> Tensor:
     """[N, C, H, W], without what changes from pixel to pixel."""
-    kernel = x.new_tensor(_SMOOTH).expand(x.shape[1], 1, 1, -1)
-    for weight, sides in ((kernel, (2, 2, 0, 0)), (kernel.transpose(2, 3), (0, 0, 2, 2))):
-        x = F.conv2d(F.pad(x, sides, mode="replicate"), weight, groups=x.shape[1])
+    for axis, sides in ((3, (2, 2, 0, 0)), (2, (0, 0, 2, 2))):
+        wide, size = F.pad(x, sides, mode="replicate"), x.shape[axis]
+        x = torch.stack([share * wide.narrow(axis, i, size) for i, share in enumerate(_SMOOTH)]).sum(dim=0)
     return x
 
 

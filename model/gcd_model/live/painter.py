@@ -8,9 +8,10 @@ from torch import Tensor
 
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics, invert_rigid
+from gcd_model.live.blocks import likeliest
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import pixel_rays, plane_depth
-from gcd_model.live.eyes import Eyes, Floor, FrameGeometry, likeliest
+from gcd_model.live.eyes import Eyes, Floor, FrameGeometry
 from gcd_model.live.memory import PlacedFrame, seen_world
 from gcd_model.live.paint_net import Painted, Seen, camera_features, filled, seen_of
 from gcd_model.live.splat import Splat, Surfels, splat, unproject

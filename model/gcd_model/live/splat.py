@@ -9,6 +9,7 @@ magnifies. Nothing here has gradients; on the CPU the same inputs give the same 
 
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,6 +41,8 @@ _PAINTED_WEIGHT = 0.01
 """Weight of what was painted beside what was seen on the same surface."""
 _SIDES = (2, 3, 4, 8, 17)
 """Footprints are drawn in groups of these widths and heights in pixels, so that few candidates are wasted."""
+_CELLS = 1 << 16
+"""Candidates at a time: what is worked out for them stays in a CPU's cache."""
 _MARGIN = 20
 """Pixels around the picture that are drawn and cut off, so that no fragment is asked whether it is inside."""
 
@@ -69,7 +72,7 @@ class Surfels:
     def rows(self, index: Tensor) -> "Surfels":
         """Those of a bool mask [N] or of int64 numbers."""
         if index.dtype == torch.bool:
-            index = torch.nonzero(index)[:, 0]
+            index = true_at(index)
         return Surfels(**{field.name: getattr(self, field.name).index_select(0, index) for field in fields(self)})
 
     def joined(self, *others: "Surfels") -> "Surfels":
@@ -111,6 +114,13 @@ class Splat:
     now_share: Tensor
 
 
+def true_at(mask: Tensor) -> Tensor:
+    """Numbers of the true ones of bool [N], int64 (on a CPU by numpy, which takes a tenth of the time)."""
+    if mask.device.type == "cpu":
+        return torch.from_numpy(np.flatnonzero(mask.numpy()))
+    return torch.nonzero(mask)[:, 0]
+
+
 @torch.no_grad()
 def unproject(
     depth: Tensor,
@@ -139,21 +149,21 @@ def unproject(
         )
     inverse = inverse_depth(depth)
     taken = inverse > 0 if keep is None else (inverse > 0) & keep
-    index = torch.nonzero(taken.flatten())[:, 0]
-    z = 1 / inverse.flatten()[index]
-    ray = _rays(lens, depth.device)[index]  # [N, 3]
+    index = true_at(taken.flatten())
+    z, slope_right, slope_down, red, green, blue, x, y = (
+        each.flatten().index_select(0, index)
+        for each in (1 / inverse, *relative_slopes(inverse), *colour.float(), *_rays(lens, depth.device))
+    )
     # p = z ray; one pixel on, the ray turns by 1 / f and z changes by -z (step of 1/z) / (1/z)
-    away = -z * relative_slopes(inverse).flatten(1)[:, index]  # [2, N]
-    step = away.T[..., None] * ray[:, None]  # [N, 2, 3]
-    step[:, 0, 0] += z / lens.fx
-    step[:, 1, 1] += z / lens.fy
+    right, down = -z * slope_right, -z * slope_down
+    steps = torch.stack([right * x + z / lens.fx, right * y, right, down * x, down * y + z / lens.fy, down])
     pose = world_from_camera.to(depth.device, torch.float32)
-    turn = pose[:3, :3].T
+    turn = pose[:3, :3]
     return Surfels(
-        position=torch.addmm(pose[:3, 3], z[:, None] * ray, turn),
-        step=(step.reshape(-1, 3) @ turn).view(-1, 2, 3),
-        colour=colour.float().flatten(1).T[index],
-        label=label.flatten()[index],
+        position=torch.addmm(pose[:3, 3:], turn, torch.stack([z * x, z * y, z])).T.contiguous(),
+        step=(turn @ steps.view(2, 3, -1)).permute(2, 0, 1).contiguous(),
+        colour=torch.stack([red, green, blue], dim=1),
+        label=label.flatten().index_select(0, index),
         stamp=torch.full_like(z, stamp),
         painted=torch.full_like(index, painted, dtype=torch.bool),
     )
@@ -190,12 +200,12 @@ def _slope(inverse: Tensor) -> Tensor:
     return torch.where(same & relative.isfinite(), relative, 0.0).clamp(-_STEEPEST, _STEEPEST)
 
 
-def _rays(lens: Intrinsics, device: torch.device) -> Tensor:
-    """Through the pixel centres, row by row, 1 along the optical axis: [H * W, 3]."""
+def _rays(lens: Intrinsics, device: torch.device) -> tuple[Tensor, Tensor]:
+    """x / z and y / z through the pixel centres, [H, W] each."""
     right = (torch.arange(lens.width, device=device) + 0.5 - lens.cx) / lens.fx
     down = (torch.arange(lens.height, device=device) + 0.5 - lens.cy) / lens.fy
-    y, x = torch.meshgrid(down, right, indexing="ij")
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1).view(-1, 3)
+    x, y = torch.meshgrid(right, down, indexing="xy")
+    return x, y
 
 
 @torch.no_grad()
@@ -252,8 +262,8 @@ def _shown(surfels: Surfels, number: Tensor, now: float) -> tuple[Tensor, Tensor
 class _Footprints:
     """M surfels in the target picture, each with a box of pixels around it.
 
-    plane: [M, 3, 3]; row 0 gives s_a, row 1 s_b, row 2 the depth in metres, at the pixel (i, j) of the box, by
-        plane @ (1, i, j). (s_a, s_b) counts in the surfel's own steps from its middle.
+    plane: [3, 3, M]; the first gives s_a, the next s_b, the last the depth in metres, at the pixel (i, j) of the box,
+        by (1, i, j) @ plane. (s_a, s_b) counts in the surfel's own steps from its middle.
     column, row: int64 [M], the first of the box. side: [2, M], width and height of the box, pixels; 0: not to be drawn.
     """
 
@@ -270,7 +280,7 @@ def _project(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics) -> t
     x, y, z = torch.addmm(camera_from_world[:3, 3:], turn, surfels.position.T)  # [3, N]
     u, v = lens.fx * x / z + (lens.cx - 0.5), lens.fy * y / z + (lens.cy - 0.5)  # whole at pixel centres
     near = (u > -_REACH_PX) & (u < lens.width + _REACH_PX) & (v > -_REACH_PX) & (v < lens.height + _REACH_PX)
-    number = torch.nonzero(near & (z > _NEAREST_M))[:, 0]
+    number = true_at(near & (z > _NEAREST_M))
     u, v, z = (each.index_select(0, number) for each in (u, v, z))
     step = surfels.step.index_select(0, number)
     (a_x, a_y, a_z), (b_x, b_y, b_z) = turn @ step[:, 0].T, turn @ step[:, 1].T  # [3, M] each
@@ -291,7 +301,7 @@ def _project(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics) -> t
     s_ai, s_aj, s_bi, s_bj = b_v / size, -b_u / size, -a_v / size, a_u / size
     s_a, s_b = s_ai * i + s_aj * j, s_bi * i + s_bj * j
     depth = (z + s_a * a_z + s_b * b_z, s_ai * a_z + s_bi * b_z, s_aj * a_z + s_bj * b_z)
-    plane = torch.stack([s_a, s_ai, s_aj, s_b, s_bi, s_bj, *depth], dim=1).view(-1, 3, 3)
+    plane = torch.stack([s_a, s_ai, s_aj, s_b, s_bi, s_bj, *depth]).view(3, 3, -1)
     return number, _Footprints(plane=plane, column=column.long(), row=row.long(), side=side)
 
 
@@ -317,21 +327,21 @@ def _large_enough(a_u: Tensor, a_v: Tensor, b_u: Tensor, b_v: Tensor) -> tuple[T
     return a_u, a_v, b_u, b_v
 
 
-_Fragments = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Pairs of a pixel and a footprint: pixel number, footprint number (both int64), weight, depth, whether core."""
+_Fragments = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Pairs of a pixel and a footprint: pixel number, footprint number (both int64), weight, depth."""
 
 
 def _fragments(footprints: _Footprints, width: int) -> _Fragments:
-    """All pixels that footprints touch, in a picture of that width, margin included."""
+    """All pixels that footprints touch, in a picture of that width, margin included; tails _TAIL times as deep."""
     order, groups = _by_size(footprints.side)
     corner = ((footprints.row + _MARGIN) * width + footprints.column + _MARGIN).index_select(0, order)
-    plane = footprints.plane.index_select(0, order)
-    parts = [_group(plane, corner, group, width) for group in groups]
+    plane = torch.stack([each.index_select(0, order) for each in footprints.plane.view(9, -1)]).view(3, 3, -1)
+    parts = [_group(plane, corner, order, group, width) for group in groups]
     if not parts:
         none = plane.new_zeros(0)
-        return none.long(), none.long(), none, none, none.bool()
-    pixel, owner, weight, z, core = (torch.cat(each) for each in zip(*parts, strict=True))
-    return pixel, order.index_select(0, owner), weight, z, core
+        return none.long(), none.long(), none, none
+    pixel, owner, weight, z = (torch.cat(each) for each in zip(*parts, strict=True))
+    return pixel, owner, weight, z
 
 
 def _by_size(side: Tensor) -> tuple[Tensor, list[tuple[slice, int, int]]]:
@@ -343,41 +353,39 @@ def _by_size(side: Tensor) -> tuple[Tensor, list[tuple[slice, int, int]]]:
     groups: list[tuple[slice, int, int]] = []
     start = 0
     for each, count in enumerate(torch.bincount(group).tolist()):
-        if each and count:
-            groups.append((slice(start, start + count), _SIDES[each // base - 1], _SIDES[each % base - 1]))
+        if each:
+            wide, high = _SIDES[each // base - 1], _SIDES[each % base - 1]
+            most = _CELLS // (wide * high)
+            groups += [(slice(i, min(i + most, start + count)), wide, high) for i in range(start, start + count, most)]
         start += count
     return order, groups
 
 
-def _group(plane: Tensor, corner: Tensor, group: tuple[slice, int, int], width: int) -> _Fragments:
-    """Fragments of footprints with boxes of one size. corner: number of the box's first pixel."""
+def _group(plane: Tensor, corner: Tensor, number: Tensor, group: tuple[slice, int, int], width: int) -> _Fragments:
+    """Fragments of footprints with boxes of one size. corner: number of the box's first pixel. number: theirs."""
     chosen, across, down = group
-    cells = across * down
-    cell = torch.arange(cells, device=plane.device)
+    cell = torch.arange(across * down, device=plane.device)
     row, column = cell // across, cell % across
-    grid = torch.stack([torch.ones_like(row), column, row]).to(plane)  # [3, cells]
-    values = (plane[chosen].view(-1, 3) @ grid).view(-1, 3, cells)
-    steps = values[:, :2].abs_()
-    far = torch.maximum(steps[:, 0], steps[:, 1]).flatten()
-    hit = torch.nonzero(far < _EDGE)[:, 0]
-    owner = hit // cells
-    place = hit + owner * (2 * cells)
-    values = values.flatten()
-    s_a, s_b = values.index_select(0, place), values.index_select(0, place + cells)
-    z = values.index_select(0, place + 2 * cells).clamp_(min=_NEAREST_M)
-    pixel = (corner[chosen, None] + (row * width + column)).flatten().index_select(0, hit)
+    grid = torch.stack([torch.ones_like(row), column, row], dim=1).to(plane)  # [cells, 3]
+    s_a, s_b, z = grid @ plane[..., chosen]  # [cells, M] each
+    far = torch.maximum(s_a.abs_(), s_b.abs_())
+    hit = true_at((far < _EDGE).flatten())
     weight = (1 - s_a).mul_(1 - s_b)
-    return pixel, owner + chosen.start, weight, z, far.index_select(0, hit) <= _CORE
+    z.clamp_(min=_NEAREST_M)
+    rank = z * (far > _CORE).mul(_TAIL).clamp_(min=1.0)  # takes a third of what `where` does
+    pixel = corner[chosen] + (row * width + column)[:, None]
+    owner = number[chosen].expand(len(cell), -1)
+    return tuple(each.flatten().index_select(0, hit) for each in (pixel, owner, weight, rank))  # pyright: ignore[reportReturnType]
 
 
-def _in_front(fragments: _Fragments, size: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Those on the nearest surface of their pixel: pixel, footprint, weight, depth.
+def _in_front(fragments: _Fragments, size: int) -> _Fragments:
+    """Those on the nearest surface of their pixel, tails as deep as they are. size: pixels in all.
 
     What hides is a core; a tail does so only where there is no core at all, and is dropped in front of one.
     """
-    pixel, owner, weight, z, core = fragments
-    rank = torch.where(core, z, z * _TAIL)
-    nearest = z.new_full((size,), torch.inf).scatter_reduce_(0, pixel, rank, "amin")
-    nearest = torch.where(nearest < _TAIL * _NEAREST_M, nearest, nearest / _TAIL).index_select(0, pixel)
-    front = torch.nonzero((z <= nearest * (1 + _BEHIND)) & (z >= nearest * (1 - _BEHIND)))[:, 0]
+    pixel, owner, weight, rank = fragments
+    nearest = rank.new_full((size,), torch.inf).scatter_reduce_(0, pixel, rank, "amin")
+    nearest, z = (each * (each < _TAIL * _NEAREST_M).float().clamp_(min=1 / _TAIL) for each in (nearest, rank))
+    nearest = nearest.index_select(0, pixel)
+    front = true_at((z <= nearest * (1 + _BEHIND)) & (z >= nearest * (1 - _BEHIND)))
     return tuple(each.index_select(0, front) for each in (pixel, owner, weight, z))  # pyright: ignore[reportReturnType]
