@@ -143,6 +143,13 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, sai
         windows_of(tmp_path / "broken.mp4")
 
 
+def test_a_video_too_narrow_for_the_network_is_refused_by_name(tmp_path: Path) -> None:
+    for number in range(20):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((64, 1, 3), np.uint8))
+    with pytest.raises(DataError, match=f"{tmp_path.name}: a picture of 1 x 64 has no part"):
+        windows_of(tmp_path, WindowChoice(rate=10.0))
+
+
 # --- views ------------------------------------------------------------------------------------------------------------
 
 

@@ -30,6 +30,14 @@ def test_looked_at_late_the_first_wrong_value_counts_with_the_clips_of_its_updat
         guard.check()
 
 
+def test_a_note_is_not_written_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "note.json").symlink_to(tmp_path / "mine.txt")
+    with pytest.raises(TrainError):
+        FiniteGuard("unet", tmp_path / "note.json").saw(5, "loss", torch.tensor(torch.nan))
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
 def test_a_note_that_cannot_be_written_does_not_hide_what_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "unet").write_text("a file where a folder should be")
     with pytest.raises(TrainError, match="the loss of unet is nan at update 5"):

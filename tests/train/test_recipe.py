@@ -183,11 +183,11 @@ def test_a_run_folder_keeps_recipe_and_commands_and_says_what_another_recipe_cha
     assert parse_recipe((tmp_path / "recipe.toml").read_bytes(), "kept") == other
 
 
-@pytest.mark.parametrize("name", ["recipe.toml", "commands.txt", "metrics.jsonl"])
+@pytest.mark.parametrize("name", ["recipe.toml", "commands.txt", "metrics.jsonl", "unet/samples"])
 def test_a_run_folder_whose_files_lead_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
     mine, given = tmp_path / "profile", tmp_path / "given"
     mine.write_text("mine")
-    given.mkdir()
+    (given / name).parent.mkdir(parents=True)
     (given / name).symlink_to(mine)
     with pytest.raises(RunError), RunFolder(given).begun(tiny_recipe(), "gcd-train train"):
         pass

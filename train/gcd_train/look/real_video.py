@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model import Traits
+from gcd_model.errors import ShapeError
 from gcd_model.geometry import center_crop_box
 from gcd_train.data.files import decoded, read
 from gcd_train.errors import DataError, RecipeError
@@ -237,7 +238,10 @@ def _chosen(
     for number, picture in enumerate(video.frames()):
         if number in wanted:
             size = (picture.shape[1], picture.shape[0])
-            (left, top, wide, high), _ = _kept(size, traits, hfov_deg)
+            try:
+                (left, top, wide, high), _ = _kept(size, traits, hfov_deg)
+            except ShapeError as error:
+                raise DataError(f"{video.path}: {error}") from error
             part = picture[top : top + high, left : left + wide]
             how = cv2.INTER_AREA if wide > wanted_size[0] else cv2.INTER_LINEAR
             chosen[number] = cv2.resize(part, wanted_size, interpolation=how).astype(np.uint8, copy=False)

@@ -18,6 +18,7 @@ from torch import Tensor
 from gcd_model.errors import FileError
 from gcd_model.small_files import decode_toml, read_small
 from gcd_train.errors import RecipeError, RunError, TrainError
+from gcd_train.files import write_whole
 from gcd_train.recipe_data import AnyStageName
 from gcd_train.recipe_files import to_toml
 
@@ -80,10 +81,11 @@ class RunFolder:
         Keeps the recipe and one more command line, and logs what differs from the last recipe. Raises RunError.
         """
         for path in (self.path / name for name in (".lock", "recipe.toml", "commands.txt", "metrics.jsonl")):
-            if path.is_symlink() or (
-                path.exists() and not path.is_file()
-            ):  # somebody else's folder: it leads elsewhere
+            if path.is_symlink() or (path.exists() and not path.is_file()):  # somebody else's: it leads elsewhere
                 raise RunError(f"{path} is no plain file; delete it, or choose another --out")
+        for path in self.path.glob("*/samples"):
+            if path.is_symlink():
+                raise RunError(f"{path} is a link, and pictures go there; delete it, or choose another --out")
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             lock = (self.path / ".lock").open("a")
@@ -194,9 +196,8 @@ class FiniteGuard:
 
     def _stop(self, wrong: _Seen, value: float, ids: list[str]) -> None:
         told = {"stage": self._stage, "update": wrong.update, "what": wrong.what, "value": str(value), "clips": ids}
-        with suppress(OSError):  # a full disk must not hide what is wrong
-            self._note.parent.mkdir(parents=True, exist_ok=True)
-            self._note.write_text(json.dumps(told, indent=1))
+        with suppress(RunError):  # a full disk must not hide what is wrong
+            write_whole(self._note, json.dumps(told, indent=1).encode())
         named = ", ".join(ids[:_NAMED]) + (f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "")
         raise TrainError(
             f"the {wrong.what} of {self._stage} is {value} at update {wrong.update}"
