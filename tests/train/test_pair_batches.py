@@ -119,6 +119,27 @@ def test_whatever_was_asked_for_before_a_loader_gives_the_same_batch(numbers: tu
         assert loaded.wait_s >= 0
 
 
+@pytest.mark.parametrize(
+    ("numbers", "starts"),
+    [
+        ((0, 1, 2, 3, 4), 1),
+        ((2, 5, 8, 11, 14), 2),
+        ((0, 4, 6, 10, 12, 16, 18), 3),  # the first of four processes that share six batches
+        ((1, 1, 6, 6, 11, 11), 3),  # the second of four that share five: one that counts nothing
+        ((*range(70), 90, 91, 92), 2),
+    ],
+)
+def test_batches_are_made_ahead_as_processes_share_them(
+    numbers: tuple[int, ...], starts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loader, started = SampleLoader(CountedSamples(), 3, HERE), list[int]()
+    start = loader._start
+    monkeypatch.setattr(loader, "_start", lambda number, count: (started.append(number), start(number, count)))
+    for number in numbers:
+        assert list(loader.batch(number, 2).numbers) == SampleOrder(7, seed=3).batch(number, 2)
+    assert len(started) == starts
+
+
 @pytest.mark.slow
 def test_processes_give_the_batches_that_are_made_here() -> None:
     """Two spawned processes, batches in order and after a jump; what they cannot read ends as it does here."""

@@ -4,6 +4,7 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, cycle
 from multiprocessing import get_context
 
 import cv2
@@ -50,8 +51,11 @@ class LoadedBatch:
     wait_s: float
 
 
+_LONGEST = 64  # steps of a process from batch to batch within one update
+
+
 class SampleLoader:
-    """Batches by number. As long as numbers rise evenly, those that follow are made ahead.
+    """Batches by number. Those that follow are made ahead, as long as the steps from number to number repeat.
 
     Worker processes are spawned, not forked: a fork would share OpenGL's and torch's state.
     """
@@ -59,17 +63,19 @@ class SampleLoader:
     def __init__(self, samples: Samples, seed: int, recipe: LoaderRecipe) -> None:
         self._samples, self._recipe = samples, recipe
         self._order = SampleOrder(len(samples), seed)
-        self._count, self._step, self._next = 0, 1, -1
+        self._count, self._last, self._steps = 0, 0, list[int]()
+        self._numbers: Iterator[int] = iter(())
         self._batches: Iterator[SampleBatch | TrainError] | None = None
 
     def batch(self, number: int, count: int) -> LoadedBatch:
         """Batch `number` of `count` samples. Raises: as `Samples.sample`; RunError if a process was killed."""
         started = time.perf_counter()
-        if self._batches is None or (number, count) != (self._next, self._count):
+        if len(self._steps) <= _LONGEST:
+            self._steps.append(number - self._last)
+        if self._batches is None or count != self._count or number != next(self._numbers):
             self._start(number, count)
         assert self._batches is not None, "just started"
-        samples = self._following(self._batches)
-        self._next = number + self._step
+        samples, self._last = self._following(self._batches), number
         if self._recipe.workers:
             self._samples.skips.extend(samples.skipped)  # each worker has its own account
         numbers = tuple(self._order.batch(number, count))
@@ -88,22 +94,25 @@ class SampleLoader:
         return samples
 
     def _start(self, number: int, count: int) -> None:
-        """From this number on, in steps as wide as the last one was: processes of a group take turns."""
-        last = self._next - self._step
-        self._step = number - last if self._batches is not None and number > last else 1
-        self._count = count
-        self._batches = iter(self._loader(number)) if self._recipe.workers else self._here(number)
+        """From this number on, in the steps that were taken so far: processes of a group take turns, if need be
+        unevenly, and an update's steps are those of the one before. Later, or backwards, it is a jump."""
+        known = self._batches is not None and count == self._count and number >= self._last
+        if not known or len(self._steps) > _LONGEST:
+            self._steps = []
+        steps, self._count = tuple(self._steps) or (1,), count
+        self._numbers, numbers = _numbered(number + steps[0], (*steps[1:], steps[0])), _numbered(number, steps)
+        self._batches = iter(self._loader(numbers)) if self._recipe.workers else self._here(numbers)
 
-    def _here(self, number: int) -> Iterator[SampleBatch | TrainError]:
-        for indices in _Batches(self._order, number, self._step, self._count):
+    def _here(self, numbers: Iterator[int]) -> Iterator[SampleBatch | TrainError]:
+        for indices in _Batches(self._order, numbers, self._count):
             yield collate([self._samples.sample(index) for index in indices])
 
-    def _loader(self, number: int) -> DataLoader[Sample | TrainError]:
+    def _loader(self, numbers: Iterator[int]) -> DataLoader[Sample | TrainError]:
         recipe = self._recipe
         order = SampleOrder(self._order.length, self._order.seed)  # read ahead, so not the one that is looked up
         return DataLoader(
             _Numbered(self._samples),
-            batch_sampler=_Batches(order, number, self._step, self._count),
+            batch_sampler=_Batches(order, numbers, self._count),
             num_workers=recipe.workers,
             prefetch_factor=recipe.prefetch,
             collate_fn=_collated,
@@ -113,20 +122,21 @@ class SampleLoader:
         )
 
 
+def _numbered(first: int, steps: Sequence[int]) -> Iterator[int]:
+    """`first`, then on and on by the steps in turn."""
+    return accumulate(cycle(steps), initial=first)
+
+
 @dataclass(frozen=True, slots=True)
 class _Batches:
-    """Numbers of the samples of batch `first`, `first + step` and so on without end: a batch sampler."""
+    """Numbers of the samples of each batch: a batch sampler."""
 
     order: SampleOrder
-    first: int
-    step: int
+    numbers: Iterator[int]
     count: int
 
     def __iter__(self) -> Iterator[list[int]]:
-        number = self.first
-        while True:
-            yield self.order.batch(number, self.count)
-            number += self.step
+        return (self.order.batch(number, self.count) for number in self.numbers)
 
 
 class _Numbered(Dataset[Sample | TrainError]):
