@@ -59,6 +59,7 @@ def test_the_first_of_two_processes_measures_alone(found: dict[str, Any]) -> Non
 
 def test_means_over_processes_keep_what_one_of_them_alone_gives(found: dict[str, Any]) -> None:
     assert found["ddp rank 0"] == found["ddp rank 1"] == 1.0
+    assert found["ddp weighed"] == 0.75  # three values of 1 beside one of 0
 
 
 @pytest.mark.timeout(300)

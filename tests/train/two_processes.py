@@ -208,7 +208,9 @@ class Together:
         for parallel in kinds:
             task = Task(recipe_of())
             weights = trained(self.folder / parallel, task, options(self.processes, Never(), LOG, parallel=parallel))
-            both = self.processes.averaged({"measured": task.measured, f"rank {self.processes.rank}": 1.0})
+            rank = self.processes.rank
+            mine = {"measured": (task.measured, 1), f"rank {rank}": (1.0, 1), "weighed": (float(rank), 1 + 2 * rank)}
+            both = self.processes.averaged(mine)
             found |= {f"{parallel} {name}": value for name, value in both.items()}
             found[f"{parallel} against two batches"] = furthest(weights, self.single["two batches"])
             found[f"{parallel} against twice the batch"] = furthest(weights, self.single["twice the batch"])

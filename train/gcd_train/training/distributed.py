@@ -6,7 +6,6 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
-from statistics import fmean as mean
 from typing import TypeVar
 
 import torch
@@ -82,15 +81,17 @@ class Processes:
             dist.all_reduce(said, dist.ReduceOp.MAX, group=self.control)
         return float(said[0]), float(said[1]), bool(said[2])
 
-    def averaged(self, values: dict[str, float]) -> dict[str, float]:
-        """The mean of every value over the processes that give it. Raises TrainError as `agreed`."""
-        if self.control is None:
-            return values
-        given = [dict[str, float]() for _ in range(self.count)]
-        with self.others_gone():
-            dist.all_gather_object(given, values, group=self.control)
-        names = {name: None for each in given for name in each}
-        return {name: mean(each[name] for each in given if name in each) for name in names}
+    def averaged(self, means: dict[str, tuple[float, int]]) -> dict[str, float]:
+        """Means over all processes, from those of each and of how many values they are. Raises TrainError as `agreed`."""
+        given = [means]
+        if self.control is not None:
+            given *= self.count
+            with self.others_gone():
+                dist.all_gather_object(given, means, group=self.control)
+        values: dict[str, list[tuple[float, int]]] = {}
+        for name, value in (item for each in given for item in each.items()):
+            values.setdefault(name, []).append(value)
+        return {name: sum(m * n for m, n in each) / sum(n for _, n in each) for name, each in values.items()}
 
     def told(self, value: object) -> object:
         """What the first process gives here, in every process. Raises TrainError as `agreed`."""

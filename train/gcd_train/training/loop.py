@@ -115,17 +115,19 @@ class _Window:
     norms: list[Tensor] = field(default_factory=list[Tensor])
     seconds: float = 0.0
 
-    def values(self) -> dict[str, float]:
-        """Mean of the gradient's norm, frames per second, and means of the loss and its parts, if any batch counted."""
-        norm, frames = float(torch.stack(self.norms).float().mean()), sum(loss.frames for loss in self.losses)
-        values = {"gradient_norm": norm, "frames_per_s": frames / max(self.seconds, 1e-9)}
-        if not self.losses:
-            return values
-        names = {name: None for loss in self.losses for name in loss.parts}
-        parts = {name: [loss.parts[name] for loss in self.losses if name in loss.parts] for name in names}
-        means = {name: float(torch.stack(values).float().mean()) for name, values in parts.items()}
-        total = float(torch.stack([loss.total for loss in self.losses]).float().mean())
-        return {"loss": total, **means, **values}
+    def values(self) -> dict[str, tuple[float, int]]:
+        """Means and of how many values: of the gradient's norm, frames per second, the loss and its parts."""
+        frames = sum(loss.frames for loss in self.losses) / max(self.seconds, 1e-9)
+        parts: dict[str, list[Tensor]] = {"loss": [loss.total for loss in self.losses]} if self.losses else {}
+        for loss in self.losses:
+            for name, value in loss.parts.items():
+                parts.setdefault(name, []).append(value)
+        means = {name: (_mean(values), len(values)) for name, values in parts.items()}
+        return means | {"gradient_norm": (_mean(self.norms), 1), "frames_per_s": (frames, 1)}
+
+
+def _mean(values: list[Tensor]) -> float:
+    return float(torch.stack(values).float().mean())
 
 
 class Loop:
@@ -242,10 +244,9 @@ class Loop:
         self._guard.check()
         if not self._window.norms:
             return
-        values = self._window.values()
-        values["peak_memory_gb"] = peak_memory_gb(self._window.norms[-1].device)
+        memory = (peak_memory_gb(self._window.norms[-1].device), 1)
+        values = self._processes.averaged(self._window.values() | {"peak_memory_gb": memory})
         self._window = _Window()
-        values = self._processes.averaged(values)
         values["frames_per_s"] *= self._processes.count
         if self._processes.first:
             self._tell(values)
