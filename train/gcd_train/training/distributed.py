@@ -82,7 +82,7 @@ class Processes:
         return float(said[0]), float(said[1]), bool(said[2])
 
     def averaged(self, means: dict[str, tuple[float, int]]) -> dict[str, float]:
-        """Means over all processes, from those of each and of how many values they are. Raises TrainError as `agreed`."""
+        """Means over all processes, from each one's and of how many values it is. Raises TrainError as `agreed`."""
         given = [means]
         if self.control is not None:
             given *= self.count
