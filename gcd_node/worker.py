@@ -1,10 +1,11 @@
 """The model's threads: they take windows, and have every view of each rendered and sent. They own the device.
 
 A model that works frame by frame has three of them beside a live source, at work on consecutive frames: one sees depth
-and motion, one places what was seen in the views, one paints the views and sends them.
+and motion, one places what was seen in the views, one paints the views and sends them. On two cores two are at work.
 """
 
 import logging
+import os
 import queue
 import threading
 import time
@@ -23,6 +24,12 @@ from gcd_node.window import PartialWindow, WindowSlot
 Given = TypeVar("Given")
 
 _LOG = logging.getLogger(__name__)
+_LOOK_S = 0.5  # how often who waits for room looks whether there will be any
+
+
+def _most_at_once() -> int:
+    """Windows in work. On two cores a third would make every view older and no more of them."""
+    return 2 if len(os.sched_getaffinity(0)) < 3 else 3
 
 
 class ModelWorker:
@@ -95,26 +102,41 @@ class ModelWorker:
             yield lambda taken: self._render(self._place(taken))
             return
 
+        failures: list[Exception] = []
+        room = threading.Semaphore(_most_at_once() - 1)  # for windows in work beside the one that is seen
+
+        def render(placed: tuple[Job, Placed | None] | None) -> None:
+            try:
+                self._render(placed)
+            finally:
+                room.release()
+
         def place_and_paint(taken: tuple[Job, Seen] | None) -> None:
             paint(self._place(taken))
 
+        def go_on(taken: tuple[Job, Seen] | None) -> None:
+            place(taken)
+            while not room.acquire(timeout=_LOOK_S) and not failures:
+                pass
+
         with (
-            self._thread("painter", newest, self._render) as paint,
-            self._thread("placer", newest, place_and_paint) as place,
+            self._thread("painter", newest, render, failures) as paint,
+            self._thread("placer", newest, place_and_paint, failures) as place,
         ):
-            yield place
+            yield go_on
+        if failures:
+            raise failures[0]
 
     @contextmanager
     def _thread(
-        self, name: str, newest: WindowSlot, step: Callable[[Given], None]
+        self, name: str, newest: WindowSlot, step: Callable[[Given], None], failures: list[Exception]
     ) -> Generator[Callable[[Given], None]]:
         """A step in a thread of its own. What is handed over is begun once the step before is done, and the call waits
         until it is begun: so the window taken next is the newest.
 
-        An error closes `newest`, and is raised at the end of the block.
+        An error closes `newest` and goes to `failures`; then nothing more is done.
         """
         waiting: queue.Queue[tuple[Given] | None] = queue.Queue()
-        failures: list[Exception] = []
 
         def work() -> None:
             self._threads.add(threading.get_ident())
@@ -123,7 +145,7 @@ class ModelWorker:
                 try:
                     if not failures:
                         step(*given)
-                except Exception as error:  # the end of a thread: the block raises it
+                except Exception as error:  # the end of a thread: who began it raises it
                     failures.append(error)
                     newest.close()
                 finally:
@@ -141,8 +163,6 @@ class ModelWorker:
         finally:
             waiting.put(None)
             thread.join()
-            if failures:
-                raise failures[0]
 
     def _place(self, taken: tuple[Job, Seen] | None) -> tuple[Job, Placed | None] | None:
         return None if taken is None else (taken[0], self._renderer.place(*taken))

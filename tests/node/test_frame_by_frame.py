@@ -1,6 +1,7 @@
 """Models that work frame by frame: a view of every frame, nothing remembered across a break of the source, and three
 threads beside a live one."""
 
+import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -74,20 +75,22 @@ def test_a_frame_that_is_rendered_again_is_the_first_one_then() -> None:
 
 
 class SideBySide(Streaming):
-    """Paints frame 3 only while frame 5 is being seen, and frame 4 placed, which is waited for. Notes the threads."""
+    """Paints frame 3 only while it and those after it are so many `at_once` in work, and no more. Notes the threads."""
 
-    def __init__(self) -> None:
+    def __init__(self, at_once: int) -> None:
         super().__init__()
         self.threads = {name: set[str]() for name in ("see", "place", "paint")}
-        self._fifth, self.met = threading.Event(), False
+        self._at_once, self._all, self._more, self.met = at_once, threading.Event(), threading.Event(), False
 
     def _note(self, step: str) -> None:
         self.threads[step].add(threading.current_thread().name)
 
     def see(self, features: SourceFeatures) -> Any:
         self._note("see")
-        if len(self.clips) == 6:
-            self._fifth.set()
+        if len(self.clips) == 4 + self._at_once:
+            self._all.set()
+        if len(self.clips) > 4 + self._at_once:
+            self._more.set()
         return super().see(features)
 
     def place(self, seen: Any, trajectories: Sequence[Trajectory]) -> Any:
@@ -99,7 +102,7 @@ class SideBySide(Streaming):
     ) -> list[View]:
         self._note("paint")
         if len(self.asked) == 4:
-            self.met = self._fifth.wait(10)
+            self.met = self._all.wait(10) and not self._more.wait(0.2)
         return super().paint(placed, trajectories, options)
 
 
@@ -114,8 +117,16 @@ def slowly(count: int) -> FakeSource:
     return source
 
 
-def test_beside_a_live_source_three_frames_are_in_work_at_once() -> None:
-    model, box = SideBySide(), Box()
+@pytest.fixture(autouse=True)
+def cores(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> int:
+    count = getattr(request, "param", 4)
+    monkeypatch.setattr(os, "sched_getaffinity", {0: range(count)}.__getitem__)
+    return count
+
+
+@pytest.mark.parametrize("cores", [2, 4], indirect=True)
+def test_beside_a_live_source_three_frames_are_in_work_at_once_and_on_two_cores_two(cores: int) -> None:
+    model, box = SideBySide(min(cores, 3)), Box()
     made_node(live_config(), model, slowly(12), box).run()
     assert model.met
     assert model.threads == {"see": {"model"}, "place": {"placer"}, "paint": {"painter"}}
