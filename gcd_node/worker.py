@@ -6,10 +6,10 @@ and motion, one places what was seen in the views, one paints the views and send
 
 import logging
 import os
-import queue
 import threading
 import time
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -22,9 +22,9 @@ from gcd_node.views import LiveConfig
 from gcd_node.window import PartialWindow, WindowSlot
 
 Given = TypeVar("Given")
+Made = TypeVar("Made")
 
 _LOG = logging.getLogger(__name__)
-_LOOK_S = 0.5  # how often who waits for room looks whether there will be any
 
 
 def _most_at_once() -> int:
@@ -105,64 +105,35 @@ class ModelWorker:
         failures: list[Exception] = []
         room = threading.Semaphore(_most_at_once() - 1)  # for windows in work beside the one that is seen
 
-        def render(placed: tuple[Job, Placed | None] | None) -> None:
+        def guarded(step: Callable[[Given], Made], given: Given) -> Made | None:
+            """A step, unless one has failed: that closes `newest`, and is raised at the end."""
             try:
-                self._render(placed)
+                return None if failures else step(given)
+            except Exception as error:  # the end of a thread's work
+                failures.append(error)
+                newest.close()
+                return None
             finally:
-                room.release()
+                self._pulse.rest()
 
-        def place_and_paint(taken: tuple[Job, Seen] | None) -> None:
-            paint(self._place(taken))
+        def place(taken: tuple[Job, Seen] | None) -> None:
+            painter.submit(paint, guarded(self._place, taken))
+
+        def paint(placed: tuple[Job, Placed | None] | None) -> None:
+            guarded(self._render, placed)
+            room.release()
 
         def go_on(taken: tuple[Job, Seen] | None) -> None:
-            place(taken)
-            while not room.acquire(timeout=_LOOK_S) and not failures:
-                pass
+            placer.submit(place, taken)
+            room.acquire()
 
-        with (
-            self._thread("painter", newest, render, failures) as paint,
-            self._thread("placer", newest, place_and_paint, failures) as place,
-        ):
+        def note() -> None:
+            self._threads.add(threading.get_ident())
+
+        with ThreadPoolExecutor(1, "painter", note) as painter, ThreadPoolExecutor(1, "placer", note) as placer:
             yield go_on
         if failures:
             raise failures[0]
-
-    @contextmanager
-    def _thread(
-        self, name: str, newest: WindowSlot, step: Callable[[Given], None], failures: list[Exception]
-    ) -> Generator[Callable[[Given], None]]:
-        """A step in a thread of its own. What is handed over is begun once the step before is done, and the call waits
-        until it is begun: so the window taken next is the newest.
-
-        An error closes `newest` and goes to `failures`; then nothing more is done.
-        """
-        waiting: queue.Queue[tuple[Given] | None] = queue.Queue()
-
-        def work() -> None:
-            self._threads.add(threading.get_ident())
-            while (given := waiting.get()) is not None:
-                waiting.task_done()
-                try:
-                    if not failures:
-                        step(*given)
-                except Exception as error:  # the end of a thread: who began it raises it
-                    failures.append(error)
-                    newest.close()
-                finally:
-                    self._pulse.rest()
-
-        def hand_over(given: Given) -> None:
-            self._pulse.rest()
-            waiting.put((given,))
-            waiting.join()
-
-        thread = threading.Thread(target=work, name=name, daemon=True)
-        thread.start()
-        try:
-            yield hand_over
-        finally:
-            waiting.put(None)
-            thread.join()
 
     def _place(self, taken: tuple[Job, Seen] | None) -> tuple[Job, Placed | None] | None:
         return None if taken is None else (taken[0], self._renderer.place(*taken))
