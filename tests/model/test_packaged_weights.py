@@ -1,5 +1,8 @@
 """The weights that ship with the package: their size, their card, and that they run."""
 
+import subprocess
+import sys
+
 import torch
 
 from gcd_model import Clip, load_synthesizer
@@ -32,3 +35,17 @@ def test_a_view_is_finite_trained_and_the_same_twice() -> None:
     assert first.video.shape == shape
     assert first.video.isfinite().all()
     assert torch.equal(first.video, second.video)
+
+
+def test_the_first_view_does_without_a_compiler() -> None:
+    """torch's compiler takes two seconds to import, and comes in by functions of tensors on the device "meta"."""
+    code = """
+import sys, torch
+from gcd_model import Clip, load_synthesizer
+live = load_synthesizer("package:live-small", device="cpu")
+video = torch.zeros(1, 3, live.traits.config.height, live.traits.config.width)
+live.streaming().render(live.encode(Clip(video=video, fps=10.0)), [live.streaming().traits.plan_view()])
+print(sorted({"torch._dynamo", "torch._inductor", "sympy", "diffusers"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"

@@ -330,7 +330,8 @@ class Familiarity(nn.Module):
         """channels: C of `summary_of`. Until `fit`, mean 0 and variance 1."""
         super().__init__()
         self.register_buffer("mean", torch.zeros(2 * channels))
-        self.register_buffer("whiten", torch.eye(2 * channels))
+        self.register_buffer("whiten", torch.zeros(2 * channels, 2 * channels))
+        self.whiten.view(-1)[:: 2 * channels + 1] = 1.0  # `eye` on the device "meta" imports torch's compiler, for 2 s
 
     def fit(self, summaries: Tensor) -> None:
         """summaries: [N, 2 C] of pictures of the training."""
