@@ -308,7 +308,9 @@ def parse_config(text: str | bytes, name: str, changes: Sequence[str] = ()) -> N
     from gcd_model import FileError, decode_toml, explain_settings_error
 
     try:
-        table = _with_changes(decode_toml(text), changes)
+        table = decode_toml(text)
+        for change in changes:
+            _make_change(table, change)
         prepare_source(table, name)
         return msgspec.convert(table, NodeConfig, strict=True)
     except msgspec.ValidationError as error:
@@ -317,8 +319,8 @@ def parse_config(text: str | bytes, name: str, changes: Sequence[str] = ()) -> N
         raise ConfigError(f"{name} {error}") from error
 
 
-def _with_changes(table: Table, changes: Sequence[str]) -> Table:
-    """A launch file's content with changes such as `model.steps=4`, in their order; the original stays.
+def _make_change(table: Table, change: str) -> None:
+    """Change a launch file's content, such as by `model.steps=4`.
 
     A value is read as TOML, so numbers, true and "quoted text" are what they look like; what is no TOML is text.
     Raises:
@@ -326,27 +328,20 @@ def _with_changes(table: Table, changes: Sequence[str]) -> Table:
     """
     from gcd_model import FileError, decode_toml
 
-    changed = _copied(table)
-    for change in changes:
-        key, equals, text = change.partition("=")
-        parts = [part.strip() for part in key.split(".")]
-        if not equals or not all(parts):
-            raise ConfigError(f"a change is SECTION.KEY=VALUE, such as model.steps=4, got {change!r}")
-        try:
-            value = decode_toml(f"value = {text.strip()}")["value"]
-        except (FileError, KeyError):
-            value = text.strip()
-        inner: object = changed
-        for section in parts[:-1]:
-            inner = inner.setdefault(section, {}) if isinstance(inner, dict) else None
-        if not isinstance(inner, dict):
-            raise ConfigError(f"{change!r}: {'.'.join(parts[:-1])} is no section")
-        inner[parts[-1]] = value
-    return changed
-
-
-def _copied(table: Table) -> Table:
-    return {key: _copied(value) if isinstance(value, dict) else value for key, value in table.items()}
+    key, equals, text = change.partition("=")
+    *sections, name = [part.strip() for part in key.split(".")]
+    if not equals or not all((*sections, name)):
+        raise ConfigError(f"a change is SECTION.KEY=VALUE, such as model.steps=4, got {change!r}")
+    try:
+        value = decode_toml(f"value = {text.strip()}")["value"]
+    except (FileError, KeyError):
+        value = text.strip()
+    inner: object = table
+    for section in sections:
+        inner = inner.setdefault(section, {}) if isinstance(inner, dict) else None
+    if not isinstance(inner, dict):
+        raise ConfigError(f"{change!r}: {'.'.join(sections)} is no section")
+    inner[name] = value
 
 
 # Written down.

@@ -7,7 +7,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 
 from gcd_client.control import Code, ControlError
 from gcd_model import ModelError, Traits
@@ -33,15 +33,6 @@ _TICK_S = 0.1
 _PATIENCE_S = 3.0  # of the 5 s an end may take; the rest is for what is still to be sent
 _LEAST_PATIENCE_S = 0.1
 _LEAST_RECORD_S = 0.5
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Done:
-    """A transition is over. requested: by a command, rather than by the node itself."""
-
-    verb: Verb
-    requested: bool
-    error: Exception | None
 
 
 class Node:
@@ -70,9 +61,9 @@ class Node:
         self.health, live, boot_id = Health(), LiveConfig(config), uuid.uuid4().hex
         self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit, sink)
         self._announcer = Announcer(config.node_id, boot_id, self.recorder, self.health)
-        self._inbox: queue.SimpleQueue[_Done | str] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the life loop is to do
         self._transitions = Transitions(
-            live, self._announcer, parts, self.recorder, lambda: self._inbox.put("over"), on_window
+            live, self._announcer, parts, self.recorder, lambda: self._inbox.put(self._after_stream), on_window
         )
         self._commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self.request)
         self._life = Lifecycle()
@@ -102,7 +93,7 @@ class Node:
     def stop(self) -> None:
         """End in order, soon: no new window begins, the one in work is abandoned at its next layer."""
         self.recorder.stop_waiting()
-        self._inbox.put("stop")
+        self._inbox.put(self._prepare_stop)
 
     def handle(self, command: Command, role: Role) -> Outcome:
         """Carry a command out, or begin to; see CommandHandler."""
@@ -153,7 +144,10 @@ class Node:
             else:
                 self._service.ready()
             while self.state is not State.FINALIZED and self._left_s(0.0) > 0:
-                self._handle_message()
+                with contextlib.suppress(queue.Empty):
+                    self._inbox.get(timeout=_TICK_S)()
+                if self._stop_s is not None:
+                    self._try("shutdown")
                 self._tick()
         finally:
             self._transitions.interrupt()
@@ -167,25 +161,15 @@ class Node:
 
     # Life loop.
 
-    def _handle_message(self) -> None:
-        try:
-            message = self._inbox.get(timeout=_TICK_S)
-        except queue.Empty:
-            return
-        if isinstance(message, _Done):
-            self._finish(message)
-        elif message == "stop":
-            self._prepare_stop()
-        elif self.state is State.ACTIVE and self._transitions.has_ended:
+    def _after_stream(self) -> None:
+        if self.state is State.ACTIVE and self._transitions.has_ended:
             self._try("deactivate")
-        if self._stop_s is not None:
-            self._try("shutdown")
 
     def _tick(self) -> None:
         stream = self._transitions.stream
         if stream is not None:
             stream.tick()
-        if self._watchdog.check(0.0 if stream is None else stream.worker.silent_s):
+        if self._watchdog.check(0.0 if stream is None else stream.renderer.pulse.silent_s):
             self._service.alive()
         self.health.recording(self.recorder.report())
         if self._retry_s is not None and time.monotonic() >= self._retry_s and self.state is State.INACTIVE:
@@ -226,6 +210,7 @@ class Node:
                 self._begin(verb)
 
     def _perform(self, verb: Verb, requested: bool) -> None:
+        """Its work, in a thread of its own. requested: by a command, rather than by the node itself."""
         work: dict[Verb, Callable[[], None]] = {
             "configure": self._transitions.configure,
             "activate": self._transitions.activate,
@@ -233,48 +218,44 @@ class Node:
             "cleanup": self._transitions.cleanup,
             "shutdown": self._transitions.deactivate,
         }
-        error: Exception | None = None
         try:
             work[verb]()
-        except Exception as raised:  # the end of a thread: the life loop looks at it
-            error = raised
-        self._inbox.put(_Done(verb=verb, requested=requested, error=error))
+        except Exception as error:  # the end of a thread: the life loop looks at it
+            self._inbox.put(partial(self._fail, verb, error))
+        else:
+            self._inbox.put(partial(self._succeed, verb, requested))
 
-    def _finish(self, done: _Done) -> None:
-        if done.error is None:
-            self._life.succeed()
-            self._publish_state()
-            self._after_success(done)
-            return
-        is_expected = done.verb in ("configure", "activate") and isinstance(done.error, NodeError | ModelError)
-        if is_expected:
+    def _fail(self, verb: Verb, error: Exception) -> None:
+        if verb in ("configure", "activate") and isinstance(error, NodeError | ModelError):
             self._life.fail()
         else:
             self._life.error()
-            _LOG.error("%s broke", done.verb, exc_info=done.error)
+            _LOG.error("%s broke", verb, exc_info=error)
             self._transitions.close(_PATIENCE_S)
             self.health.model("absent")
             self._life.recover()
         self._publish_state()
-        self._announcer.event(_code(done.error).value, Level.ERROR, {"verb": done.verb, "message": str(done.error)})
-        self._after_failure(done.error, done.verb)
+        self._announcer.event(_code(error).value, Level.ERROR, {"verb": verb, "message": str(error)})
+        self._after_failure(error, verb)
 
-    def _after_success(self, done: _Done) -> None:
-        """What follows by itself."""
-        if done.requested:
-            self._announcer.event("STATE", Level.OK, {"verb": done.verb, "state": self.state.label})
-        if done.verb == "configure":
+    def _succeed(self, verb: Verb, requested: bool) -> None:
+        """And what follows by itself."""
+        self._life.succeed()
+        self._publish_state()
+        if requested:
+            self._announcer.event("STATE", Level.OK, {"verb": verb, "state": self.state.label})
+        if verb == "configure":
             traits = self._transitions.traits
             if traits is not None and self._on_configured is not None:
                 self._on_configured(traits)
-            if self._on_its_own and not done.requested:
+            if self._on_its_own and not requested:
                 self._try("activate")
-        elif done.verb == "activate":
+        elif verb == "activate":
             self._waits = backoff_s(self._config.source.kind)
             self._service.ready()
             if self._transitions.has_ended:  # before the node was active
                 self._try("deactivate")
-        elif done.verb == "deactivate" and not done.requested and self._stop_s is None:
+        elif verb == "deactivate" and not requested and self._stop_s is None:
             failure = self._transitions.failure  # the stream has ended by itself
             if failure is not None:
                 self._after_failure(failure, "activate")

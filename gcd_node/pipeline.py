@@ -91,8 +91,8 @@ class Stream:
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, config.source)
         self._preview = InputPreview(announcer.sink, lambda: self.context)
-        renderer = Renderer(live, announcer, model, self.context_at, on_window)
-        self.worker = ModelWorker(live, announcer, model, renderer)
+        self.renderer = Renderer(live, announcer, model, self.context_at, on_window)
+        self.worker = ModelWorker(live, announcer, model, self.renderer)
         self._threads = [
             threading.Thread(target=self._work, name="model", daemon=True),
             threading.Thread(target=read, args=(self._watch, self._builder, self._newest), name="reader", daemon=True),
@@ -155,7 +155,7 @@ class Stream:
         """End soon: no new window begins, the one in work is abandoned at its next layer. May wait a second for a
         camera that does not answer."""
         self.stopped = True
-        self.worker.cancel()
+        self.renderer.cancel.set()
         self._newest.close()
         self._watch.close()
 
@@ -195,13 +195,13 @@ class Stream:
         fields = {"message": str(self.failure)} if has_failed else {}
         self._announcer.event(code, Level.ERROR if has_failed else Level.OK, fields)
         delay_ms = _STOP_DELAY_MS if self.stopped else None
-        self.worker.announce_end(delay_ms=delay_ms)
+        self.renderer.announce_end(delay_ms=delay_ms)
         self._preview.announce_end(delay_ms=delay_ms)
 
     def summary(self) -> Summary:
         """What it came to so far."""
         return Summary(
-            counts=self.worker.counts,
+            counts=self.renderer.counts,
             fps=self.context.fps,
             dropped=self._newest.dropped,
             frames=self._builder.pushed,

@@ -159,7 +159,7 @@ class Recorder:
     def stop_waiting(self) -> None:
         self._sink.stop_waiting()
         if self._recording is not None:
-            self._recording.queue.stop_waiting()
+            self._recording.stop_waiting()
 
     @property
     def stats(self) -> PublisherStats:
@@ -170,7 +170,7 @@ class Recorder:
         if is_head:
             self._head[topic] = item
         if self._recording is not None:
-            self._recording.queue.put(item)
+            self._recording.put(item)
 
     def _to_utc_ns(self) -> int:
         """UTC minus the monotonic clock, held still while it moves by less than a millisecond: so steps between stamps
@@ -193,20 +193,25 @@ class _Item:
     is_head: bool
 
 
-class _Queue:
-    """What waits for the disk; when there is no room, the oldest pictures go. waits: in lockstep whoever has a picture
-    waits for room instead, for 5 s at most. dropped: what found no room or could not be written, by topic."""
+class _Recording:
+    """From `record_start` to `record_stop`, or to a full disk: what waits for the disk, its thread and its files.
 
-    def __init__(self, *, waits: bool) -> None:
-        self._waits, self._end_s = waits, math.inf
+    When there is no room for it, the oldest pictures go; in lockstep whoever has a picture waits for room instead, for
+    5 s at most.
+    """
+
+    def __init__(self, recorder: Recorder, head: Mapping[str, _Item]) -> None:
+        """head: what was said before and still holds."""
+        self._recorder, self._config, self._head = recorder, recorder.config.record, dict(head)
+        self._waits, self._end_s = recorder.config.source.pace == "lockstep", math.inf
         self._changed = threading.Condition()
         self._items: deque[_Item] = deque()
-        self.dropped: Counter[str] = Counter()
-
-    @property
-    def over(self) -> bool:
-        """Whether it was closed, and is empty or has no time left."""
-        return self._end_s < math.inf and (not self._items or time.monotonic() > self._end_s)
+        self._dropped: Counter[str] = Counter()  # what found no room or could not be written, by topic
+        self._files: list[McapFile] = []
+        self._stop: str | None = None
+        self._failure: tuple[str, str] | None = None  # code and message
+        self.thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self.thread.start()
 
     def put(self, item: _Item) -> None:
         """Hand an item over; from any thread."""
@@ -216,23 +221,14 @@ class _Queue:
             if self._end_s < math.inf:
                 return
             if not item.size and len(self._items) >= _QUEUED_ITEMS:
-                self.drop(item)
+                self._dropped[item.topic] += 1
                 return
             while not self._has_room(item):
                 oldest = next(each for each in self._items if each.size)
                 self._items.remove(oldest)
-                self.drop(oldest)
+                self._dropped[oldest.topic] += 1
             self._items.append(item)
             self._changed.notify_all()
-
-    def take(self, timeout_s: float) -> _Item | None:
-        """The next item; None if none comes in time, or it is over."""
-        with self._changed:
-            self._changed.wait_for(lambda: bool(self._items) or self._end_s < math.inf, max(0.0, timeout_s))
-            if self.over or not self._items:
-                return None
-            self._changed.notify_all()
-            return self._items.popleft()
 
     def stop_waiting(self) -> None:
         """Make nobody wait any more."""
@@ -240,42 +236,11 @@ class _Queue:
             self._waits = False
             self._changed.notify_all()
 
-    def close(self, patience_s: float) -> None:
-        """Take nothing more in; what is in there may be taken for so long. Without any, it counts as dropped now."""
-        self._end_s = min(self._end_s, time.monotonic() + patience_s)
-        self.stop_waiting()
-        if patience_s <= 0:
-            with self._changed:
-                self.drop(*self._items)
-                self._items.clear()
-
-    def drop(self, *items: _Item) -> None:
-        """Count what is lost."""
-        with self._changed:
-            self.dropped.update(item.topic for item in items)
-
-    def _has_room(self, item: _Item) -> bool:
-        waiting = sum(each.size for each in self._items)
-        return waiting == 0 or waiting + item.size <= _QUEUED_BYTES  # one always finds room
-
-
-class _Recording:
-    """From `record_start` to `record_stop`, or to a full disk: its queue, its thread and its files."""
-
-    def __init__(self, recorder: Recorder, head: Mapping[str, _Item]) -> None:
-        """head: what was said before and still holds."""
-        self._recorder, self._config, self._head = recorder, recorder.config.record, dict(head)
-        self.queue = _Queue(waits=recorder.config.source.pace == "lockstep")
-        self._files: list[McapFile] = []
-        self._stop: str | None = None
-        self._failure: tuple[str, str] | None = None  # code and message
-        self.thread = threading.Thread(target=self._run, name="recorder", daemon=True)
-        self.thread.start()
-
     def stop(self, reason: str, patience_s: float) -> None:
         """End soon: what waits is written for so long, then given up. Does not wait."""
         self._stop = self._stop or reason
-        self.queue.close(patience_s)
+        self._end_s = min(self._end_s, time.monotonic() + patience_s)
+        self.stop_waiting()
 
     def report(self) -> RecordHealth:
         """How it does."""
@@ -285,8 +250,12 @@ class _Recording:
             file=f"{files[-1].path.parent.name}/{files[-1].path.name}" if files else None,
             bytes=sum(each.size for each in files),
             written=sum(each.messages for each in files),
-            dropped=dict(self.queue.dropped),
+            dropped=dict(self._dropped),
         )
+
+    def _has_room(self, item: _Item) -> bool:
+        waiting = sum(each.size for each in self._items)
+        return waiting == 0 or waiting + item.size <= _QUEUED_BYTES  # one always finds room
 
     # What follows runs in the recorder thread alone.
 
@@ -314,7 +283,11 @@ class _Recording:
             is_broken = True
             _LOG.exception("the recording broke")
             self._failure = "INTERNAL", f"{type(error).__name__}; see the log"
-        self.queue.close(0.0)
+        with self._changed:
+            self._end_s, self._waits = -math.inf, False
+            self._dropped.update(item.topic for item in self._items)
+            self._items.clear()
+            self._changed.notify_all()
         if self._files:
             self._files[-1].close(is_broken=is_broken)
         reason, message = self._failure or (self._stop or "INTERNAL", "")
@@ -325,9 +298,14 @@ class _Recording:
 
     def _work(self, root: Path, folder: Path) -> None:
         config, flush_s, flushes = self._config, time.monotonic() + _FLUSH_S, 0
-        while not self.queue.over:
+        while self._end_s == math.inf or (self._items and time.monotonic() < self._end_s):
             file = self._files[-1]
-            item = self.queue.take(flush_s - time.monotonic())
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: bool(self._items) or self._end_s < math.inf, max(0.0, flush_s - time.monotonic())
+                )
+                item = self._items.popleft() if self._items else None
+                self._changed.notify_all()
             if item is not None:
                 self._write(file, item)
             if time.monotonic() >= flush_s:
@@ -350,7 +328,8 @@ class _Recording:
             raise
         except Exception as error:  # of one item: a recording does not end for it
             _LOG.warning("something on %s is not recorded: %s", item.topic, error)
-            self.queue.drop(item)
+            with self._changed:
+                self._dropped[item.topic] += 1
 
     def _open(self, folder: Path) -> None:
         """Every file begins with all it takes to read it alone."""

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError
 from gcd_node.health import IDLE, Level
-from gcd_node.inference import Job, Placed, Renderer, Seen, WorkCounts
+from gcd_node.inference import Job, Placed, Renderer, Seen
 from gcd_node.model import IdleTimer, ModelSlot, interruptible, model_errors
 from gcd_node.status import Announcer
 from gcd_node.views import LiveConfig
@@ -44,20 +44,6 @@ class ModelWorker:
         self._threads: set[int] = set()
         self._may_encode_ahead = True
 
-    @property
-    def counts(self) -> WorkCounts:
-        """What was done so far."""
-        return self._renderer.counts
-
-    @property
-    def silent_s(self) -> float:
-        """How long the model has been at one step; 0 while it waits for windows."""
-        return self._pulse.silent_s
-
-    def cancel(self) -> None:
-        """Abandon the window in work at the next layer of a network; from any thread."""
-        self._renderer.cancel.set()
-
     def work(self, newest: WindowSlot) -> None:
         """Take windows and publish their views; while there is none, encode what has arrived of the next.
 
@@ -74,10 +60,6 @@ class ModelWorker:
         finally:
             self._pulse.rest()
             self.warm.set()
-
-    def announce_end(self, *, delay_ms: int | None) -> None:
-        """Send the end of every view. After `work`. delay_ms: see MessageSink."""
-        self._renderer.announce_end(delay_ms=delay_ms)
 
     def _work(self, newest: WindowSlot) -> None:
         if self._realtime:
