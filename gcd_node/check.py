@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,13 +27,11 @@ from gcd_model import (
 )
 from gcd_node.auth import load_server_security
 from gcd_node.config import ModelSection, NodeConfig
-from gcd_node.control import ControlServer, Outcome
 from gcd_node.errors import ConfigError, NodeError, SourceError
 from gcd_node.frame import SourceInfo
-from gcd_node.health import Health
 from gcd_node.mcap_file import RoomError, check_room
 from gcd_node.preprocess import in_words
-from gcd_node.session import load_model, metrics_server, model_threads, open_publisher, viewer_arguments
+from gcd_node.session import load_model, model_threads, open_session
 from gcd_node.sources import open_source
 from gcd_node.stream_context import StreamContext, drawing_options, family_name, prepare_stream, sampler_in_use
 from gcd_node.views import LiveConfig, VirtualViews
@@ -103,22 +100,8 @@ class _Look:
         self.context: StreamContext | None = None
 
     def endpoints(self) -> str:
-        config, control = self._config, None
-        security = load_server_security(config.security)
-        with open_publisher(config, security) as publisher, ExitStack() as stack:
-            if config.control.endpoint is not None:
-                server = ControlServer(
-                    config.control.endpoint,
-                    lambda _command, _role: Outcome(message="the launch file is being checked"),
-                    lambda: "unconfigured",
-                    lambda _code, _fields: None,
-                    security=security,
-                )
-                control = stack.enter_context(server).endpoint
-            if config.health.http is not None:
-                stack.enter_context(metrics_server(config.health.http, Health()))
-            if config.viewer.http is not None:
-                viewer_arguments(config, publisher, control, security)
+        control = self._config.control.endpoint
+        with open_session(self._config) as (_, publisher):
             sockets = f"data {publisher.endpoint}, status {publisher.status_endpoint}"
             return f"free: {sockets}, {'no control' if control is None else f'control {control}'}"
 

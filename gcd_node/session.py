@@ -92,7 +92,7 @@ def open_session(
     show_page: let it open its page in a browser.
 
     Raises:
-        EndpointError, ConfigError: see Publisher, ControlServer, MetricsServer, Recorder, viewer_arguments(). Nothing
+        EndpointError, ConfigError: see Publisher, ControlServer, metrics_server(), Recorder, ViewerConfig. Nothing
             stays open.
     """
     nodes: list[Node] = []  # none yet: what publishes the node's events is made before it
@@ -120,30 +120,27 @@ def open_session(
         node.watch(publisher.dead_threads)
         control: str | None = None
         if config.control.endpoint is not None:
-            server = stack.enter_context(_control_server(config.control.endpoint, node, emit, security))
+            server = ControlServer(
+                config.control.endpoint,
+                node.handle,
+                state=lambda: node.state.label,
+                on_event=emit,
+                on_answer=node.recorder.command,
+                security=security,
+            )
+            stack.enter_context(server)
             node.watch(server.dead_threads)
             control = server.endpoint
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
-            arguments = viewer_arguments(config, publisher, control, security)
+            arguments = _viewer_arguments(config, publisher, control, security)
             if viewer:
                 stack.enter_context(_viewer_process([*arguments, *(["--open"] if show_page else [])]))
         yield node, publisher
 
 
-def _control_server(endpoint: str, node: Node, emit: EventSink, security: ServerSecurity | None) -> ControlServer:
-    return ControlServer(
-        endpoint,
-        node.handle,
-        state=lambda: node.state.label,
-        on_event=emit,
-        on_answer=node.recorder.command,
-        security=security,
-    )
-
-
-def viewer_arguments(
+def _viewer_arguments(
     config: NodeConfig, publisher: Publisher, control: str | None, security: ServerSecurity | None
 ) -> list[str]:
     """What `gcd-node viewer` is given beside a node whose sockets are bound.
