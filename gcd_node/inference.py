@@ -25,7 +25,6 @@ from gcd_model import (
 )
 from gcd_node.encoded_frames import EncodedFrames, encode_terms, window_seed
 from gcd_node.errors import DepthError
-from gcd_node.health import Level
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import (
     Failure,
@@ -46,8 +45,8 @@ from gcd_node.window import FrameWindow, PartialWindow
 _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
 _HOLD_S = 1.0
-_INPUT_CODES = ("DEPTH_BAD", "ODOMETRY_BAD", "MOTION_LOST")
-WORK_REASONS = ("world", *_INPUT_CODES)
+_OTHER_WORLD = "this is another world than the model learned from: depth and classes are guesses"
+WORK_REASONS = ("DEPTH_BAD", "ODOMETRY_BAD", "MOTION_LOST", "world")
 """What a model thread raises of the node's health by what its windows show."""
 
 
@@ -123,8 +122,8 @@ class Renderer:
         exchanges the model."""
         self._memory = 0
         hold_s = _HOLD_S if model.streams else 0.0
-        self._bad_depth, self._bad_odometry, self._lost_motion = (
-            Condition(code, announcer, hold_s=hold_s) for code in _INPUT_CODES
+        self._bad_depth, self._bad_odometry, self._lost_motion, self._other_world = (
+            Condition(code, announcer, hold_s=hold_s) for code in WORK_REASONS
         )
         self._epoch = -1
         self._latest: tuple[StreamContext, StreamContext] | None = None
@@ -382,10 +381,8 @@ class Renderer:
         """Whether the model knows such a source, and how it moved; the same for all views of a window."""
         self._lost_motion.update({"message": view.lost[0], "frames": len(view.lost)} if view.lost else None)
         self._health.measure("ood_score", view.ood)
-        if world_flags(context.traits, view):
-            self._health.raise_reason("world", Level.WARN)
-        else:
-            self._health.clear_reason("world")
+        is_foreign = bool(world_flags(context.traits, view))
+        self._other_world.update({"message": _OTHER_WORLD, "ood_score": view.ood} if is_foreign else None)
 
     def _count(self, job: Job, seconds: float) -> None:
         age_ms = (time.monotonic_ns() - newest_ns(job.context, job.window)) / 1e6

@@ -2,11 +2,9 @@
 one of its own. What brings torch is imported when called."""
 
 import gc
-import logging
 import os
 import statistics
 import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
@@ -20,14 +18,12 @@ from rich.text import Text
 from typer import Argument, Option
 
 from gcd_node.cli.main import table
-from gcd_node.config import LifeConfig, load_config, to_toml
+from gcd_node.config import LifeConfig, NodeConfig, load_config, to_toml
 from gcd_node.service import ServiceManager, background_logging
 
 if TYPE_CHECKING:
     from gcd_model import Traits
-    from gcd_node.health import Health
     from gcd_node.inference import WindowReport
-    from gcd_node.node import Node
     from gcd_node.pipeline import Summary
 
 ConfigPath: TypeAlias = Annotated[Path, Argument(metavar="CONFIG", help="A launch file, such as launch/demo.toml.")]
@@ -36,10 +32,7 @@ Changes: TypeAlias = Annotated[
 ]
 PrintConfig: TypeAlias = Annotated[bool, Option("--print-config", help="Print the whole configuration, and end.")]
 
-
-_LOG = logging.getLogger(__name__)
 _SWITCH_S = 0.001
-_LOOK_S, _QUIET_S = 1.0, 60.0
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 
@@ -52,35 +45,33 @@ def run(
     ] = None,
 ) -> None:
     """Run the node on a launch file, until its recording ends or it is told to."""
-    settings = load_config(config, changes or ())
-    if print_config:
-        typer.echo(to_toml(settings), nl=False)
-        return
+    settings = _settings(config, changes, print_config)
     from gcd_node.session import open_session, run_until_signal
 
     apply_scheduling(settings.life)
     console = Console(stderr=True, markup=False)
     status = console.status(Text(f"loading {settings.model.weights}"))
-    nodes: list[Node] = []
-    show, warn = _window_printer(console), world_warning(lambda: nodes[0].health)
-
-    def on_window(report: "WindowReport") -> None:
-        show(report)
-        warn()
-
     session = open_session(
         settings,
         once=once,
         on_configured=lambda traits: _show_configured(console, status, traits),
-        on_window=on_window,
+        on_window=_window_printer(console),
         service=ServiceManager(os.environ),
         viewer=True,
     )
     with background_logging(as_json=settings.health.log == "json"), status, session as (node, publisher):
-        nodes.append(node)
         console.print(f"views on {publisher.endpoint}, status on {publisher.status_endpoint}", soft_wrap=True)
         summary = run_until_signal(node, publisher)
     console.print(_summary_table(summary, f"{publisher.stats.sent} messages sent"))
+
+
+def _settings(config: Path, changes: list[str] | None, print_config: bool) -> NodeConfig:
+    """Of a launch file. print_config: print them, and end."""
+    settings = load_config(config, changes or ())
+    if print_config:
+        typer.echo(to_toml(settings), nl=False)
+        raise typer.Exit
+    return settings
 
 
 def apply_scheduling(life: LifeConfig) -> None:
@@ -100,10 +91,7 @@ def check(config: ConfigPath, changes: Changes = None, print_config: PrintConfig
     Endpoints, camera or recording, weights, memory, views and time. Ends with what a start would fail with: 65 weights,
     66 a recording, 69 no camera, 73 an endpoint, 78 a setting.
     """
-    settings = load_config(config, changes or ())
-    if print_config:
-        typer.echo(to_toml(settings), nl=False)
-        return
+    settings = _settings(config, changes, print_config)
     from gcd_model import printable
     from gcd_node.check import check_launch
 
@@ -230,22 +218,6 @@ def _window_printer(console: Console) -> Callable[["WindowReport"], None]:
         console.print(line, highlight=False)
 
     return show
-
-
-def world_warning(health: Callable[[], "Health"]) -> Callable[[], None]:
-    """Logs, once a minute at most, that the model does not know what its camera shows. To be called for each window."""
-    due_s = 0.0
-
-    def warn() -> None:
-        nonlocal due_s
-        if (now_s := time.monotonic()) < due_s:
-            return
-        is_foreign = "world" in health().snapshot().status["reasons"]
-        due_s = now_s + (_QUIET_S if is_foreign else _LOOK_S)
-        if is_foreign:
-            _LOG.warning("world: this is another one than the model learned from: depth and classes are guesses")
-
-    return warn
 
 
 def _summary_table(summary: "Summary", delivered: str) -> Table:

@@ -264,6 +264,7 @@ def test_a_source_of_another_world_is_flagged_as_long_as_it_lasts() -> None:
     assert ["world" in header.quality.ood for header in headers] == [False, True]
     status = statuses(box)[-1]
     assert "world" in status["reasons"]
+    assert [fields["code"] for topic, fields in box.notes if topic == "event"].count("world") == 1
     assert status["model"]["ood_score"] == round(above, 3)
     again = statuses(run(Telling({"ood": above}, {"ood": below}), ""))[-1]
     assert "world" not in again["reasons"]

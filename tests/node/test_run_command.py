@@ -9,9 +9,8 @@ import cv2
 import pytest
 import torch
 
-from gcd_node.cli.run import apply_scheduling, world_warning
+from gcd_node.cli.run import apply_scheduling
 from gcd_node.config import LifeConfig, ModelSection
-from gcd_node.health import Health, Level
 from gcd_node.session import load_model, model_threads
 
 
@@ -50,17 +49,6 @@ def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monk
     finally:
         sys.setswitchinterval(before)
         gc.unfreeze()
-
-
-def test_the_log_says_once_that_the_model_does_not_know_the_world(caplog: pytest.LogCaptureFixture) -> None:
-    health = Health()
-    warn = world_warning(lambda: health)
-    warn()
-    health.raise_reason("world", Level.WARN)
-    later = world_warning(lambda: health)
-    later()
-    later()
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
 def test_a_thread_that_hangs_changes_neither_the_exit_code_nor_what_was_said() -> None:
