@@ -72,7 +72,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     seed: int = 0
     motion_bucket: float | None = None
     move_time: Annotated[int, Meta(ge=0)] | None = None
-    cond_aug: Annotated[float, Meta(ge=0)] | None = None
+    cond_aug: NotNegative | None = None
     head_width: Count | None = None
     image_heads: Count | None = None
     depth_model: str | None = None
@@ -223,7 +223,7 @@ class LifeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     autostart: bool = True
-    idle_s: Annotated[float, Meta(ge=0)] = 0.0
+    idle_s: NotNegative = 0.0
     hang_s: Positive = 60.0
     nice: Annotated[int, Meta(ge=0, le=19)] = 0
 
@@ -245,10 +245,10 @@ class RecordConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     what: tuple[Literal["inputs", "views"], ...] = ("inputs", "views")
     input_encoding: Literal["jpeg", "raw"] = "jpeg"
     jpeg_quality: Annotated[int, Meta(ge=50, le=100)] = 90
-    rotate_mb: Annotated[float, Meta(ge=0)] = 500.0
-    rotate_s: Annotated[float, Meta(ge=0)] = 0.0
-    max_total_mb: Annotated[float, Meta(ge=0)] = 0.0
-    keep_free_mb: Annotated[float, Meta(ge=0)] = 500.0
+    rotate_mb: NotNegative = 500.0
+    rotate_s: NotNegative = 0.0
+    max_total_mb: NotNegative = 0.0
+    keep_free_mb: NotNegative = 500.0
     autostart: bool = False
 
     def __post_init__(self) -> None:

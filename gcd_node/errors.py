@@ -84,8 +84,6 @@ class EndpointError(NodeError):
 class PublisherError(NodeError):
     """The publisher thread has died."""
 
-    exit_code = 70
-
 
 class OutputError(NodeError):
     """A result cannot be written."""
@@ -101,8 +99,6 @@ class DamagedRunError(NodeError):
 
 class ModelFailedError(NodeError):
     """The model keeps producing unusable views."""
-
-    exit_code = 70
 
 
 class ConfigError(NodeError):

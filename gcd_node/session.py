@@ -69,11 +69,6 @@ def load_model(section: ModelSection) -> ViewSynthesizer:
         raise ConfigError(f"[model]: {error}") from error
 
 
-def ends_by_itself(config: NodeConfig) -> bool:
-    """Whether a run ends with its source by default: recordings end, cameras and commands go on."""
-    return config.source.kind not in LIVE_KINDS and config.life.autostart
-
-
 @contextmanager
 def open_session(
     config: NodeConfig,
@@ -87,7 +82,8 @@ def open_session(
 ) -> Generator[tuple[Node, Publisher]]:
     """A node ready to run, and its publisher, already bound; its control and health sockets too, if it has any.
 
-    once: see Node; left out, as ends_by_itself() says. on_configured, on_window, service: see Node.
+    once, on_configured, on_window, service: see Node; once is left out: recordings that start by themselves end the
+        node, cameras and commands go on.
     viewer: start `gcd-node viewer` beside the node, if its launch file has a [viewer]; else that is only checked.
     show_page: let it open its page in a browser.
 
@@ -111,14 +107,14 @@ def open_session(
             config,
             parts,
             publisher,
-            once=ends_by_itself(config) if once is None else once,
+            once=config.source.kind not in LIVE_KINDS and config.life.autostart if once is None else once,
             on_configured=on_configured,
             on_window=on_window,
             service=service,
         )
         nodes.append(node)
         node.watch(publisher.dead_threads)
-        control: str | None = None
+        control = "none"
         if config.control.endpoint is not None:
             server = ControlServer(
                 config.control.endpoint,
@@ -134,27 +130,19 @@ def open_session(
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
-            arguments = _viewer_arguments(config, publisher, control, security)
+            arguments = ["--http", config.viewer.http, "--data", publisher.endpoint, "--control", control]
+            arguments += ["--status", publisher.status_endpoint, *(["--open"] if show_page else [])]
+            arguments += _page_keys(config, arguments, security)
+            listen(config.viewer.http, "[viewer] http").close()  # to know at once whether it is free
             if viewer:
-                stack.enter_context(_viewer_process([*arguments, *(["--open"] if show_page else [])]))
+                stack.enter_context(_viewer_process(arguments))
         yield node, publisher
 
 
-def _viewer_arguments(
-    config: NodeConfig, publisher: Publisher, control: str | None, security: ServerSecurity | None
-) -> list[str]:
-    """What `gcd-node viewer` is given beside a node whose sockets are bound.
-
-    Raises:
-        ConfigError: other machines could reach the page; the node asks for keys, and the page has none.
-        EndpointError: the page's port is in use.
-    """
-    http = config.viewer.http or ""
-    listen(http, "[viewer] http").close()  # to know at once
-    status = publisher.status_endpoint or config.publish.status
-    arguments = ["--http", http, "--data", publisher.endpoint, "--status", status, "--control", control or "none"]
+def _page_keys(config: NodeConfig, arguments: list[str], security: ServerSecurity | None) -> list[str]:
+    """The page is a client like others: it needs keys where the node asks for them. Raises ConfigError without any."""
     if security is None or not any(each.startswith("tcp://") for each in arguments):
-        return arguments
+        return []
     if config.viewer.keys is None:
         raise ConfigError(
             "this node asks its clients for keys, and the page is one of them: make a pair with `gcd-node keys new`, "
@@ -162,7 +150,7 @@ def _viewer_arguments(
         )
     folder = Path(config.viewer.keys).expanduser()
     read_key_pair(folder)
-    return [*arguments, "--keys", str(folder), "--node-key", security.keys.public]
+    return ["--keys", str(folder), "--node-key", security.keys.public]
 
 
 @contextmanager
