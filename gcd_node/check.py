@@ -100,10 +100,9 @@ class _Look:
         self.context: StreamContext | None = None
 
     def endpoints(self) -> str:
-        control = self._config.control.endpoint
-        with open_session(self._config) as (_, publisher):
+        with open_session(self._config) as (_, publisher, control):
             sockets = f"data {publisher.endpoint}, status {publisher.status_endpoint}"
-            return f"free: {sockets}, {'no control' if control is None else f'control {control}'}"
+            return f"free: {sockets}, {'no control' if control is None else f'control {control.endpoint}'}"
 
     def record(self) -> str:
         """What fails here ends no start, but nothing would be recorded."""

@@ -72,7 +72,7 @@ def run_open_demo() -> Summary:
             control=ControlConfig(endpoint=f"ipc://{folder}/control"),
             viewer=ViewerConfig(http="127.0.0.1:0"),
         )
-        with open_session(config, once=True, viewer=True, show_page=True) as (node, publisher):
+        with open_session(config, once=True, viewer=True, show_page=True) as (node, publisher, _):
             return run_until_signal(node, publisher)
 
 
@@ -93,7 +93,7 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
     with tempfile.TemporaryDirectory(prefix="gcd-demo-") as name:
         received = Path(name) / "received"
         session = open_session(demo_config(Path(name)), once=True, on_configured=models.append, on_window=remember)
-        with session as (node, publisher), _receiver(publisher, received) as receiver:
+        with session as (node, publisher, _), _receiver(publisher, received) as receiver:
             summary = run_until_signal(node, publisher)
             publisher.close()
             try:

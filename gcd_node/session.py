@@ -15,7 +15,7 @@ import torch
 
 from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, Traits, ViewSynthesizer, load_synthesizer
-from gcd_node.auth import EventSink, ServerSecurity, load_server_security
+from gcd_node.auth import ServerSecurity, load_server_security
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
@@ -29,13 +29,6 @@ from gcd_node.service import ServiceManager, listen
 from gcd_node.sources import LIVE_KINDS, open_source
 
 _LOG = logging.getLogger(__name__)
-
-
-def open_publisher(
-    config: NodeConfig, security: ServerSecurity | None = None, on_event: EventSink | None = None
-) -> Publisher:
-    """The publisher of a launch file, bound. Raises as Publisher."""
-    return Publisher(config.publish, on_event, lockstep=config.source.pace == "lockstep", security=security)
 
 
 def model_threads(section: ModelSection) -> int:
@@ -79,13 +72,14 @@ def open_session(
     service: ServiceManager | None = None,
     viewer: bool = False,
     show_page: bool = False,
-) -> Generator[tuple[Node, Publisher]]:
-    """A node ready to run, and its publisher, already bound; its control and health sockets too, if it has any.
+    parts: Parts | None = None,
+) -> Generator[tuple[Node, Publisher, ControlServer | None]]:
+    """A node ready to run, its publisher and its control server, already bound; its health socket too, if it has any.
 
     once, on_configured, on_window, service: see Node; once is left out: recordings that start by themselves end the
         node, cameras and commands go on.
     viewer: start `gcd-node viewer` beside the node, if its launch file has a [viewer]; else that is only checked.
-    show_page: let it open its page in a browser.
+    show_page: let it open its page in a browser. parts: others than those that the launch file names.
 
     Raises:
         EndpointError, ConfigError: see Publisher, ControlServer, metrics_server(), Recorder, ViewerConfig. Nothing
@@ -101,11 +95,11 @@ def open_session(
 
     security = load_server_security(config.security, emit)
     with ExitStack() as stack:
-        publisher = stack.enter_context(open_publisher(config, security, emit))
-        parts = Parts(open_source=lambda source: open_source(source, security, emit), load_model=load_model)
+        is_lockstep = config.source.pace == "lockstep"
+        publisher = stack.enter_context(Publisher(config.publish, emit, lockstep=is_lockstep, security=security))
         node = Node(
             config,
-            parts,
+            parts or Parts(open_source=lambda each: open_source(each, security, emit), load_model=load_model),
             publisher,
             once=config.source.kind not in LIVE_KINDS and config.life.autostart if once is None else once,
             on_configured=on_configured,
@@ -114,9 +108,9 @@ def open_session(
         )
         nodes.append(node)
         node.watch(publisher.dead_threads)
-        control = "none"
+        control: ControlServer | None = None
         if config.control.endpoint is not None:
-            server = ControlServer(
+            control = ControlServer(
                 config.control.endpoint,
                 node.handle,
                 state=lambda: node.state.label,
@@ -124,19 +118,19 @@ def open_session(
                 on_answer=node.recorder.command,
                 security=security,
             )
-            stack.enter_context(server)
-            node.watch(server.dead_threads)
-            control = server.endpoint
+            stack.enter_context(control)
+            node.watch(control.dead_threads)
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
-            arguments = ["--http", config.viewer.http, "--data", publisher.endpoint, "--control", control]
-            arguments += ["--status", publisher.status_endpoint, *(["--open"] if show_page else [])]
+            arguments = ["--http", config.viewer.http, "--data", publisher.endpoint]
+            arguments += ["--status", publisher.status_endpoint, "--control", control.endpoint if control else "none"]
+            arguments += ["--open"] if show_page else []
             arguments += _page_keys(config, arguments, security)
             listen(config.viewer.http, "[viewer] http").close()  # to know at once whether it is free
             if viewer:
                 stack.enter_context(_viewer_process(arguments))
-        yield node, publisher
+        yield node, publisher, control
 
 
 def _page_keys(config: NodeConfig, arguments: list[str], security: ServerSecurity | None) -> list[str]:

@@ -15,14 +15,13 @@ from msgspec.structs import replace
 from gcd_model import FAMILIES, NonFiniteError, RenderOptions, SourceFeatures, Traits, View
 from gcd_model.config import SVD_14
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig
-from gcd_node.control import ControlServer
 from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.node import Node
 from gcd_node.publisher import Publisher
-from gcd_node.session import open_publisher
+from gcd_node.session import open_session
 from gcd_node.sources import V4l2Source
 from gcd_node.sources.live import LiveCamera
 
@@ -241,13 +240,10 @@ def running_node(
             node_id="soak",
         )
         parts = Parts(open_source=lambda _: script.open(), load_model=lambda _: model)
-        with open_publisher(config) as publisher:
-            node = Node(config, parts, publisher, once=False, on_window=on_window)
-            with ControlServer(
-                str(config.control.endpoint), node.handle, lambda: node.state.label, node.event
-            ) as control:
-                rig = Rig(node, publisher, control.endpoint)
-                try:
-                    yield rig
-                finally:
-                    rig.close()
+        with open_session(config, parts=parts, once=False, on_window=on_window) as (node, publisher, control):
+            assert control is not None
+            rig = Rig(node, publisher, control.endpoint)
+            try:
+                yield rig
+            finally:
+                rig.close()

@@ -59,7 +59,7 @@ def run(
         service=ServiceManager(os.environ),
         viewer=True,
     )
-    with background_logging(as_json=settings.health.log == "json"), status, session as (node, publisher):
+    with background_logging(as_json=settings.health.log == "json"), status, session as (node, publisher, _):
         console.print(f"views on {publisher.endpoint}, status on {publisher.status_endpoint}", soft_wrap=True)
         summary = run_until_signal(node, publisher)
     console.print(_summary_table(summary, f"{publisher.stats.sent} messages sent"))

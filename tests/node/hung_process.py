@@ -14,8 +14,7 @@ from rig import rig_config
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection
 from gcd_node.lifecycle import Parts
-from gcd_node.node import Node
-from gcd_node.session import open_publisher, run_until_signal
+from gcd_node.session import open_session, run_until_signal
 
 
 def hang(_: object = None) -> None:
@@ -32,8 +31,7 @@ def load(_: ModelSection) -> ViewSynthesizer:
 def main() -> None:
     config = rig_config(Path(sys.argv[1]), 'kind = "synthetic"\npace = "lockstep"', "[view.main]", "")
     parts = Parts(open_source=lambda _: FakeSource(100_000), load_model=load)
-    with open_publisher(config) as publisher:
-        node = Node(config, parts, publisher, once=False)
+    with open_session(config, parts=parts, once=False) as (node, publisher, _):
         run_until_signal(node, publisher)
     print("left behind" if node.left_behind else "all ended", flush=True)
 

@@ -20,13 +20,11 @@ from gcd_client.protocol import ViewHeader
 from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection, NodeConfig, parse_config
-from gcd_node.control import ControlServer
 from gcd_node.frame import FrameSource
 from gcd_node.lifecycle import Parts
-from gcd_node.node import Node
 from gcd_node.pipeline import Summary
 from gcd_node.service import ServiceManager
-from gcd_node.session import open_publisher
+from gcd_node.session import open_session
 from gcd_node.sources import SourceConfig
 
 CAMERA = 'kind = "v4l2"'
@@ -110,17 +108,9 @@ class Rig:
             open_source=(lambda _: source.open()) if isinstance(source, Bench) else source,
             load_model=(lambda _: loaded) if hasattr(loaded, "traits") else loaded,  # type: ignore[arg-type,return-value]
         )
-        self.publisher = open_publisher(self.config)
-        self.node = Node(self.config, parts, self.publisher, once=once, service=service)
-        self.control = ControlServer(
-            f"ipc://{folder}/control",
-            self.node.handle,
-            lambda: self.node.state.label,
-            self.node.event,
-            self.node.recorder.command,
-        )
-        for watched_over in (self.publisher, self.control):
-            self.node.watch(watched_over.dead_threads)
+        self._session = contextlib.ExitStack()
+        opened = open_session(self.config, parts=parts, once=once, service=service)
+        self.node, self.publisher, self.control = self._session.enter_context(opened)
         self.folder = folder
         self.notes: list[tuple[float, str, Mapping[str, Any]]] = []
         self.views: list[Seen] = []
@@ -148,9 +138,8 @@ class Rig:
         self.node.stop()
         self._threads[-1].join(20)
         alive = self._threads[-1].is_alive()
-        self.control.close()
         self._done.set()
-        self.publisher.close()  # waits until the readers have heard everything and left
+        self._session.close()  # waits until the readers have heard everything and left
         for thread in self._threads[:-1]:
             thread.join(10)
         self.client.close()

@@ -27,7 +27,7 @@ from gcd_client.images import encode_jpegs, inverse_depth
 from gcd_client.protocol import MAGIC, PREFIX, MessageError, ViewMessage, decode, encode
 from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.session import open_publisher
+from gcd_node.publisher import Publisher
 from gcd_node.sources import open_source
 
 SOURCE = Path(__file__).parents[2] / "launch" / "clients" / "subscriber.cpp"
@@ -153,7 +153,7 @@ def test_both_languages_read_the_same_from_a_live_node(client: Path, tmp_path: P
     config, views = config_of(tmp_path), list[ReceivedView]()
     (tmp_path / "pictures").mkdir()
     endpoint = config.publish.data
-    with open_publisher(config) as publisher:
+    with Publisher(config.publish, lockstep=config.source.pace == "lockstep") as publisher:
         every = start(client, endpoint, "--every", "--ppm", str(tmp_path / "pictures"))
         newest = start(client, endpoint)
         reader = threading.Thread(target=read_all, args=(endpoint, views), daemon=True)

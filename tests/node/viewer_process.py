@@ -10,11 +10,9 @@ import numpy as np
 from fakes import FakeSynthesizer, traits
 from rig import rig_config
 
-from gcd_node.control import ControlServer
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.lifecycle import Parts
-from gcd_node.node import Node
-from gcd_node.session import open_publisher
+from gcd_node.session import open_session
 
 VIEWS = "[view.left]\nazimuth_deg = -30.0\n[view.swing]\nkind = 'orbit'\nrate_deg_s = 10.0\namplitude_deg = 20.0"
 SOURCE = 'kind = "synthetic"\npace = "realtime"'
@@ -51,16 +49,10 @@ def main(folder: Path) -> None:
     """Run the node on sockets in `folder`."""
     config = rig_config(folder, SOURCE, VIEWS, "")
     model = FakeSynthesizer(traits())
-    with open_publisher(config) as publisher:
-        node = Node(
-            config,
-            Parts(open_source=lambda _: Bar(), load_model=lambda _: model),
-            publisher,
-            once=False,
-        )
-        with ControlServer(f"ipc://{folder}/control", node.handle, lambda: node.state.label, node.event):
-            print("there", flush=True)
-            node.run()
+    parts = Parts(open_source=lambda _: Bar(), load_model=lambda _: model)
+    with open_session(config, parts=parts, once=False) as (node, *_):
+        print("there", flush=True)
+        node.run()
 
 
 if __name__ == "__main__":
