@@ -60,8 +60,8 @@ class Stream:
         reopen: Opener,
         first: tuple[int, int],
         on_over: Callable[[], None],
-        on_window: Callable[[WindowReport], None] | None = None,
-        recorder: Recorder | None = None,
+        on_window: Callable[[WindowReport], None] | None,
+        recorder: Recorder,
     ) -> None:
         """Check everything that can be checked without a frame.
 
@@ -226,8 +226,7 @@ class Stream:
         """Count, and show; see WatchListener."""
         now_ns = time.monotonic_ns()
         self._health.frame(frame.stamp_ns, now_ns)
-        if self._recorder is not None:
-            self._recorder.frame(frame)
+        self._recorder.frame(frame)
         self._preview.offer(frame, now_ns, self._builder.epoch)
 
     def source_broken(self, reason: Reason) -> None:
@@ -249,10 +248,9 @@ class Stream:
             self._health.clear_reason("SRC_REFUSED")
             return True
         finally:
-            if self._recorder is not None:
-                lens = self.context.lens
-                is_fitting = lens is not None and lens.fits(info.width, info.height)
-                self._recorder.source(info, lens if is_fitting else None)
+            lens = self.context.lens
+            is_fitting = lens is not None and lens.fits(info.width, info.height)
+            self._recorder.source(info, lens if is_fitting else None)
 
     def _adapt(self, info: SourceInfo) -> None:
         """To another size, rate or camera. Raises ConfigError, and changes nothing then."""

@@ -279,7 +279,11 @@ class Publisher:
             elif closing and self._left_s(progress) < 0:
                 if self._is_hurried:
                     return
-                raise EndpointError(self._undelivered())
+                raise EndpointError(
+                    f"{self._queue.qsize() + 1} messages were not taken within {self._drain_ms / 1000:g} s at "
+                    f"{self.endpoint} ({self.stats.watchers} subscribers, wanted {self._config.min_subscribers}); "
+                    "start the reader"
+                )
             else:
                 progress = progress if closing else time.monotonic()
                 self._wait(_RETRY_MS)
@@ -370,13 +374,6 @@ class Publisher:
         is_preview = _PREVIEW_KEY.startswith(topic)
         gained = (change, change * (topic == b"" or not is_preview), change * is_preview)
         self._readers = tuple(map(sum, zip(self._readers, gained, strict=True)))
-
-    def _undelivered(self) -> str:
-        count, seconds, readers = self._queue.qsize() + 1, self._drain_ms / 1000, self.stats.watchers
-        return (
-            f"{count} messages were not taken within {seconds:g} s at {self.endpoint} ({readers} subscribers, wanted "
-            f"{self._config.min_subscribers}); start the reader"
-        )
 
 
 def _pending_events(socket: Socket) -> list[bytes]:

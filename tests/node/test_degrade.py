@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from fakes import Box, FakeSource, FakeSynthesizer, traits
-from rig import Rig
+from rig import LOCKSTEP, Rig
 
 from gcd_model import DeviceMemoryError, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
 from gcd_node.config import ModelSection
@@ -26,9 +26,6 @@ def test_only_three_failures_within_a_minute_at_the_bottom_are_the_end() -> None
     assert failures.level.single
     with pytest.raises(ModelFailedError):
         failures.out_of_memory(1, DeviceMemoryError("full"), levels)
-
-
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 
 
 class OnGpu(FakeSynthesizer):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
 from fakes import Box, FakeSource, FakeSynthesizer, Steady, fake_config, made_node, traits
-from rig import Rig, service_manager
+from rig import LOCKSTEP, Rig, service_manager
 
 from gcd_client.control import Code
 from gcd_client.subscriber import ViewSubscriber
@@ -25,7 +25,6 @@ from gcd_node.frame import Frame
 from gcd_node.service import ServiceManager
 
 WAITING = "life = {autostart = false}"
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
 TWO_VIEWS = "[view.main]\nazimuth_deg = 10.0\n[view.other]\nazimuth_deg = -10.0"
 SLACK_S = 3.0  # what a machine that does other things may add

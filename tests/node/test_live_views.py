@@ -9,13 +9,12 @@ from pathlib import Path
 import zmq
 from cameras import until
 from fakes import FakeSynthesizer, Steady, painting_traits, traits
-from rig import Rig
+from rig import LOCKSTEP, Rig
 
 from gcd_client.control import Code
 from gcd_client.protocol import EndMessage, StatusMessage, ViewMessage, decode
 from gcd_model import RenderOptions
 
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 TWO_VIEWS = '[view.top]\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 60.0'
 
 

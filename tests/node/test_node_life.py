@@ -6,13 +6,12 @@ from typing import Any
 import pytest
 from cameras import Bench, Camera, until
 from fakes import FakeSource, FakeSynthesizer, Steady, traits
-from rig import Rig
+from rig import LOCKSTEP, Rig
 
 from gcd_client.control import Code
 from gcd_model import RenderOptions, SphericalDelta
 
 TWO_VIEWS = '[view.main]\nazimuth_deg = 10.0\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 30.0'
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 
 
 class Gate:

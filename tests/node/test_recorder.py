@@ -30,7 +30,7 @@ from recordings import (
     salvaged,
     summary,
 )
-from rig import Rig
+from rig import LOCKSTEP, Rig
 from wire_messages import origin
 
 from gcd_client.control import Code
@@ -45,7 +45,6 @@ from gcd_node.sources.logs import LogSource
 
 pytestmark = pytest.mark.timeout(180)
 
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 RAW = 'input_encoding = "raw"'
 LIVE = SourceInfo(kind="v4l2", id="t", width=100, height=100, fps_nominal=10.0, clock="realtime")
 START_S = 120.0  # what a busy machine may take to start a process

@@ -9,7 +9,7 @@ import pytest
 import torch
 from cameras import Bench, until
 from fakes import FakeSource, FakeSynthesizer, traits
-from rig import Rig
+from rig import LOCKSTEP, Rig
 from torch import nn
 
 from gcd_client.control import Code
@@ -17,7 +17,6 @@ from gcd_model import Augmentation, Cancelled, Clip, RenderOptions, SourceFeatur
 from gcd_node.config import ModelSection
 from gcd_node.model import interruptible
 
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 WAITING = "life = {autostart = false}"
 
 
