@@ -15,8 +15,8 @@ import torch
 
 from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, Traits, ViewSynthesizer, load_synthesizer
-from gcd_node.auth import ServerSecurity, load_server_security
-from gcd_node.config import ModelSection, NodeConfig
+from gcd_node.auth import EventSink, ServerSecurity, load_server_security
+from gcd_node.config import ModelSection, NodeConfig, ViewerConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health
@@ -110,41 +110,46 @@ def open_session(
         node.watch(publisher.dead_threads)
         control: ControlServer | None = None
         if config.control.endpoint is not None:
-            control = ControlServer(
-                config.control.endpoint,
-                node.handle,
-                state=lambda: node.state.label,
-                on_event=emit,
-                on_answer=node.recorder.command,
-                security=security,
-            )
-            stack.enter_context(control)
+            control = stack.enter_context(_control_server(config.control.endpoint, node, emit, security))
             node.watch(control.dead_threads)
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
-            arguments = ["--http", config.viewer.http, "--data", publisher.endpoint]
-            arguments += ["--status", publisher.status_endpoint, "--control", control.endpoint if control else "none"]
-            arguments += ["--open"] if show_page else []
-            arguments += _page_keys(config, arguments, security)
+            arguments = _viewer_arguments(config.viewer, publisher, control, security)
             listen(config.viewer.http, "[viewer] http").close()  # to know at once whether it is free
             if viewer:
-                stack.enter_context(_viewer_process(arguments))
+                stack.enter_context(_viewer_process([*arguments, *(["--open"] if show_page else [])]))
         yield node, publisher, control
 
 
-def _page_keys(config: NodeConfig, arguments: list[str], security: ServerSecurity | None) -> list[str]:
-    """The page is a client like others: it needs keys where the node asks for them. Raises ConfigError without any."""
+def _control_server(endpoint: str, node: Node, emit: EventSink, security: ServerSecurity | None) -> ControlServer:
+    return ControlServer(
+        endpoint,
+        node.handle,
+        state=lambda: node.state.label,
+        on_event=emit,
+        on_answer=node.recorder.command,
+        security=security,
+    )
+
+
+def _viewer_arguments(
+    config: ViewerConfig, publisher: Publisher, control: ControlServer | None, security: ServerSecurity | None
+) -> list[str]:
+    """What `gcd-node viewer` is given. The page is a client like others: without keys ConfigError, where the node asks
+    for them."""
+    arguments = ["--http", config.http or "", "--data", publisher.endpoint, "--status", publisher.status_endpoint]
+    arguments += ["--control", "none" if control is None else control.endpoint]
     if security is None or not any(each.startswith("tcp://") for each in arguments):
-        return []
-    if config.viewer.keys is None:
+        return arguments
+    if config.keys is None:
         raise ConfigError(
             "this node asks its clients for keys, and the page is one of them: make a pair with `gcd-node keys new`, "
             "name its folder in [viewer] keys, and put its public key on the list in [security] allow"
         )
-    folder = Path(config.viewer.keys).expanduser()
+    folder = Path(config.keys).expanduser()
     read_key_pair(folder)
-    return ["--keys", str(folder), "--node-key", security.keys.public]
+    return [*arguments, "--keys", str(folder), "--node-key", security.keys.public]
 
 
 @contextmanager
