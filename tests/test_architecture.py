@@ -22,11 +22,8 @@ MOST_LINES = {"gcd_client": 1383}
 OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "write_text", "write_bytes"}
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
-MOST = [("gcd_node", 61, 15_687), ("tests/node", 86, 15_868)]
-"""Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise.
-
-That of the node rose once, by 90 lines, by the threads of worker.py.
-"""
+MOST = [("gcd_node", 61, 15_541), ("tests/node", 86, 15_840)]
+"""Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 
 
 def files(package: str) -> list[Path]:
