@@ -33,7 +33,7 @@ from gcd_node.image_io import (
     write_png,
     write_video,
 )
-from gcd_node.preprocess import Fit, assumed_hfov_deg, stated_mount, stated_sphere, to_clip_tensor
+from gcd_node.preprocess import Fit, assumed_hfov_deg, require_usable, stated_mount, stated_sphere, to_clip_tensor
 from gcd_node.sources import SourcePose
 from gcd_node.sources.depth import DepthPicture, OnnxDepth, clean_depth
 from gcd_node.sources.files import PICTURES, ImageFolder, VideoFile, list_pictures, read_depth, read_picture
@@ -50,10 +50,11 @@ _Frame = TypeVar("_Frame")
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipRequest:
-    """Which frames of the input, at what size, under which frame rate, and with which depth.
+    """Which frames of the input, at what size, under which frame rate, from which camera, and with which depth.
 
     start, stride: in frames of the input. fps: what the network is told; else worked out.
     height, width: else the trained size.
+    pose: of the source camera, if stated.
     hfov_deg: horizontal field of view of the input's pictures, if known; of a stereo pair, of the rectified ones.
     depth: of the input's frames: a folder of 16-bit pictures in millimetres, one such picture of a still, .npy of
         [T, H, W] metres, a network as .onnx, or with a calibration the right video of a stereo pair.
@@ -66,6 +67,7 @@ class ClipRequest:
     fps: float | None = None
     height: int | None = None
     width: int | None = None
+    pose: SourcePose | None = None
     hfov_deg: float | None = None
     depth: Path | None = None
     calibration: Path | None = None
@@ -104,20 +106,21 @@ class OfflineClip:
     hfov_deg: float | None
 
 
-def read_clip(path: Path, request: ClipRequest, traits: Traits, pose: SourcePose | None = None) -> OfflineClip:
-    """Read T frames of an input. pose: of the source camera, if stated.
+def read_clip(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
+    """Read T frames of an input.
 
     Raises:
         SourceError: missing, empty, damaged, undecodable. TooShortError: fewer frames than a clip needs.
         OptionError: a size the network cannot take. UsageError: what the model has no use for.
         DepthError: the depth does not belong to the pictures, or there is none. ConfigError: a calibration of no pair.
     """
-    request = _with_lens(request, traits, pose)
+    require_usable(request.pose, traits)
+    request = _with_lens(request, traits)
     if request.calibration is not None:
         source = _from_pair(path, request, traits)
     else:
         source = _from_pictures(path, request, traits)
-    mount, depth = stated_mount(pose, source.hfov_deg, traits), source.clip.depth
+    mount, depth = stated_mount(request.pose, source.hfov_deg, traits), source.clip.depth
     if request.network is not None:
         scale = mount if request.depth_kind == "inverse" else None
         network = OnnxDepth(request.network, kind=request.depth_kind, scale=scale)
@@ -126,7 +129,7 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits, pose: SourcePose
     return replace(source, clip=replace(source.clip, mount=mount, depth=depth))
 
 
-def _with_lens(request: ClipRequest, traits: Traits, pose: SourcePose | None) -> ClipRequest:
+def _with_lens(request: ClipRequest, traits: Traits) -> ClipRequest:
     """With the field of view that depth and the live model need: as stated, measured, or else as trained."""
     measured = request.depth is not None
     if measured and not (traits.live or traits.knows_camera):
@@ -139,7 +142,7 @@ def _with_lens(request: ClipRequest, traits: Traits, pose: SourcePose | None) ->
     if not needed or request.calibration is not None or request.hfov_deg is not None:
         return request
     trained = None if traits.family is None else traits.family.hfov_deg
-    hfov_deg = assumed_hfov_deg(pose) if traits.live else trained
+    hfov_deg = assumed_hfov_deg(request.pose) if traits.live else trained
     if hfov_deg is None:
         raise UsageError(f"nobody knows the field of view that depth needs, {traits.name} neither; give --hfov-deg")
     return replace(request, hfov_deg=hfov_deg)

@@ -18,6 +18,7 @@ from gcd_model import (
     SolverName,
     Traits,
     Trajectory,
+    View,
     ViewSynthesizer,
     export_weights,
     load_synthesizer,
@@ -29,7 +30,6 @@ from gcd_node.errors import SourceError, UsageError
 from gcd_node.image_io import write_npz
 from gcd_node.messages import ontology
 from gcd_node.offline import ClipRequest, OfflineClip, plan, read_clip, write_view
-from gcd_node.preprocess import require_usable
 from gcd_node.sources import SourcePose
 
 _view = partial(Option, rich_help_panel="The view")
@@ -162,14 +162,16 @@ def synthesize(
     clip = ClipRequest(start=start, stride=stride, fps=fps, height=height, width=width, unit_m=unit_m, depth=depth)
     clip = replace(clip, hfov_deg=hfov_deg, calibration=calibration, rectified=rectified, depth_kind=depth_kind)
     pose = _pose(source_elevation_deg, source_radius, (mount_height, mount_forward, mount_left, mount_tilt))
+    clip = replace(clip, pose=pose)
     path = partial(plan, poses=poses, trajectory=trajectory, move_time=move_time, source=pose)
     path = partial(path, change=(azimuth_deg, elevation_deg, radius))
     options = RenderOptions(steps=steps, solver=solver, guidance=guidance, quality=quality, samples=samples, seed=seed)
     options = replace(options, guidance_interval=guidance_interval, motion_bucket=motion_bucket)
-    augmentation = Augmentation(strength=cond_aug, seed=seed)
     load = partial(load_synthesizer, weights, adapter=adapter, family=family, device=device, dtype=dtype, engine=engine)
     load = partial(load, head_width=head_width, image_heads=image_heads, providers=provider or ())
-    _run(input_path, out, save, clip, pose, load, path, options, augmentation)
+    if save is not None and samples != 1:
+        raise UsageError("--save holds one sample; leave out --samples")
+    _write(out, save, *_rendered(input_path, clip, load, path, options, cond_aug))
 
 
 def _pose(elevation_deg: float | None, radius: float | None, mount: tuple[float | None, ...]) -> SourcePose | None:
@@ -184,29 +186,23 @@ def _pose(elevation_deg: float | None, radius: float | None, mount: tuple[float 
         raise UsageError(str(error)) from error
 
 
-def _run(
+def _rendered(
     input_path: Path,
-    out: Path,
-    save: Path | None,
     clip: ClipRequest,
-    pose: SourcePose | None,
     load: Callable[[], ViewSynthesizer],
     path: Callable[..., Trajectory],
     options: RenderOptions,
-    augmentation: Augmentation,
-) -> None:
-    if save is not None and options.samples != 1:
-        raise UsageError("--save holds one sample; leave out --samples")
+    cond_aug: float | None,
+) -> tuple[Traits, OfflineClip, View]:
     if not input_path.exists():
         raise SourceError(f"{input_path} does not exist; give a video, a folder of pictures or a still")
     with Console(stderr=True, markup=False).status("loading the weights"):
         model = load()
     traits = model.traits
-    require_usable(pose, traits)
-    source = read_clip(input_path, clip, traits, pose)
+    source = read_clip(input_path, clip, traits)
     trajectory = path(traits, mount=source.clip.mount)
     with progress_bar("encoding") as advance:
-        features = model.encode(source.clip, augmentation)
+        features = model.encode(source.clip, Augmentation(strength=cond_aug, seed=options.seed))
         progress = partial(advance, "denoising")
         view = model.render(features, [trajectory], replace(options, progress=progress))[0]
     if view.visibility is None and source.clip.depth is not None:
@@ -214,13 +210,18 @@ def _run(
     console = Console(markup=False)
     if not traits.trained:
         console.print(f"{traits.name}: these weights are random, so the picture is noise.")
-    for each in _assumed(clip, pose, traits, source, trajectory):
+    for each in _assumed(clip, traits, source, trajectory):
         console.print(each, soft_wrap=True)
+    return traits, source, view
+
+
+def _write(out: Path, save: Path | None, traits: Traits, source: OfflineClip, view: View) -> None:
     written = write_view(out, source, view, ontology(traits))
     if save is not None:
         frames = view.video.permute(0, 2, 3, 1).contiguous()
         write_npz(save, {"latents": view.latents[0].numpy(), "frames": frames.numpy()})
         written.append(save)
+    console = Console(markup=False)
     if traits.ood_threshold is not None and view.ood is not None and view.ood > traits.ood_threshold:
         console.print(
             f"To {traits.name} this is another world than the one it learned from ({view.ood:.2f}, its own are below "
@@ -231,11 +232,9 @@ def _run(
         console.print(f"wrote {each}", soft_wrap=True)
 
 
-def _assumed(
-    clip: ClipRequest, pose: SourcePose | None, traits: Traits, source: OfflineClip, trajectory: Trajectory
-) -> Iterator[str]:
+def _assumed(clip: ClipRequest, traits: Traits, source: OfflineClip, trajectory: Trajectory) -> Iterator[str]:
     """What nobody stated of the source camera, and what it is taken to be."""
-    start = trajectory.source
+    start, pose = trajectory.source, clip.pose
     is_stated = pose is not None and (pose.on_vehicle or None not in (pose.elevation_deg, pose.radius))
     if start is not None and trajectory.delta is not None and not is_stated:
         yield (

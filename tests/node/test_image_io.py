@@ -13,12 +13,7 @@ from gcd_node.errors import OutputError
 from gcd_node.frame import Image
 from gcd_node.image_io import legend, to_u8, write_png, write_video
 
-HEIGHT, WIDTH = 24, 36
-SEEN = np.full((HEIGHT, WIDTH), 2, np.uint8)
-
-
-def flat(level: int) -> Image:
-    return np.full((HEIGHT, WIDTH, 3), level, np.uint8)
+SEEN = np.full((16, 24), 2, np.uint8)
 
 
 def gradient(red: int = 200) -> Image:
@@ -62,9 +57,9 @@ def test_a_legend_takes_as_many_lines_as_it_needs_and_drops_no_class(width: int,
 
 
 def test_frames_of_whole_windows_are_put_together_in_order_and_the_unseen_hatched() -> None:
-    pictures = {window: [flat(10 * window + i) for i in range(2)] for window in (5, 2, 7)}
+    pictures = {window: [gradient(10 * window + i) for i in range(2)] for window in (5, 2, 7)}
     seen = {2: [SEEN, 0 * SEEN], 5: [SEEN, SEEN], 7: [SEEN]}  # of 7 not all has arrived
     shown = moments(pictures, pictures, seen, pictures)
     assert [int(view[0, 0, 0]) for window in shown for _, view, _, _ in window] == [20, 21, 50, 51]
-    assert np.array_equal(shown[0][0][2], flat(20))
-    assert np.array_equal(shown[0][1][2], hatched(flat(21), 0 * SEEN))
+    assert np.array_equal(shown[0][0][2], gradient(20))
+    assert np.array_equal(shown[0][1][2], hatched(gradient(21), 0 * SEEN))
