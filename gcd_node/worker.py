@@ -27,11 +27,6 @@ Made = TypeVar("Made")
 _LOG = logging.getLogger(__name__)
 
 
-def _most_at_once() -> int:
-    """Windows in work. On two cores a third would make every view older and no more of them."""
-    return 2 if len(os.sched_getaffinity(0)) < 3 else 3
-
-
 class ModelWorker:
     """Renders windows until there are no more, it is cancelled, or the model has failed."""
 
@@ -85,7 +80,8 @@ class ModelWorker:
             return
 
         failures: list[Exception] = []
-        room = threading.Semaphore(_most_at_once() - 1)  # for windows in work beside the one that is seen
+        # for windows in work beside the one that is seen: on two cores a third would make all older and no more of them
+        room = threading.Semaphore(1 if len(os.sched_getaffinity(0)) < 3 else 2)
 
         def guarded(step: Callable[[Given], Made], given: Given) -> Made | None:
             """A step, unless one has failed: that closes `newest`, and is raised at the end."""
