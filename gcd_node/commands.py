@@ -60,14 +60,11 @@ class NodeCommands:
                 return self._request(verb, command.dry_run)
             case "record_start" | "record_stop":
                 return self._record(begin=verb == "record_start", dry_run=command.dry_run)
-            case _:
-                pass
-        match args:
-            case SetView() | SetPose():
+            case _ if isinstance(args, SetView | SetPose):
                 return self._set_view(args, command)
-            case RemoveView():
+            case _ if isinstance(args, RemoveView):
                 return self._remove_view(args, command)
-            case SetParam():
+            case _ if isinstance(args, SetParam):
                 return self._set_param(args, dry_run=command.dry_run)
             case _:
                 raise RequestError(f"this node does not know {verb}", Code.UNKNOWN_VERB)

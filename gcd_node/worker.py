@@ -6,10 +6,10 @@ and motion, one places what was seen in the views, one paints the views and send
 
 import logging
 import os
+import queue
 import threading
 import time
 from collections.abc import Callable, Generator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -95,23 +95,40 @@ class ModelWorker:
                 self._pulse.rest()
 
         def place(taken: tuple[Job, Seen] | None) -> None:
-            painter.submit(paint, guarded(self._place, taken))
+            placed = guarded(self._place, taken)
+            to_painter(lambda: paint(placed))
 
         def paint(placed: tuple[Job, Placed | None] | None) -> None:
             guarded(self._render, placed)
             room.release()
 
         def go_on(taken: tuple[Job, Seen] | None) -> None:
-            placer.submit(place, taken)
+            to_placer(lambda: place(taken))
             room.acquire()
 
-        def note() -> None:
-            self._threads.add(threading.get_ident())
-
-        with ThreadPoolExecutor(1, "painter", note) as painter, ThreadPoolExecutor(1, "placer", note) as placer:
+        with self._thread("painter") as to_painter, self._thread("placer") as to_placer:
             yield go_on
         if failures:
             raise failures[0]
+
+    @contextmanager
+    def _thread(self, name: str) -> Generator[Callable[[Callable[[], None]], None]]:
+        """A thread that makes the calls it is given. A daemon: a network that hangs must not hold up the end of the
+        process, as an executor of the library would."""
+        calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+
+        def work() -> None:
+            self._threads.add(threading.get_ident())
+            for call in iter(calls.get, None):
+                call()
+
+        thread = threading.Thread(target=work, name=name, daemon=True)
+        thread.start()
+        try:
+            yield calls.put
+        finally:
+            calls.put(None)
+            thread.join()
 
     def _place(self, taken: tuple[Job, Seen] | None) -> tuple[Job, Placed | None] | None:
         return None if taken is None else (taken[0], self._renderer.place(*taken))

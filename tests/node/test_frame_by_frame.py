@@ -129,11 +129,11 @@ def test_beside_a_live_source_three_frames_are_in_work_at_once_and_on_two_cores_
     model, box = SideBySide(min(cores, 3)), Box()
     made_node(live_config(), model, slowly(12), box).run()
     assert model.met
-    assert model.threads == {"see": {"model"}, "place": {"placer_0"}, "paint": {"painter_0"}}
+    assert model.threads == {"see": {"model"}, "place": {"placer"}, "paint": {"painter"}}
     seqs = [message.header.src.seq[0] for message in box.of("win")]
     assert seqs == sorted(set(seqs))
     assert seqs[-1] == 11
-    assert not {"painter_0", "placer_0"} & {thread.name for thread in threading.enumerate()}
+    assert not {"painter", "placer"} & {thread.name for thread in threading.enumerate()}
 
 
 def test_what_fails_in_the_painter_is_done_again_or_ends_the_node() -> None:
