@@ -4,7 +4,7 @@
 
 Each way is held against 25 Euler steps and against many of second order (`--fine`): `latents from` is the norm of the
 difference over that of the reference. Then against the truth, frames 2 to the last, with the lead over the weights' own
-way (the first row) and its paired standard error over scenes. `runs` counts evaluations of the network for one view.
+way (the first row) and its paired 95 % interval over scenes. `runs` counts evaluations of the network for one view.
 """
 
 import argparse
@@ -19,8 +19,7 @@ from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
 from gcd_train.evaluation.opening import Choice, open_pairs
 from gcd_train.evaluation.predictors import Fixed
-from gcd_train.evaluation.statistics import lead
-from gcd_train.evaluation.summary import evaluation
+from gcd_train.evaluation.statistics import Selection, bootstrap, difference
 
 UNGUIDED = (1.0, 1.0)
 HEADS = ["steps", "solver", "guidance", "runs", "latents from Euler", "dB to Euler", "latents from fine", "dB to fine"]
@@ -90,7 +89,7 @@ def measure(views, clips, ways, references):
             apart[way].append([number for each in references for number in distance(drawn[way], drawn[each])])
             shown = Fixed(name=str(way), prediction=views.shown(drawn[way]))
             records[way].append(predicted_and_measured(shown, clip, classes=clips.classes)[1])
-    truth = {way: evaluation(rows, classes=len(clips.classes)) for way, rows in records.items()}
+    truth = {way: bootstrap(rows, Selection(), classes=len(clips.classes)) for way, rows in records.items()}
     return {way: ([mean(column) for column in zip(*apart[way], strict=True)], truth[way]) for way in ways}
 
 
@@ -106,14 +105,14 @@ def show(found, diffusion):
         guidance = "no" if way.guidance == UNGUIDED else "{:g} to {:g}".format(*way.guidance)
         if way.guidance_interval is not None:
             guidance += ", noise {:g} to {:g}".format(*way.guidance_interval)
-        ahead_db, ahead_miou = lead(truth.of_all, own.of_all, "psnr_db"), lead(truth.of_all, own.of_all, "miou")
+        ahead_db, ahead_miou = (difference(truth, own, name) for name in ("psnr_db", "miou"))
         row = [way.steps, way.solver, guidance, Schedule.of(diffusion, options_of(way)).evaluations]
         row += [f"{number:.{digits}f}" for number, digits in zip(apart, (4, 1, 4, 1), strict=True)]
-        row += [f"{truth.value('psnr_db'):.2f}", "{:.2f} ± {:.2f}".format(*ahead_db)]
+        row += [f"{truth.value('psnr_db'):.2f}", f"{ahead_db.value:.2f} [{ahead_db.low:.2f}, {ahead_db.high:.2f}]"]
         row += [
             f"{truth.value('gradient_energy'):.2f}",
             f"{truth.value('miou'):.3f}",
-            "{:.3f} ± {:.3f}".format(*ahead_miou),
+            f"{ahead_miou.value:.3f} [{ahead_miou.low:.3f}, {ahead_miou.high:.3f}]",
         ]
         print("| " + " | ".join(map(str, row)) + " |")
 

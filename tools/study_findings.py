@@ -11,8 +11,8 @@ count: models of two paths share the last frame alone. Writes findings.md and fi
 import argparse
 from pathlib import Path
 
+from gcd_train.evaluation.comparisons import Difference, differences_csv
 from gcd_train.evaluation.paper import PICTURE_COLUMNS
-from gcd_train.evaluation.report import Difference, differences_csv
 from gcd_train.evaluation.runs import Goal, Run, gather
 from gcd_train.evaluation.statistics import Selection, bootstrap, common_clips, difference
 from gcd_train.evaluation.tables import markdown_rows

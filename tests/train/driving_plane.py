@@ -25,12 +25,10 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_train.data.pairs import PairedClip
-from gcd_train.evaluation.baselines import BaselineSettings, build, usual_baselines
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.measure import predicted_and_measured as measured
-from gcd_train.evaluation.predictors import CameraPair, Predictor, fit_statistics, pixel_rays
-from gcd_train.evaluation.statistics import Selection
-from gcd_train.evaluation.summary import Evaluation, evaluation
+from gcd_train.evaluation.predictors import CameraPair, Predictor, pixel_rays
+from gcd_train.evaluation.statistics import Bootstrap, Selection, bootstrap
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World
 
 SKY, ROAD, TERRAIN = 0, 1, 4
@@ -191,26 +189,14 @@ def _strips(clip: PairedClip) -> dict[str, np.ndarray]:
     return {kind: np.ascontiguousarray(np.concatenate(frames)) for kind, frames in strips.items()}
 
 
-def without_learning(clips: PlaneClips, *, named: bool = True) -> tuple[Predictor, ...]:
-    """What is compared with models of pictures, built from the same clips. named: with their classes."""
-    settings = BaselineSettings(
-        frames=clips.frames,
-        height=clips.height,
-        width=clips.width,
-        classes=tuple(clips.classes) if named else (),
-        statistics=fit_statistics(clips),
-    )
-    return tuple(build(name, settings) for name in usual_baselines(settings) if not name.startswith("reproject"))
-
-
 def evaluated(
     predictors: Sequence[Predictor],
     clips: PlaneClips,
     *,
     declared: CameraMount | None = None,
     selection: Selection | None = None,
-) -> list[Evaluation]:
-    """What an evaluation finds on these pairs."""
+) -> list[Bootstrap]:
+    """Figures of each on these pairs."""
     pairs = PairedSet(clips=clips, identity="plane", declared=declared)
     of = [[measured(each, pairs.clip(key), classes=pairs.classes)[1] for key in pairs.keys] for each in predictors]
-    return [evaluation(records, selection, classes=len(pairs.classes)) for records in of]
+    return [bootstrap(records, selection or Selection(), classes=len(pairs.classes)) for records in of]

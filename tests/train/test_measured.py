@@ -13,9 +13,8 @@ from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
 from gcd_train.evaluation.predictors import CameraPair, Fixed, Prediction, SourceClip, to_pictures
-from gcd_train.evaluation.statistics import class_counts
+from gcd_train.evaluation.statistics import Selection, bootstrap, class_counts, class_iou
 from gcd_train.evaluation.store import ClipRecord
-from gcd_train.evaluation.summary import evaluation
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
 KINDS = tuple(SemanticClass(name=f"kind {number}", colour=(number, 0, 0)) for number in range(CLASSES))
@@ -102,8 +101,8 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
         wrong = [sum(count for _, label, count in frame if label == NO_CLASS) for frame in counted]
         assert wrong == [rows * shape[1]] * FRAMES
         assert road in {entry[0] for frame in counted for entry in frame if entry[1] == NO_CLASS}
-    found = evaluation([record], classes=CLASSES)
-    assert math.isnan(found.class_iou(full=True)[void])
+    found = bootstrap([record], Selection(), classes=CLASSES)
+    assert math.isnan(class_iou(found.scenes.full[0])[void])
     assert void not in class_counts([record], CLASSES).common
     assert found.value("miou_full") < 1.0
 

@@ -8,12 +8,12 @@ import msgspec
 import pytest
 from made_records import FRAMES, note, record, region
 
+from gcd_train.evaluation.comparisons import differences
+from gcd_train.evaluation.comparisons import differences_markdown as differences_told
 from gcd_train.evaluation.galleries import caption
-from gcd_train.evaluation.report import differences
-from gcd_train.evaluation.report import differences_markdown as differences_told
-from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
+from gcd_train.evaluation.runs import EvaluatedSet, Measured, Run, gather, on_the_same_goals
 from gcd_train.evaluation.store import ClipRecord
-from gcd_train.evaluation.tables import Measured, main_tables, region_table, to_markdown
+from gcd_train.evaluation.tables import main_tables, region_table, to_markdown
 
 COUNTS = [(0, 0, 9), (1, 0, 1)]
 

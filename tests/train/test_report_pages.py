@@ -13,12 +13,13 @@ from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
+from gcd_train.evaluation.comparisons import differences, worst_clips
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
 from gcd_train.evaluation.plots import all_plots
-from gcd_train.evaluation.report import Choices, differences, make_report, worst_clips
-from gcd_train.evaluation.runs import Run, gather
+from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.runs import Measured, Run, gather
 from gcd_train.evaluation.store import ClipRecord, RunKeeper, RunNote
-from gcd_train.evaluation.tables import Measured, main_tables, to_csv, to_markdown
+from gcd_train.evaluation.tables import main_tables, to_csv, to_markdown
 
 WEIGHTS = {"weights": "0123456789ab", "steps": "4"}
 SCENES = 6

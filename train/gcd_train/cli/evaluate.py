@@ -17,8 +17,8 @@ from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.plan import EvaluateOptions, planned
+from gcd_train.evaluation.report import Choices, make_report
 from gcd_train.evaluation.store import RunKeeper
-from gcd_train.evaluation.summary import complete_rows, to_markdown, write_summary
 
 _FIELD = HexPlaneSettings()
 
@@ -144,16 +144,10 @@ def _evaluate(
         account = _measured(work, workers, ray, options.device)
     for line in account.lines():
         say(line)
-    rows = complete_rows(keeper, list(work.makers), plan.clips.keys, account.records)
-    summary = plan.summary(rows, account.failed())
-    text = to_markdown(summary)
-    write_summary(summary, text, out)
-    keys = [record.key for record in next(iter(rows.values())) if record.key in work.sheet]
-    (out / "contact_sheet.png").unlink(missing_ok=True)
-    if keys:
-        plan.write_sheet(out / "contact_sheet.png", summary, keys, keeper)
-    typer.echo(text)
-    say(f"wrote {out}/run.json, records, evaluation.json, evaluation.md" + " and contact_sheet.png" * bool(keys))
+    report = make_report([out], out, Choices(clips=0, worst=0, drawn=False))
+    shown = plan.write_sheet(out / "contact_sheet.png", work.sheet, keeper)
+    typer.echo(report.read_text())
+    say(f"wrote {out}/run.json, records, report.md, tables" + " and contact_sheet.png" * shown)
     if account.failures:
         raise typer.Exit(TrainError.exit_code)
 

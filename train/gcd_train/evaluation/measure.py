@@ -288,8 +288,7 @@ class Account:
     """How far a run is. there: clips that had all their records before, and all frames that are to be kept.
 
     measured: clips with a new record. drawn: clips of which only frames were lacking, and now are there. failures:
-    clip, or clip and method, to why. gave_up: stopped before its end, see `GIVE_UP_AFTER`. records: the new ones, by
-    method and key.
+    clip, or clip and method, to why. gave_up: stopped before its end, see `GIVE_UP_AFTER`.
     """
 
     clips: int
@@ -297,7 +296,6 @@ class Account:
     measured: int = 0
     drawn: int = 0
     failures: dict[str, str] = field(default_factory=dict[str, str])
-    records: dict[tuple[str, str], ClipRecord] = field(default_factory=dict[tuple[str, str], ClipRecord])
     _tried: int = 0
     _in_a_row: int = 0
 
@@ -310,14 +308,6 @@ class Account:
     def gave_up(self) -> bool:
         """Whether too many clips in a row had no record."""
         return self._in_a_row >= GIVE_UP_AFTER
-
-    def failed(self) -> tuple[str, ...]:
-        """For each method that failed on clips, on how many and why the first time; all of them for clips that could
-        not be read."""
-        reasons: dict[str, list[str]] = {}
-        for what, why in self.failures.items():
-            reasons.setdefault(what.partition(", ")[2] or "every method", []).append(why)
-        return tuple(f"{name} on {len(each)} of {self.clips} clips ({each[0]})" for name, each in reasons.items())
 
     def add(self, outcome: Outcome[ClipItem, ClipDone]) -> None:
         """Count one clip. Raises RunError where nothing can be written."""
@@ -334,7 +324,6 @@ class Account:
             useful = bool(found.measured or found.drawn)
             self.measured += bool(found.measured)
             self.drawn += bool(found.drawn and not found.measured)
-            self.records |= {(record.method, key): record for record in found.measured}
         self.failures |= faults
         self._in_a_row = self._in_a_row + 1 if faults and not useful else 0
 

@@ -1,11 +1,12 @@
 """What a user asks of an evaluation, worked out: the clips, the methods, what the run says of itself, what it found."""
 
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import product
 from math import isnan
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -33,9 +34,9 @@ from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import Choice, SceneCuts, data_kind, open_pairs, open_scenes, usual_samples
 from gcd_train.evaluation.predictors import fit_statistics
 from gcd_train.evaluation.protocol import FrameBounds, ProtocolName
+from gcd_train.evaluation.runs import Measured, Run, gather
 from gcd_train.evaluation.statistics import FigureName, Selection
-from gcd_train.evaluation.store import LPIPS, ClipRecord, RunKeeper, RunNote
-from gcd_train.evaluation.summary import Conditions, MountNumbers, Shot, Summary, best_of, evaluation
+from gcd_train.evaluation.store import LPIPS, RunKeeper, RunNote
 from gcd_train.layouts.manifest import package_version
 
 ProgressBar: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
@@ -176,45 +177,33 @@ class Plan:
             methods={method.name: {**method.told, **lpips} for method in self.methods},
         )
 
-    def summary(self, rows: Mapping[str, Sequence[ClipRecord]], failed: tuple[str, ...] = ()) -> Summary:
-        """What was found. rows: records by method, of the same clips in their order. failed: see `Conditions`."""
-        clips, options, model = self.clips, self.options, self.model
-        released, pairs = options.protocol == "release", clips if isinstance(clips, PairedSet) else None
-        selection = Selection(frames="all") if released else Selection()
-        found = {name: evaluation(records, selection, classes=len(clips.classes)) for name, records in rows.items()}
-        names = [method.name for method in self.models]
-        return Summary(
-            conditions=Conditions(
-                data=tuple(map(str, options.data)),
-                weights=None if model is None else model.name,
-                sha256_12=None if model is None else model.sha256_12,
-                steps=None if model is None else model.config.sampling.steps,
-                shots=tuple(Shot.of(clips, record) for record in next(iter(rows.values()))),
-                frames=clips.frames,
-                size=(clips.height, clips.width),
-                grid=(clips.height // 2, clips.width // 2),
-                camera=clips.camera,
-                true_mount=MountNumbers.of(None if pairs is None else pairs.clips.mount),
-                declared_mount=MountNumbers.of(None if pairs is None else pairs.declared),
-                train=() if self.training is None else tuple(map(str, options.train or ())),
-                train_clips=0 if self.training is None else len(self.training),
-                samples=options.sampling.samples,
-                first_frame=1 if released else 2,
-                failed=failed,
-            ),
-            classes=tuple(each.name for each in clips.classes),
-            model=tuple(found[name] for name in names if name in found),
-            baselines=tuple(each for name, each in found.items() if name not in names),
-        )
-
-    def write_sheet(self, path: Path, summary: Summary, keys: Sequence[str], keeper: RunKeeper) -> None:
-        """The contact sheet of the first clips of a summary. Raises RunError."""
-        shown, classes = _on_the_sheet(summary), self.clips.classes
+    def write_sheet(self, path: Path, keys: Sequence[str], keeper: RunKeeper) -> bool:
+        """The contact sheet of clips; whether any of them was measured. Raises RunError."""
+        shown, classes = self._on_the_sheet(keeper), self.clips.classes
+        path.unlink(missing_ok=True)
         rows = [
-            contact_rows(self.clips.clip(key), [(name, keeper.sheet_rows(name, key)) for name in shown], classes)
+            (key, contact_rows(self.clips.clip(key), [(name, keeper.sheet_rows(name, key)) for name in shown], classes))
             for key in keys
+            if any(keeper.has(name, key) for name in shown)
         ]
-        write_sheet(list(zip(map(str, summary.conditions.shots), rows, strict=False)), path)
+        if rows:
+            write_sheet(rows, path)
+        return bool(rows)
+
+    def _on_the_sheet(self, keeper: RunKeeper) -> list[str]:
+        """The weights, and the best others with and without more than the source, by PSNR and by mIoU."""
+        (of,) = gather([Run.read(keeper.folder)])
+        measured, chosen = Measured(of=of), [method.name for method in self.models[:1]]
+        others = {method.name for method in self.baselines + self.saved}
+        figures: tuple[FigureName, ...] = ("psnr_db", "miou_full")
+        for figure, privileged in product(figures, (False, True)):
+            found = [
+                (measured.sums(method, Selection()).value(figure), method.name)
+                for method in of.methods
+                if method.name in others and method.privileged == privileged
+            ]
+            chosen += [name for _, name in sorted(each for each in found if not isnan(each[0]))[-1:]]
+        return [method.name for method in of.methods if method.name in chosen]
 
 
 def planned(options: EvaluateOptions) -> Plan:
@@ -355,16 +344,3 @@ def _settings(
         hexplane=options.hexplane,
     )
     return settings if training is None else replace(settings, statistics=settings.fill)
-
-
-def _on_the_sheet(summary: Summary) -> list[str]:
-    """The model, and the best baselines with and without more than the source, by PSNR and by mIoU."""
-    names: tuple[FigureName, ...] = ("psnr_db", "miou")
-    wanted = [each.name for each in summary.model[:1]]
-    for name in names:
-        if summary.model and isnan(summary.model[0].value(name)):
-            continue  # the model has no such figure
-        for privileged in (False, True):
-            best = best_of([each for each in summary.baselines if each.privileged == privileged], name)
-            wanted += [] if best is None else [best.name]
-    return [each.name for each in summary.evaluations if each.name in wanted]

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gcd_train.errors import RenderError
-from gcd_train.evaluation.runs import Method
+from gcd_train.evaluation.runs import Measured, Method
 from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval, Selection, bootstrap
 from gcd_train.evaluation.store import ClipRecord, Region
-from gcd_train.evaluation.tables import Cell, Measured, csv_text
+from gcd_train.evaluation.tables import Cell, csv_text
 from gcd_train.files import write_whole
 
 if TYPE_CHECKING:

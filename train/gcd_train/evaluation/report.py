@@ -1,37 +1,36 @@
 """The report as a folder: `report.md`, its tables as CSV, plots, galleries and videos."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-
-import numpy as np
+from statistics import fmean
 
 from gcd_train.errors import RecipeError, RunError
+from gcd_train.evaluation.comparisons import (
+    Difference,
+    differences,
+    differences_csv,
+    differences_markdown,
+    worst_clips,
+    worst_figure,
+    worst_markdown,
+)
 from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
-from gcd_train.evaluation.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, is_model, tables_for
+from gcd_train.evaluation.paper import is_model, tables_for
 from gcd_train.evaluation.plots import all_plots, curves_csv, draw, require_matplotlib
-from gcd_train.evaluation.runs import EvaluatedSet, Method, Run, gather, on_the_same_goals
+from gcd_train.evaluation.runs import EvaluatedSet, Measured, Method, Run, gather, on_the_same_goals
 from gcd_train.evaluation.statistics import (
     FEW_SCENES,
-    FigureName,
-    Interval,
-    Selection,
     Span,
-    common_clips,
-    difference,
 )
 from gcd_train.evaluation.store import folder_name
 from gcd_train.evaluation.tables import (
     NOTHING,
     STAR_OF_FIGURE,
-    WORST_REGIONS,
-    Cell,
-    Measured,
     Table,
     all_figures,
+    class_table,
     clips_csv,
-    csv_text,
     frames_csv,
     frames_told,
     main_tables,
@@ -126,9 +125,16 @@ def _first_page(runs: Sequence[Run], command: str, choices: Choices) -> str:
 def _note_lines(run: Run) -> list[str]:
     note = run.note
     versions = ", ".join(f"{name} {version}" for name, version in note.versions.items())
-    clips = Counter(record.method for record in run.records)
+    seconds: dict[str, list[float]] = {name: [] for name in note.methods}
+    for record in run.records:
+        seconds.setdefault(record.method, []).append(record.seconds)
     rows = [
-        [name, str(clips[name]), ", ".join(f"{key} {value}" for key, value in told.items())]
+        [
+            name,
+            str(len(seconds[name])),
+            f"{fmean(seconds[name]):.2f}" if seconds[name] else NOTHING,
+            ", ".join(f"{key} {value}" for key, value in told.items()),
+        ]
         for name, told in note.methods.items()
     ]
     lines = [
@@ -137,9 +143,9 @@ def _note_lines(run: Run) -> list[str]:
         f"- protocol: {note.protocol}, seed {note.seed}",
         f"- size: {note.frames} frames of {note.width}x{note.height} at {note.fps:g} fps",
         "",
-        *markdown_rows(["method", "clips", "what it is"], rows),
+        *markdown_rows(["method", "clips", "s/clip", "what it is"], rows),
     ]
-    without = [name for name in note.methods if not clips[name]]
+    without = [name for name in note.methods if not seconds[name]]
     if without:
         why = "No clip was measured; the line of `gcd-train evaluate` says why."
         lines += ["", f"**Failed: {', '.join(without)}. {why}**"]
@@ -193,6 +199,8 @@ class _Writer:
     def _tables(self, measured: Measured, spans: Sequence[Span]) -> Iterator[str]:
         yield from map(self._table, main_tables(measured, spans))
         yield self._table(region_table(measured, spans[0]))
+        if any(method.makes_classes for method in self.of.methods):
+            yield self._table(class_table(measured, spans[0]))
         self._write("tables/figures.csv", all_figures(measured))
         self._write("tables/frames.csv", frames_csv(measured))
         self._write("tables/clips.csv", clips_csv(measured))
@@ -274,127 +282,3 @@ class _Writer:
 
     def _write(self, name: str, text: str) -> None:
         write_whole(self._path(name), text.encode())
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """How far one method lies above another in one figure. clips: that both have.
-
-    starred: one of them was given more for this figure than for its others, see `Method.copies_classes`.
-    """
-
-    first: str
-    other: str
-    column: Column
-    frames: Span
-    clips: int
-    apart: Interval
-    starred: bool = False
-
-    @property
-    def verdict(self) -> str:
-        """ "better" or "worse" where zero lies outside the interval, "open" where it does not."""
-        if not self.apart.off_zero:
-            return "open"
-        return "better" if (self.apart.value > 0) != (self.column.figure == "lpips") else "worse"
-
-
-def differences(measured: Measured, first: Method, frames: Span = "2-last") -> tuple[Difference, ...]:
-    """A method against every other one, in all columns that both have figures in, on the clips that both have."""
-    found: list[Difference] = []
-    for other in measured.of.methods:
-        ours, theirs = common_clips(first.records, other.records)
-        for column in (*PICTURE_COLUMNS, *CLASS_COLUMNS) if ours and other.name != first.name else ():
-            chosen = Selection(frames=frames, region=column.region)
-            apart = difference(measured.sums(first, chosen, ours), measured.sums(other, chosen, theirs), column.figure)
-            starred = (first.copies_classes or other.copies_classes) and column.of_classes
-            if apart.known:
-                found.append(Difference(first.name, other.name, column, frames, len(ours), apart, starred))
-    return tuple(found)
-
-
-def differences_csv(found: Sequence[Difference]) -> str:
-    """One difference a line."""
-    lines = [
-        [e.first, e.other, e.frames, e.column.heading, *Cell(figure=e.apart).numbers(), str(e.clips), e.verdict]
-        for e in found
-    ]
-    return csv_text(["first", "other", "frames", "figure", "first ahead", "low", "high", "clips", "verdict"], lines)
-
-
-def differences_markdown(found: Sequence[Difference], of: EvaluatedSet) -> str:
-    """A row for each other method, a column for each figure; bold where zero lies outside the interval."""
-    headings = list(dict.fromkeys(each.column.heading for each in found))
-    cells = {(each.other, each.column.heading): _told(each) for each in found}
-    others = list(dict.fromkeys(each.other for each in found))
-    rows = [[of.method(name).starred, *(cells.get((name, head), NOTHING) for head in headings)] for name in others]
-    return "\n".join(markdown_rows(["", *headings], rows)) + "\n"
-
-
-def _told(each: Difference) -> str:
-    value, low, high = (
-        f"{number:+.{each.column.digits}f}" for number in (each.apart.value, each.apart.low, each.apart.high)
-    )
-    star = " *" if each.starred else ""
-    if np.isnan(each.apart.low):  # one scene tells nothing of it
-        return value + star
-    text = f"{value} [{low}, {high}]"
-    return (text if each.verdict == "open" else f"**{text}** {each.verdict}") + star
-
-
-@dataclass(frozen=True, slots=True)
-class WorstClip:
-    """One clip of a method. occluded: the figure there; NaN for none. best, best_value: of the other methods on it.
-
-    best is starred where it was given more for this figure than the source video.
-    """
-
-    key: str
-    value: float
-    occluded: float
-    best: str
-    best_value: float
-    change: tuple[float, float, float] | None
-
-
-def worst_figure(method: Method) -> FigureName:
-    """What clips are ordered by: PSNR, or mIoU of a method without pictures."""
-    return "psnr_db" if method.makes_pictures else "miou_full"
-
-
-def worst_clips(measured: Measured, method: Method, count: int) -> tuple[WorstClip, ...]:
-    """So many clips, the worst first, in frames 2 to the last; what has no figure comes last."""
-    name = worst_figure(method)
-    values, occluded = (measured.by_clip(method, region, name) for region in WORST_REGIONS)
-    rivals = [
-        (
-            f"{other.name} *" if other.copies_classes and name != "psnr_db" else other.starred,
-            dict(zip(other.keys, measured.by_clip(other, "all", name).tolist(), strict=True)),
-        )
-        for other in measured.of.methods
-        if other.name != method.name
-    ]
-    found: list[WorstClip] = []
-    for place in np.argsort(np.nan_to_num(values, nan=np.inf), kind="stable")[:count]:
-        record = method.records[place]
-        theirs = [(by_key.get(record.key, np.nan), rival) for rival, by_key in rivals]
-        best_value, best = max((pair for pair in theirs if np.isfinite(pair[0])), default=(float("nan"), ""))
-        of_method = (float(values[place]), float(occluded[place]))
-        found.append(WorstClip(record.key, *of_method, best, best_value, record.change))
-    return tuple(found)
-
-
-def worst_markdown(name: FigureName, found: Sequence[WorstClip]) -> str:
-    """A row for each clip."""
-    heading, digits = ("PSNR dB", 2) if name == "psnr_db" else ("mIoU", 3)
-
-    def shown(value: float) -> str:
-        return NOTHING if np.isnan(value) else f"{value:.{digits}f}"
-
-    rows: list[list[str]] = []
-    for each in found:
-        change = NOTHING if each.change is None else ", ".join(f"{part:+.1f}" for part in each.change)
-        figures = [shown(each.value), shown(each.occluded), each.best or NOTHING, shown(each.best_value)]
-        rows.append([each.key, change, *figures])
-    headings = ["clip", "azimuth, elevation, radius", heading, f"{heading} occluded", "best other", f"its {heading}"]
-    return "\n".join(markdown_rows(headings, rows)) + "\n"

@@ -1,15 +1,26 @@
 """Runs of evaluations put together: what was measured on the same clips stands in the same tables."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from gcd_train.errors import RunError
 from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
-from gcd_train.evaluation.statistics import Selection, Span
+from gcd_train.evaluation.statistics import (
+    Array,
+    Bootstrap,
+    ClassCounts,
+    FigureName,
+    Selection,
+    Span,
+    bootstrap,
+    class_counts,
+    clip_sums,
+)
 from gcd_train.evaluation.store import FRAMES_IN, LPIPS, REGIONS, ClipRecord, Frames, Region, RunNote, read_run
 
 COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "fps", "classes")
@@ -164,6 +175,37 @@ def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
     LPIPS may have been left out of one of the two runs."""
     left_out = {FRAMES_IN} if LPIPS in first and LPIPS in other else {FRAMES_IN, LPIPS}
     return all(first.get(name) == other.get(name) for name in (first.keys() | other.keys()) - left_out)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Measured:
+    """A set of clips with the sums of its methods, each worked out once.
+
+    seed: of the bootstrap. rows: method to the row of the paper's tables that a user says it belongs in.
+    """
+
+    of: EvaluatedSet
+    seed: int = 0
+    rows: Mapping[str, str] = field(default_factory=dict[str, str])
+    _known: dict[object, Any] = field(default_factory=dict[object, Any], init=False, repr=False, compare=False)
+
+    def sums(self, method: Method, selection: Selection, records: Sequence[ClipRecord] | None = None) -> Bootstrap:
+        """A method's sums for some frames and pixels; of some of its records, or of all."""
+        if records is not None and tuple(record.key for record in records) != method.keys:
+            return bootstrap(records, selection, classes=len(self.of.note.classes), seed=self.seed)
+        at = (method.name, selection)
+        if at not in self._known:
+            self._known[at] = bootstrap(method.records, selection, seed=self.seed, counts=self._counts(method))
+        return self._known[at]
+
+    def by_clip(self, method: Method, region: Region, name: FigureName) -> Array:
+        """A figure of each clip of a method, [n], in frames 2 to the last."""
+        return clip_sums(method.records, Selection(region=region), counts=self._counts(method)).figure(name)
+
+    def _counts(self, method: Method) -> ClassCounts:
+        if method.name not in self._known:
+            self._known[method.name] = class_counts(method.records, len(self.of.note.classes))
+        return self._known[method.name]
 
 
 _SAME_CHANGE = 0.01  # degrees and metres

@@ -1,7 +1,7 @@
 """Records as sums that add up, the figures that are functions of them, and how sure those are.
 
 Every figure of some clips is a function of sums over them, so any grouping or weighting of clips is one product.
-Intervals and errors are the bootstrap over scenes, Efron 1979: scenes are drawn, not clips, as clips of one scene are
+Intervals are the bootstrap over scenes, Efron 1979: scenes are drawn, not clips, as clips of one scene are
 alike; the same seed draws the same scenes of every method, so that differences are paired.
 """
 
@@ -151,21 +151,21 @@ class Sums:
     def figure(self, name: FigureName, weights: Array | None = None) -> Array:
         """One figure of each row, or of the rows as often as each weighting [..., n] says; NaN for nothing."""
         if name in ("accuracy", "miou"):
-            grid = weighted(self.grid, weights)
+            grid = _weighted(self.grid, weights)
             right, true = grid[..., 0, :].sum(-1), grid[..., 2, :].sum(-1)
             return _divided(right, true) if name == "accuracy" else _nanmean(class_iou(grid))
         if name in ("miou_full", "miou_common"):
-            iou = class_iou(weighted(self.full, weights))
+            iou = class_iou(_weighted(self.full, weights))
             return _nanmean(iou[..., list(self.common)] if name == "miou_common" else iou)
         kept = self.means[:, _MEANS.index(name)] if name in _MEANS else self.ratios[:, _RATIOS.index(name)]
-        part = weighted(kept, weights)
+        part = _weighted(kept, weights)
         return _divided(part[..., 0], part[..., 1])
 
     def grouped(self, groups: Sequence[str]) -> "Sums":
         """Sums of rows by group, in the order of each group's first row."""
         order = list(dict.fromkeys(groups))
         weights = np.array([[float(group == each) for group in groups] for each in order])
-        sums = {name: weighted(getattr(self, name), weights) for name in ("means", "ratios", "grid", "full")}
+        sums = {name: _weighted(getattr(self, name), weights) for name in ("means", "ratios", "grid", "full")}
         return replace(self, **sums)
 
 
@@ -230,7 +230,7 @@ def _array(values: Sequence[Frames] | Frames) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def weighted(sums: Array, weights: Array | None) -> Array:
+def _weighted(sums: Array, weights: Array | None) -> Array:
     return sums if weights is None else np.tensordot(weights, sums, axes=1)
 
 
@@ -284,10 +284,6 @@ class Bootstrap:
         """One figure with its bounds."""
         return _interval(self.value(name), lambda: self.again(name))
 
-    def error(self, name: FigureName) -> float:
-        """Standard error of a figure; NaN where fewer than two scenes have it."""
-        return float(deviation(self.again(name)) * unbiased(self.scenes.figure(name)))
-
     @property
     def weights(self) -> Array | None:
         """How often each scene is drawn, [DRAWS, n]; None for a single scene."""
@@ -319,15 +315,6 @@ def difference(first: Bootstrap, other: Bootstrap, name: FigureName) -> Interval
     return _interval(first.value(name) - other.value(name), lambda: first.again(name) - other.again(name))
 
 
-def lead(first: Bootstrap, other: Bootstrap, name: FigureName) -> tuple[float, float]:
-    """How far `first` lies above `other`, and the paired standard error of that."""
-    ahead = first.value(name) - other.value(name)
-    if len(first.scenes) != len(other.scenes):
-        return ahead, float("nan")
-    by_scene = first.scenes.figure(name) - other.scenes.figure(name)
-    return ahead, float(deviation(first.again(name) - other.again(name)) * unbiased(by_scene))
-
-
 def common_clips(
     first: Sequence[ClipRecord], other: Sequence[ClipRecord]
 ) -> tuple[tuple[ClipRecord, ...], tuple[ClipRecord, ...]]:
@@ -345,15 +332,3 @@ def _interval(value: float, again: Callable[[], Array]) -> Interval:
         return Interval(value=value, low=float("nan"), high=float("nan"))
     low, high = np.quantile(known, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
     return Interval(value=value, low=float(low), high=float(high))
-
-
-def unbiased(by_scene: Array) -> Array:
-    """What a bootstrap's standard error is short of, by how many scenes, the first axis, have the figure; NaN: one."""
-    known = np.count_nonzero(~np.isnan(by_scene), axis=0)
-    return np.where(known > 1, np.sqrt(known / np.maximum(known - 1, 1)), np.nan)
-
-
-def deviation(drawn: Array) -> Array:
-    """Standard deviation over draws, the first axis, of what is not NaN; NaN if all is."""
-    mean = _nanmean(drawn.T)
-    return np.sqrt(_nanmean(((drawn - mean) ** 2).T))

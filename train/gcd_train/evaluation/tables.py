@@ -2,12 +2,12 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product, zip_longest
 from math import isnan, nan
 from statistics import fmean
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -20,22 +20,17 @@ from gcd_train.evaluation.paper import (
     row_label,
     tables_for,
 )
-from gcd_train.evaluation.runs import EvaluatedSet, Method
+from gcd_train.evaluation.runs import EvaluatedSet, Measured, Method
 from gcd_train.evaluation.statistics import (
     FIGURE_NAMES,
     FIRST_MEASURED,
-    Array,
-    Bootstrap,
-    ClassCounts,
     FigureName,
     Interval,
     Selection,
     Span,
-    bootstrap,
-    class_counts,
-    clip_sums,
+    class_iou,
 )
-from gcd_train.evaluation.store import REGIONS, ClipRecord, Region
+from gcd_train.evaluation.store import REGIONS, Region
 
 NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
 _LINE = "———"
@@ -84,7 +79,7 @@ class Cell:
 class Row:
     """label: of the row. method: whose figures these are, empty for none. clips: how many it was measured on."""
 
-    label: str
+    label: str = ""
     method: str = ""
     clips: str = ""
     cells: tuple[Cell, ...]
@@ -150,37 +145,6 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Measured:
-    """A set of clips with the sums of its methods, each worked out once.
-
-    seed: of the bootstrap. rows: method to the row of the paper's tables that a user says it belongs in.
-    """
-
-    of: EvaluatedSet
-    seed: int = 0
-    rows: Mapping[str, str] = field(default_factory=dict[str, str])
-    _known: dict[object, Any] = field(default_factory=dict[object, Any], init=False, repr=False, compare=False)
-
-    def sums(self, method: Method, selection: Selection, records: Sequence[ClipRecord] | None = None) -> Bootstrap:
-        """A method's sums for some frames and pixels; of some of its records, or of all."""
-        if records is not None and tuple(record.key for record in records) != method.keys:
-            return bootstrap(records, selection, classes=len(self.of.note.classes), seed=self.seed)
-        at = (method.name, selection)
-        if at not in self._known:
-            self._known[at] = bootstrap(method.records, selection, seed=self.seed, counts=self._counts(method))
-        return self._known[at]
-
-    def by_clip(self, method: Method, region: Region, name: FigureName) -> Array:
-        """A figure of each clip of a method, [n], in frames 2 to the last."""
-        return clip_sums(method.records, Selection(region=region), counts=self._counts(method)).figure(name)
-
-    def _counts(self, method: Method) -> ClassCounts:
-        if method.name not in self._known:
-            self._known[method.name] = class_counts(method.records, len(self.of.note.classes))
-        return self._known[method.name]
-
-
 def frames_told(of: EvaluatedSet, frames: Span) -> str:
     """Which frames a table is over, in words."""
     return {"2-last": f"frames 2-{of.note.frames}", "last": "last frame", "all": f"all {of.note.frames} frames"}[frames]
@@ -216,6 +180,26 @@ def region_table(measured: Measured, frames: Span = "2-last") -> Table:
     }
     extra = tuple(note for figure, note in notes.items() if figure in figures)
     return _own_table(measured, columns, frames, "regions", title, extra)
+
+
+def class_table(measured: Measured, frames: Span = "2-last") -> Table:
+    """Intersection over union of each class at picture size; what occurs nowhere is left out."""
+    of, methods = measured.of, [method for method in measured.of.methods if method.makes_classes]
+    iou = [class_iou(measured.sums(each, Selection(frames=frames)).scenes.full.sum(axis=0)) for each in methods]
+    there = [place for place in range(len(of.note.classes)) if any(np.isfinite(each[place]) for each in iou)]
+    rows = tuple(
+        Row(
+            method=method.starred,
+            clips=f"{len(method.records)} of {len(of.keys)}",
+            cells=tuple(
+                Cell(figure=Interval(value=float(each[place]), low=nan, high=nan), starred=method.copies_classes)
+                for place in there
+            ),
+        )
+        for method, each in zip(methods, iou, strict=True)
+    )
+    names = tuple(of.note.classes[place] for place in there)
+    return Table(name="classes", title=f"IoU of each class: {frames_told(of, frames)}", headings=names, rows=rows)
 
 
 def _own_table(
