@@ -224,7 +224,7 @@ def base_of_recipe(here: Path, plant: Plant) -> list[str]:
 
 @text_door("toml")
 def distillation(here: Path, plant: Plant) -> list[str]:
-    return ["gcd-train", "distill", plant("student.toml"), "--data", "data", "--valid", "valid", "--out", "out"]
+    return ["gcd-train", "train", plant("student.toml"), "--data", "data", "--valid", "valid", "--out", "out"]
 
 
 @text_door("json")

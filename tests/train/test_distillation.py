@@ -15,6 +15,7 @@ from gcd_model.networks import Networks, random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_weights, read_adapter, save_weights
+from gcd_train.data.batches import SampleBatches
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
 from gcd_train.errors import Interrupted, RecipeError
@@ -22,7 +23,6 @@ from gcd_train.recipe import OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
 from gcd_train.recipe_files import checked_recipe
 from gcd_train.stop import StopSignal
-from gcd_train.training.batches import PixelBatches
 from gcd_train.training.distill import (
     Distiller,
     SampleLoss,
@@ -105,7 +105,9 @@ def batch(networks: Networks) -> Batch:
     recipe = UNetRecipe(
         budget=Budget(updates=1), optimiser=OptimiserRecipe(rate=1.0), source="pixels", dropout=0.0, augmentation=0.0
     )
-    return PixelBatches(TinyClips(1), networks, recipe, CPU).batch([0], Draws(1, "batch", 0, CPU.device))
+    return SampleBatches(TinyClips(1), networks, recipe, FAMILIES["driving"], CPU).whole_clips(
+        Draws(1, "batch", 0, CPU.device), 1
+    )
 
 
 def test_the_student_samples_in_training_as_the_synthesizer_does(networks: Networks, batch: Batch) -> None:

@@ -1,4 +1,4 @@
-"""A whole drive through the grown driving world: the rig, and what holds at every time step, before it is drawn."""
+"""A whole drive through the driving world: the rig, and what holds at every time step, before it is drawn."""
 
 from functools import cache
 
@@ -15,9 +15,9 @@ from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.flow import Crowd, RoadUser, random_drive
 from gcd_train.scenes.driving.roads import random_street
 from gcd_train.scenes.driving.roadside import Place, Plot
-from gcd_train.scenes.driving.vehicles import Lamps, grown_bus
+from gcd_train.scenes.driving.vehicles import Lamps, random_bus
 from gcd_train.scenes.driving.weather import WEATHERS, random_weather
-from gcd_train.scenes.driving.world import grown_world
+from gcd_train.scenes.driving.world import random_world
 from gcd_train.scenes.renderer import Renderer
 
 SEEDS = (1, 6, 11)
@@ -39,7 +39,7 @@ def drive(seed: int) -> Scene:
 
 @cache
 def road_users(seed: int) -> list[RoadUser]:
-    return grown_world(seed, FRAMES)[1]
+    return random_world(seed, FRAMES)[1]
 
 
 def test_the_rig_has_the_cameras_and_the_two_poses_of_the_paper() -> None:
@@ -134,7 +134,7 @@ def test_no_vehicle_drives_through_a_camera() -> None:
     random = np.random.default_rng(3)
     street = random_street(random)
     way = random_drive(street, 5, random)
-    bus = grown_bus(random, Lamps(), near=False)
+    bus = random_bus(random, Lamps(), near=False)
     rows = np.array([[t, 100.0, 0.0, 0.0] for t in range(5)], np.float32)
     for height, kept in ((2.0, False), (6.0, True)):
         cameras = np.tile([4.0, 100.0, height], (5, 1, 1))

@@ -22,7 +22,7 @@ FORM = PairForm(width=48, height=32, frames=3, oversample=1)
 
 
 def world(path: CameraWay, mount: WorldOptions | None = None) -> World:
-    return driving_world(FORM, mount or WorldOptions(), 1, path)
+    return driving_world(FORM, mount or WorldOptions(), path)
 
 
 def folder(place: Path, path: CameraWay, first_seed: int = 0) -> Path:

@@ -109,7 +109,7 @@ def test_the_seed_decides_all_of_a_clip(tmp_path: Path) -> None:
 @needs_egl
 def test_most_of_the_targets_pixels_are_explained(tmp_path: Path) -> None:
     """Where a pixel counts as seen now, the source shows nearly its colour there."""
-    generate_live(tmp_path, "driving-first", range(2), ClipSettings(width=64, height=32, path="paper"))
+    generate_live(tmp_path, "driving", range(2), ClipSettings(width=64, height=32, path="paper"))
     for path in clip_paths(tmp_path):
         first = read_clip(path, slice(0, 1))  # the paper's path begins at the source
         assert (first.arrays["target.visibility"] == 2).all()

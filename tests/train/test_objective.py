@@ -9,11 +9,12 @@ from tiny_world import FRAMES, TinyClips, tiny_recipe
 from torch import Tensor
 from torch.testing import assert_close
 
+from gcd_model import FAMILIES
 from gcd_model.diffusion import preconditioning
 from gcd_model.networks import Networks, random_networks
+from gcd_train.data.batches import SampleBatches
 from gcd_train.data.sample import to_network
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
-from gcd_train.training.batches import PixelBatches
 from gcd_train.training.draws import Draws
 from gcd_train.training.objective import Batch, Denoiser, diffusion_loss, draw_noise, draw_sigma, drop_streams
 from gcd_train.training.setup import Precision, model_config
@@ -133,8 +134,8 @@ def pixel_batch(augmentation: float, dropout: float = 0.0) -> tuple[Batch, Netwo
         recipe, image_share=0.0, loss=LossRecipe(), augmentation=augmentation, dropout=dropout
     )
     source = to_network(TinyClips(1).rgb(0)[0])
-    batches = PixelBatches(TinyClips(1), networks, changed, PRECISION)
-    return batches.batch([0], draws()), networks, source
+    batches = SampleBatches(TinyClips(1), networks, changed, FAMILIES["driving"], PRECISION)
+    return batches.whole_clips(draws(), 1), networks, source
 
 
 def test_augmentation_noise_is_added_to_the_pixels_the_encoder_sees() -> None:

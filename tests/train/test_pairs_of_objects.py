@@ -139,7 +139,7 @@ def test_paths_keep_within_the_bounds_and_differ_between_worlds() -> None:
 
 
 def test_the_world_told_is_the_world_read(tmp_path: Path) -> None:
-    for number, world in enumerate((ORBITS, driving_world(TINY, WorldOptions(), 2))):
+    for number, world in enumerate((ORBITS, driving_world(TINY, WorldOptions()))):
         (tmp_path / str(number)).mkdir()
         agree(tmp_path / str(number), world)
         assert read_world(tmp_path / str(number)) == world
@@ -217,7 +217,7 @@ def test_what_wraps_clips_tells_of_the_same_path(folder: Path) -> None:
 
 @needs_egl
 def test_painted_clips_show_classes_where_others_show_colours(tmp_path: Path) -> None:
-    clips = PairedClips.open(written(tmp_path, driving_world(TINY, WorldOptions(), 1), range(1)))
+    clips = PairedClips.open(written(tmp_path, driving_world(TINY, WorldOptions()), range(1)))
     painted = PaintedClips(clips)
     colours = np.array([kind.colour for kind in DRIVING_CLASSES], np.uint8)
     np.testing.assert_array_equal(painted.rgb(0)[0], clips.rgb(0)[0])
@@ -293,12 +293,12 @@ def test_the_command_makes_pairs_and_a_contact_sheet(tmp_path: Path, monkeypatch
 
 
 def test_a_folder_of_another_edition_has_another_origin(tmp_path: Path) -> None:
-    agree(tmp_path, driving_world(PairForm(), WorldOptions(), 1))
+    agree(tmp_path, driving_world(PairForm(), WorldOptions()))
     world = read_world(tmp_path)
-    assert world == driving_world(PairForm(), WorldOptions(), 1)
+    assert world == driving_world(PairForm(), WorldOptions())
     clips = PairedClips((world,), ((tmp_path, "00000000"),))
     assert (clips.camera, clips.mount, clips.scene(0)) == ("none", CameraMount(), ("driving", 0))
-    grown = PairedClips((driving_world(PairForm(), WorldOptions(), 2),), clips.places)
+    grown = PairedClips((msgspec.structs.replace(world, edition=world.edition + 1),), clips.places)
     assert grown.origin != clips.origin
 
 

@@ -17,15 +17,16 @@ from gcd_model.conditioning import micro_conditioning, spherical_features
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.networks import random_networks
+from gcd_train.data.batches import EncodedBatches, SampleBatches
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
+from gcd_train.data.loader import LoadedBatch
 from gcd_train.data.open import DataPlaces, RunData, open_data
-from gcd_train.data.sample import ClipSource, PaintedClips, SomeClips, to_network
+from gcd_train.data.sample import ClipSource, PaintedClips, SomeClips, collate, to_network
 from gcd_train.errors import DataError, Interrupted
 from gcd_train.recipe import ClassWeightsName, NoiseRecipe, Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
 from gcd_train.stop import StopSignal
-from gcd_train.training.batches import EncodedBatches, PixelBatches
 from gcd_train.training.conditioner import Conditioner, mirrored_path
 from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
@@ -268,9 +269,9 @@ def test_batches_from_pixels_are_told_of_orbits_the_same(orbit_run: Path) -> Non
     recipe = orbit_recipe()
     unet = msgspec.structs.replace(recipe.unet, image_share=0.0)
     networks = random_networks(model_config(recipe.model), seed=5)
-    batch = PixelBatches(TinyOrbits(), networks, unet, PRECISION, FAMILIES["kubric90"]).batch(
-        [0, 1], Draws(1, "test", 0, CPU)
-    )
+    batches = SampleBatches(TinyOrbits(), networks, unet, FAMILIES["kubric90"], PRECISION)
+    loaded = LoadedBatch(collate([TinyOrbits().sample(number) for number in (0, 1)]), (0, 1), 0.0)
+    batch = batches.batch(loaded, Draws(1, "test", 0, CPU))
     encoded_rows = LatentClips.open(orbit_run / "latents").rows(
         torch.tensor([0, 1]).repeat_interleave(FRAMES),
         torch.arange(FRAMES).repeat(2),

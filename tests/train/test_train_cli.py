@@ -9,7 +9,7 @@ import torch
 import typer
 from typer.testing import CliRunner
 
-from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.common import errors_shown
 from gcd_train.cli.main import COMMANDS, app
 from gcd_train.errors import RunError
 

@@ -46,7 +46,7 @@ def test_the_recipes_that_ship_are_listed_and_one_is_shown_whole() -> None:
         assert text in shown.output
 
 
-def test_a_distillation_is_listed_and_shown_whole_and_train_refuses_it(tmp_path: Path) -> None:
+def test_a_distillation_is_listed_and_shown_whole_and_train_takes_it(tmp_path: Path) -> None:
     assert "package:distill-kubric" in CliRunner().invoke(app, ["recipes"]).output
     shown = CliRunner().invoke(app, ["recipes", "package:distill-kubric", "--set=student.steps=7"])
     assert shown.exit_code == 0, shown.output
@@ -54,7 +54,7 @@ def test_a_distillation_is_listed_and_shown_whole_and_train_refuses_it(tmp_path:
     folders = [f"--{name}={tmp_path}" for name in ("data", "out")]
     refused = CliRunner().invoke(app, ["train", "package:distill-kubric", *folders])
     assert refused.exit_code == 78
-    assert "gcd-train distill" in refused.output
+    assert "kubric_gradual_max90.ckpt" in refused.output
 
 
 def test_train_takes_the_small_scale_and_changes(tmp_path: Path) -> None:

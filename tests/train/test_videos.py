@@ -17,7 +17,7 @@ from gcd_train.data.files import FileFault
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.videos import CAMERA_FILE, FilmedPairs, filmed_scenes
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.recipe import DataRecipe
+from gcd_train.recipe_data import DataRecipe
 
 WIDTH, HEIGHT, FPS, FRAMES, CLIP = 64, 48, 20, 16, 4
 LEFT, RIGHT = "left.mp4", "right.mp4"

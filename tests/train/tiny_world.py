@@ -90,9 +90,15 @@ class TinyClips(ClipSource):
     def sample(self, number: int, /) -> Sample:
         source, target = self.rgb(number)
         path, frames = self.trajectory(number), tuple(range(FRAMES))
-        poses = path.source_from_target.numpy()
         return Sample(
-            source=source, target=target, source_from_target=poses, fps=self.fps, scene="tiny", frame_numbers=frames
+            source=source,
+            target=target,
+            source_from_target=path.source_from_target.numpy(),
+            start=path.source,
+            deltas=None if path.delta is None else path.delta.numpy(),
+            fps=self.fps,
+            scene="tiny",
+            frame_numbers=frames,
         )
 
     def rgb(self, number: int, /) -> tuple[np.ndarray, np.ndarray]:

@@ -181,7 +181,7 @@ def checked_recipe(table: Table, place: str, kind: type[Kind], changes: Sequence
 
 def _recipe(read: MergedTable, *, small: bool, changes: Sequence[str]) -> Recipe:
     if TEACHER in read.table:
-        raise RecipeError(f"{read.place} has a [{TEACHER}]: it is a distillation, for `gcd-train distill`")
+        raise RecipeError(f"{read.place} has a [{TEACHER}]: it is a distillation, and no recipe of a training")
     require_known(read.table, _KEYS, read.place)
     own = {key: value for key, value in read.table.items() if key not in (SMALL, WITHOUT)}
     if not small:

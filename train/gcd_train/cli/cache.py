@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 from rich.console import Console
 from typer import Argument, Option
 
-from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.common import errors_shown
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:

@@ -9,9 +9,7 @@ import typer
 from typer import Option
 
 from gcd_model import Quality, SolverName
-from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar, say, stop_as_by_ctrl_c
-from gcd_train.cli.training_run import command_line
+from gcd_train.cli.common import command_line, errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings

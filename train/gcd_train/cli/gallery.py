@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from gcd_model.errors import NonFiniteError
-from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar, say
+from gcd_train.cli.common import errors_shown, progress_bar, say
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:

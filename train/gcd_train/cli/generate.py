@@ -9,8 +9,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.progress_bar import progress_bar, say, stop_as_by_ctrl_c
+from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError
 from gcd_train.layouts.scene_writer import SceneFormat, SceneRun, generate_scenes, write_scene_sheet
 from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
@@ -99,7 +98,6 @@ def driving(
     width: Width = None,
     height: Height = None,
     clips_per_shard: ClipsPerShard = 8,
-    edition: Annotated[int, typer.Option(min=1, max=2, help="Pairs: 1, or 2 for the streets of whole scenes.")] = 1,
     path: Annotated[CameraWay, typer.Option(help="Pairs: the target camera moves all the clip, or stands there.")] = (
         "gradual"
     ),
@@ -114,10 +112,10 @@ def driving(
     with errors_shown():
         place = _one_folder(folder, out)
         mount = WorldOptions(height_m=mount_height, tilt_deg=mount_tilt)
-        told = pairs or mount != WorldOptions() or edition != 1 or path != "gradual"
+        told = pairs or mount != WorldOptions() or path != "gradual"
         if _wants_pairs(told, clips, scenes, compact):
             form = _pair_form(width, height, frames, oversample, clips_per_shard)
-            world = driving_world(form, mount, edition, path)
+            world = driving_world(form, mount, path)
             _make_pairs(place, world, world.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
             return
         drive = SCENE_WORLDS["driving"]
@@ -159,7 +157,7 @@ def _wants_pairs(pairs: bool, clips: int | None, scenes: int | None, compact: bo
     wanted = pairs or clips is not None
     if wanted and (scenes is not None or compact):
         raise RecipeError(
-            "--scenes and --compact make whole scenes; --clips, --pairs, a mount, an edition and a path pairs; give one"
+            "--scenes and --compact make whole scenes; --clips, --pairs, a mount and a path pairs; give one"
         )
     return wanted
 

@@ -7,24 +7,19 @@ from importlib import import_module
 import typer
 
 COMMANDS = {
-    "bench": ("bench:app", "Measure on this machine."),
     "cache": ("cache:cache", "Encode a driving set once, so that training never runs the frozen encoders again."),
     "calibrate": (
         "calibrate:calibrate_command",
         "Measure how often the truth lies within the intervals of the samples, and the scale that makes it as meant.",
     ),
-    "data": ("data:app", "Downloaded data sets: repacking."),
-    "distill": (
-        "distill:distill",
-        "Teach a student to do in a few steps what its teacher does in many, or go on where that stopped.",
-    ),
+    "data": ("data:data", "Downloaded data sets: repacking."),
     "evaluate": (
         "evaluate:evaluate_command",
         "Measure weights, baselines and others' frames on held-out clips, and say what is reached.",
     ),
-    "export": ("lerobot:app", "Write data in other programs' formats."),
+    "export": ("data:export", "Write data in other programs' formats."),
     "families": (
-        "families:families_command",
+        "weights:families_command",
         "List the model families: how each was trained, and what a finetuned checkpoint will accept.",
     ),
     "gallery": (
@@ -33,10 +28,10 @@ COMMANDS = {
     ),
     "generate": ("generate:app", "Make training data with a procedural world (extra `scenes`)."),
     "lerobot": (
-        "lerobot:lerobot_command",
+        "data:lerobot_command",
         "Read pairs of cameras of a LeRobot data set as training would, and say what was left out.",
     ),
-    "lora": ("lora:app", "Adapters that a run with model.train = lora writes, and their bases."),
+    "lora": ("weights:lora", "Adapters that a run with model.train = lora writes, and their bases."),
     "recipes": ("train:recipes", "List the recipes that ship, or show one whole: on its bases, with every default."),
     "report": (
         "report:report_command",
@@ -48,7 +43,7 @@ COMMANDS = {
         "Train a model on clips, or go on where a run stopped. Ctrl-C stops after the update and saves.",
     ),
     "verify": (
-        "verify:verify_command",
+        "data:verify_command",
         "Compare every file of generated scenes with its SHA-256; exit code 66 and the files' names if one differs.",
     ),
 }

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.training_run import command_line
+from gcd_train.cli.common import command_line, errors_shown
 from gcd_train.errors import RecipeError
 
 

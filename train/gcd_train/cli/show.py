@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from typer import Argument, Option
 
-from gcd_train.cli.errors import errors_shown
+from gcd_train.cli.common import errors_shown
 from gcd_train.errors import RunError
 
 if TYPE_CHECKING:

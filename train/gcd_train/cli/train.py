@@ -1,33 +1,26 @@
-"""`gcd-train train`: from clips to a weight file, stage by stage; `gcd-train recipes`: what there is to train."""
+"""`gcd-train train`: from a recipe and data to a weight file; `gcd-train recipes`: what there is to train."""
 
 import logging
+import os
+import signal
+import threading
 import warnings
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias, get_args
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar, get_args
 
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
-from typer import Argument, Option
+from typer import Argument, BadParameter, Option
 
-from gcd_train.cli.errors import errors_shown
-from gcd_train.cli.training_run import (
-    Changes,
-    Data,
-    Latents,
-    Out,
-    Threads,
-    Valid,
-    command_line,
-    prepare_process,
-    stage_named,
-    stop_when_asked,
-)
+from gcd_train.cli.common import command_line, errors_shown
 from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
 from gcd_train.recipe import Recipe
-from gcd_train.recipe_data import Budget, ComputeRecipe, StageName
+from gcd_train.recipe_data import Budget, ComputeRecipe, DistillStageName, StageName
 from gcd_train.recipe_files import TEACHER, load_recipe, packaged_recipes, read_merged, to_toml
 from gcd_train.training.distill_recipe import DistillRecipe, load_distillation, packaged_distillations
 
@@ -35,13 +28,31 @@ if TYPE_CHECKING:
     from gcd_train.data.open import DataPlaces
     from gcd_train.training.distributed import Processes
 
+Name = TypeVar("Name", bound=str)
+
 RecipeFile: TypeAlias = Annotated[
     str, Argument(metavar="RECIPE", help="A TOML file, or package:NAME for one that ships (`gcd-train recipes`).")
 ]
 Shown: TypeAlias = Annotated[
     str | None, Argument(metavar="[RECIPE]", help="Show this one whole, with its bases and every default.")
 ]
-Stage: TypeAlias = Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(StageName))}.")]
+Data: TypeAlias = Annotated[Path, Option(help="What to learn from: the recipe's data.kind says what lies there.")]
+Valid: TypeAlias = Annotated[
+    Path | None, Option(help="Held-out data of the same kind to measure on; left out, a part of --data (data.split).")
+]
+Out: TypeAlias = Annotated[Path, Option(help="Folder of the run; run again to go on.")]
+Latents: TypeAlias = Annotated[
+    Path | None, Option(help="Folder for encoded clips, shared by runs of one autoencoder; else in --out.")
+]
+Threads: TypeAlias = Annotated[int | None, Option(min=1, help="CPU threads; else torch's own choice.")]
+Changes: TypeAlias = Annotated[
+    list[str] | None,
+    Option("--set", metavar="KEY=VALUE", help="Change the recipe: log.save_s=60, for one; may be repeated."),
+]
+Stage: TypeAlias = Annotated[
+    str | None,
+    Option(help=f"Only this one: {', '.join(dict.fromkeys((*get_args(StageName), *get_args(DistillStageName))))}."),
+]
 Small: TypeAlias = Annotated[
     bool, Option("--small", help="Model, size, batch and budget of the recipe's table `small`, for a CPU.")
 ]
@@ -59,17 +70,47 @@ def train(
     changes: Changes = None,
 ) -> None:
     """Train a model on clips, or go on where a run stopped. Ctrl-C stops after the update and saves."""
-    # projected embeddings are views of what their layer made; nobody writes into them
-    warnings.filterwarnings("ignore", message="FSDP2-wrapped module")
-    prepare_process(threads)
+    # remarks on views that nobody writes into, and on the speed of the decoder's last layer
+    warnings.filterwarnings("ignore", message="FSDP2-wrapped module|grad and param do not obey the gradient layout")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    if threads is not None:
+        import torch
+
+        torch.set_num_threads(threads)
     from gcd_train.data.open import DataPlaces
 
     with errors_shown():
         if is_live(recipe):
             _train_live(recipe, data, valid, out)
             return
+        places = DataPlaces(data=data, valid=valid)
+        if TEACHER in read_merged(recipe).table:
+            if small:
+                raise RecipeError(f"{recipe} is a distillation, which has no table `small`; leave out --small")
+            student = load_distillation(recipe, changes or ())
+            _distill(student, places, out, latents, _stage_named(stage, get_args(DistillStageName)))
+            return
         loaded = load_recipe(recipe, small=small, changes=changes or ())
-        _in_processes(loaded, DataPlaces(data=data, valid=valid), out, latents, stage_named(stage, get_args(StageName)))
+        _in_processes(loaded, places, out, latents, _stage_named(stage, get_args(StageName)))
+
+
+def _stop_when_asked() -> threading.Event:
+    """Set by Ctrl-C and by SIGTERM from now on; the run then stops after its update and saves."""
+    stop = threading.Event()
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGINT, ask)
+    signal.signal(signal.SIGTERM, ask)
+    return stop
+
+
+def _stage_named(name: str | None, known: Sequence[Name]) -> Name | None:
+    """The stage with this name, None for all of them. Raises BadParameter if there is none."""
+    if name is not None and name not in known:
+        raise BadParameter(f"no stage is called {name!r}; there are {', '.join(known)}")
+    return next((each for each in known if each == name), None)
 
 
 def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
@@ -84,7 +125,7 @@ def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
         if not processes.first:
             logging.getLogger().setLevel(logging.WARNING)
         with RunFolder(out).begun(loaded, command_line()) if processes.first else nullcontext():
-            train_live(loaded, places, stop_when_asked(), processes)
+            train_live(loaded, places, _stop_when_asked(), processes)
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:
@@ -142,6 +183,26 @@ def _length(budget: Budget) -> str:
     return f"{budget.updates}" if budget.updates is not None else f"{budget.minutes:g} min"
 
 
+def _distill(
+    recipe: DistillRecipe, places: "DataPlaces", out: Path, latents: Path | None, stage: DistillStageName | None
+) -> None:
+    from gcd_train.data.open import open_data
+    from gcd_train.training.distill import Distiller, as_training, teacher_of
+    from gcd_train.training.monitor import RunFolder, TensorBoard
+    from gcd_train.training.run import RunInputs
+
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise RecipeError("a distillation is the work of one process; start it without torchrun")
+    stop, teacher = _stop_when_asked(), teacher_of(recipe)
+    training = as_training(recipe, teacher)
+    folder = RunFolder(out, TensorBoard(out / "tensorboard") if recipe.log.tensorboard else None)
+    data = open_data(training, teacher.config, teacher.family, places)
+    inputs = RunInputs(recipe=training, data=data, folder=folder, stop=stop, latents=latents)
+    distiller = Distiller(inputs, recipe, teacher)
+    with folder.begun(recipe, command_line()):
+        distiller.run(stage)
+
+
 def _in_processes(
     recipe: Recipe, places: "DataPlaces", out: Path, latents: Path | None, stage: StageName | None
 ) -> None:
@@ -166,7 +227,7 @@ def _run(
     from gcd_train.training.run import RunInputs, Trainer
     from gcd_train.training.setup import family_of, model_config
 
-    stop = stop_when_asked()
+    stop = _stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
     data = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
     folder = RunFolder(out, board)

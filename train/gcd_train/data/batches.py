@@ -1,7 +1,7 @@
-"""Batches of the diffusion objective from samples of a data set or from a latent cache.
+"""Batches of the diffusion objective: from a run's own latents, from samples of a data set, or from a latent cache.
 
 Each clip has its own camera, rate and motion. From samples, the frozen networks run on every batch: with fresh
-augmentation noise, and targets drawn from their posterior. From a cache they never run.
+augmentation noise, and targets drawn from their posterior. From latents and a cache they never run.
 """
 
 import time
@@ -12,14 +12,15 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from gcd_model import Family
+from gcd_model import Family, ModelConfig
 from gcd_model.conditioning import micro_conditioning
 from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
+from gcd_train.data.latents import EncodedClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader
-from gcd_train.data.sample import Samples, to_network
+from gcd_train.data.sample import ClipSource, RepeatedClips, Samples, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.recipe_data import LoaderRecipe
@@ -31,7 +32,7 @@ from gcd_train.training.setup import Precision
 
 Made = TypeVar("Made")
 _AT_ONCE = 14  # frames; changes memory, not the result
-_WHOLE_CLIPS = "samples of a data set and a latent cache are whole clips; set image_share to 0"
+_WHOLE_CLIPS = 'unet.source "pixels" and a latent cache take whole clips only; set image_share to 0'
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -89,32 +90,86 @@ def _in_kept_precision(network: Callable[[Tensor], Made], frames: Tensor) -> Mad
     return network(frames.to(next(network.parameters()).dtype))
 
 
-class SampleBatches:
-    """A `BatchSource` of whole clips. Batch n, by `Draws.number`, always has the same samples.
+class EncodedBatches:
+    """Batches of what the latents stage wrote."""
 
-    samples: `ViewPairs`, `LeRobotPairs`. family: says what the network is told of a camera's way.
-    Raises RecipeError for single frames: those learn from pairs of clips.
-    """
+    def __init__(self, clips: EncodedClips, config: ModelConfig, recipe: UNetRecipe, precision: Precision) -> None:
+        self._clips, self._recipe, self._precision = clips, recipe, precision
+        self._conditioner = Conditioner(config, recipe, precision)
 
-    def __init__(
-        self,
-        samples: Samples,
-        networks: Networks,
-        recipe: UNetRecipe,
-        family: Family,
-        precision: Precision,
-        loader: LoaderRecipe,
-        seed: int,
-    ) -> None:
+    def single_frames(self, draws: Draws, count: int) -> Batch:
+        """See BatchSource."""
+        return self._batch(
+            draws, draws.below(self._clips.meta.clips, count), draws.below(self._clips.meta.frames, count), 1
+        )
+
+    def whole_clips(self, draws: Draws, count: int) -> Batch:
+        """See BatchSource."""
+        frames = self._clips.meta.frames
+        return self._batch(
+            draws, draws.below(self._clips.meta.clips, count), torch.arange(frames).repeat(count), frames
+        )
+
+    def _batch(self, draws: Draws, clips: Tensor, frames: Tensor, per_clip: int) -> Batch:
+        flip = draws.below(self._clips.meta.flips, clips.shape[0]).bool()
+        rows = self._clips.rows(
+            clips.repeat_interleave(per_clip), frames, flip.repeat_interleave(per_clip), self._precision.device
+        )
+        condition, _ = drop_streams(self.condition(rows), None, per_clip, draws, self._recipe)
+        return Batch(
+            target=self._precision.frames(rows.target),
+            condition=condition,
+            vector=self.vector(rows),
+            tokens=None,
+            emphasis=rows.emphasis,
+            frames=per_clip,
+            camera=rows.control,
+            ids=self._clips.names(clips),
+        )
+
+    def vector(self, rows: LatentRows) -> Tensor:
+        """Micro-conditioning of some frames, [N, V]."""
+        return self._conditioner.vector(rows.motion, rows.target.shape[0])
+
+    def condition(self, rows: LatentRows) -> Tensor:
+        """Condition channels [N, C', h, w] of some frames."""
+        return self._conditioner.channels(rows.source)
+
+
+class WholeClips:
+    """What has no single frames. Raises RecipeError for a recipe that wants some."""
+
+    def __init__(self, recipe: UNetRecipe) -> None:
         if recipe.image_share:
             raise RecipeError(_WHOLE_CLIPS)
-        self._networks, self._recipe, self._precision = networks, recipe, precision
-        self._conditioner = Conditioner(networks.config, recipe, precision, family)
-        self._loader = SampleLoader(samples, seed, loader)
+        self._recipe = recipe
 
     def single_frames(self, draws: Draws, count: int) -> Batch:
         """Not offered; refused when this was made."""
         raise RecipeError(_WHOLE_CLIPS)
+
+
+class SampleBatches(WholeClips):
+    """A `BatchSource` of whole clips. Batch n, by `Draws.number`, always has the same samples.
+
+    samples: `ViewPairs`, `LeRobotPairs`, or a set of clips. family: says what the network is told of a camera's way.
+    """
+
+    def __init__(
+        self,
+        samples: Samples | ClipSource,
+        networks: Networks,
+        recipe: UNetRecipe,
+        family: Family,
+        precision: Precision,
+        loader: LoaderRecipe = LoaderRecipe(),  # noqa: B008  it is frozen
+        seed: int = 0,
+    ) -> None:
+        super().__init__(recipe)
+        self._networks, self._precision = networks, precision
+        self._conditioner = Conditioner(networks.config, recipe, precision, family)
+        each = RepeatedClips(samples) if isinstance(samples, ClipSource) else samples
+        self._loader = SampleLoader(each, seed, loader)
 
     def whole_clips(self, draws: Draws, count: int) -> Batch:
         """See BatchSource. Raises DataError if samples cannot be read or do not fit the model."""
@@ -159,7 +214,7 @@ class SampleBatches:
         return micro_conditioning(fps, motion, recipe.augmentation, width)
 
 
-class CachedBatches:
+class CachedBatches(WholeClips):
     """A `BatchSource` of whole clips: noise copy of every frame, posterior sample and dropout drawn anew each time.
 
     The frame rate of a clip is its own, after the stride; the recipe's `fps` is not used.
@@ -174,18 +229,15 @@ class CachedBatches:
         precision: Precision,
         path: PathKind,
     ) -> None:
+        super().__init__(recipe)
         kept, given = cache.index.identity.encoders, encoders_digest(networks)
         if kept != given:
             raise RecipeError(
                 f"{cache.folder} was made with other encoders ({kept}) than the run's ({given}); give the same "
                 "model.weights, or make the cache anew"
             )
-        self._cache, self._config, self._recipe, self._precision = cache, networks.config, recipe, precision
+        self._cache, self._config, self._precision = cache, networks.config, precision
         self._path: PathKind = path
-
-    def single_frames(self, draws: Draws, count: int) -> Batch:
-        """Not offered; refused when this was made."""
-        raise RecipeError(_WHOLE_CLIPS)
 
     def whole_clips(self, draws: Draws, count: int) -> Batch:
         """See BatchSource."""

@@ -190,6 +190,20 @@ class ClipSource(ABC):
         return self._last[1]
 
 
+class RepeatedClips:
+    """A set of clips as samples: the same ones again after its length."""
+
+    def __init__(self, clips: ClipSource) -> None:
+        self._clips, self.skips = clips, Skips()
+
+    def __len__(self) -> int:
+        return len(self._clips)
+
+    def sample(self, index: int, /) -> Sample:
+        """The clip of a number. Raises DataError if it cannot be read."""
+        return self._clips.sample(index % len(self._clips))
+
+
 class SampleClips(ClipSource):
     """The first `count` samples of a set.
 

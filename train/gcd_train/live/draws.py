@@ -21,23 +21,23 @@ from gcd_train.scenes.worlds import scene_world
 
 Poses = NDArray[np.float64]
 Random = np.random.Generator
-LiveWorld = Literal["driving", "driving-first", "drop", "tabletop"]
+LiveWorld = Literal["driving", "drop", "tabletop"]
 TargetPath = Literal["mixed", "paper", "orbit60", "small"]
 """Which targets: the training's mixture, the paper's path over a road, orbits of 10 to 60 degrees, small moves."""
 
 FRAMES = 14
-CLIPS_PER_SCENE = {"driving": 1, "driving-first": 1, "drop": 3, "tabletop": 3}
+CLIPS_PER_SCENE = {"driving": 1, "drop": 3, "tabletop": 3}
 """A simulated scene is filmed several times, a drive once."""
-LIVE_SCENES: dict[LiveWorld, int] = {"driving": 1400, "driving-first": 560, "drop": 224, "tabletop": 280}
-"""What the packaged model learned from."""
+LIVE_SCENES: dict[LiveWorld, int] = {"driving": 1960, "drop": 224, "tabletop": 280}
+"""So many scenes are about as many clips as the packaged model learned from."""
 _WORLDS: dict[TargetPath, tuple[LiveWorld, ...]] = {
     "mixed": get_args(LiveWorld),
-    "paper": ("driving", "driving-first"),
+    "paper": ("driving",),
     "orbit60": ("drop", "tabletop"),
     "small": ("drop", "tabletop"),
 }
-METRES_A_UNIT = {"driving": 1.0, "driving-first": 1.0, "drop": 1.0, "tabletop": 0.1}
-FLOOR_Z_M = {"driving": 0.0, "driving-first": 0.0, "drop": 0.0, "tabletop": -0.12}
+METRES_A_UNIT = {"driving": 1.0, "drop": 1.0, "tabletop": 0.1}
+FLOOR_Z_M = {"driving": 0.0, "drop": 0.0, "tabletop": -0.12}
 """Height of the plane on which the world stands: the road, the floor, the table."""
 STAGE_HFOV_DEG = math.degrees(2 * math.atan(0.5))
 DRIVING_HFOV_DEG = 85.0
@@ -79,8 +79,8 @@ def live_scene(world: LiveWorld, seed: int, path: TargetPath) -> tuple[Scene, li
     if world not in worlds_of(path):
         raise RecipeError(f"{world} has no targets of the kind {path!r}; {', '.join(worlds_of(path))} have")
     salt = zlib.crc32(f"live {world} {path}".encode())
-    if world in ("driving", "driving-first"):
-        return _drive(world, seed, path, np.random.default_rng([seed, salt]))
+    if world == "driving":
+        return _drive(seed, path, np.random.default_rng([seed, salt]))
     published = scene_world(world)
     scene = published.make(seed, published.frames)
     draws = [
@@ -90,13 +90,12 @@ def live_scene(world: LiveWorld, seed: int, path: TargetPath) -> tuple[Scene, li
     return scene, draws
 
 
-def _drive(world: LiveWorld, seed: int, path: TargetPath, random: Random) -> tuple[Scene, list[LiveDraw]]:
+def _drive(seed: int, path: TargetPath, random: Random) -> tuple[Scene, list[LiveDraw]]:
     paper = path == "paper" or random.random() < 0.3
     mount = CameraMount() if paper else _random_mount(random)
     # the paper's path is gradual where it is measured; in training it also stands at its goal, which is the live view
     move_time = FRAMES - 1 if path == "paper" else int(random.choice([0, FRAMES - 1], p=[0.6, 0.4]))
-    edition = 1 if world == "driving-first" else 2
-    scene = driving_scene(seed, frames=FRAMES, mount=mount, edition=edition, move_time=move_time)
+    scene = driving_scene(seed, frames=FRAMES, mount=mount, move_time=move_time)
     source, target = scene.cameras["source"], scene.cameras["target"]
     target_hfov = mount.hfov_deg
     if not paper:

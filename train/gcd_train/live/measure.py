@@ -1,6 +1,6 @@
 """The live view measured beside splats by exact depth and homographies.
 
-    python -m gcd_train.live.measure --heldout DIR --training DIR --weights FILE --sets paper-first,orbit \
+    python -m gcd_train.live.measure --heldout DIR --training DIR --weights FILE --sets paper,orbit \
         --methods splat,live --out DIR
 
 Same clips, same run; writes report.md, report.json and a sheet of pictures for each set.

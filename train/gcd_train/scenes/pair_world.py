@@ -14,6 +14,7 @@ from gcd_model.geometry import CameraMount
 from gcd_model.small_files import read_json
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.files import write_whole
+from gcd_train.scenes.driving import EDITION as DRIVING_EDITION
 from gcd_train.scenes.driving import FPS as DRIVING_FPS
 from gcd_train.scenes.driving import HFOV_DEG as DRIVING_HFOV_DEG
 from gcd_train.scenes.worlds import SceneWorld
@@ -101,10 +102,10 @@ class PairForm:
     clips_per_shard: int = 8
 
 
-def driving_world(form: PairForm, mount: WorldOptions, edition: int = 1, path: CameraWay = "gradual") -> World:
+def driving_world(form: PairForm, mount: WorldOptions, path: CameraWay = "gradual") -> World:
     """Pairs of the forward camera and the path to the view from above.
 
-    mount: where the source camera really sits. edition: see `driving_scene`. path: how the target camera gets there.
+    mount: where the source camera really sits. path: how the target camera gets there.
     Raises: PoseError if that is no mount.
     """
     CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
@@ -118,7 +119,7 @@ def driving_world(form: PairForm, mount: WorldOptions, edition: int = 1, path: C
         oversample=form.oversample,
         clips_per_shard=form.clips_per_shard,
         options=mount,
-        edition=edition,
+        edition=DRIVING_EDITION,
         path=path,
     )
 

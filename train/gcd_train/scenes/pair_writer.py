@@ -157,7 +157,7 @@ def drawn_clips(renderer: Renderer, world: World, seeds: Sequence[int]) -> Itera
 
 def _fixed(renderer: Renderer, world: World, seed: int) -> DrawnClip:
     mount = CameraMount(height_m=world.options.height_m, tilt_deg=world.options.tilt_deg)
-    scene = driving_scene(seed, frames=world.frames, mount=mount, edition=world.edition, move_time=world.move_time)
+    scene = driving_scene(seed, frames=world.frames, mount=mount, move_time=world.move_time)
     return DrawnClip(
         seed=seed, facts=scene.facts, hfov_deg=scene.hfov_deg, cameras=scene.cameras, views=renderer.render(scene)
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gcd_train.errors import RecipeError
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.driving import ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
+from gcd_train.scenes.driving import EDITION, ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
 
 Layout = Literal["kubric4d", "parallel_domain4d"]
 
@@ -59,7 +59,7 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
     "driving": SceneWorld(
         name="driving",
         make=driving_drive,
-        edition=2,  # the first is that of the pairs
+        edition=EDITION,
         layout="parallel_domain4d",
         frames=parallel_domain4d.FRAMES,
         fps=parallel_domain4d.FPS,

@@ -14,6 +14,7 @@ from gcd_model import ModelConfig
 from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
+from gcd_train.data.batches import EncodedBatches, SampleBatches
 from gcd_train.data.latents import EncodedClips
 from gcd_train.data.latents_writer import Encodings, autoencoder_digest
 from gcd_train.data.open import RunData
@@ -22,7 +23,6 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
 from gcd_train.recipe_data import AnyStageName, Budget
 from gcd_train.stop import StopSignal
-from gcd_train.training.batches import EncodedBatches, PixelBatches
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.export import ExportJob, Validation, export
 from gcd_train.training.loop import Loop, LoopOptions, Task
@@ -233,7 +233,8 @@ class Trainer:
         data = self._inputs.data
         if data.batches is not None:
             return data.batches(networks, self._precision)
-        return PixelBatches(data.clips, networks, recipe, self._precision, self._family)
+        loader, seed = self._recipe.data.loader, self._recipe.seed
+        return SampleBatches(data.clips, networks, recipe, self._family, self._precision, loader, seed)
 
     def _weights(self, clips: EncodedClips | None) -> torch.Tensor | None:
         """Of latent channels, by what the decoder makes of them."""

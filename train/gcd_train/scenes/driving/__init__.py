@@ -2,9 +2,10 @@
 
 from gcd_train.scenes.driving.classes import ONTOLOGY, OntologyItem, class_ids
 from gcd_train.scenes.driving.flow import FPS
-from gcd_train.scenes.driving.world import HFOV_DEG, driving_drive, driving_scene, vehicle_from_camera
+from gcd_train.scenes.driving.world import EDITION, HFOV_DEG, driving_drive, driving_scene, vehicle_from_camera
 
 __all__ = [
+    "EDITION",
     "FPS",
     "HFOV_DEG",
     "ONTOLOGY",

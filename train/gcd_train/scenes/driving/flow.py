@@ -1,4 +1,4 @@
-"""Who moves through the streets of a grown driving world: no two footprints ever touch, at no time step.
+"""Who moves through the streets of the driving world: no two footprints ever touch, at no time step.
 
 Every road user is proposed by a simple rule and kept only if it keeps clear, over the whole drive, of all who were
 kept before.
@@ -133,7 +133,7 @@ class Crowd:
 
 def fill(crowd: Crowd, lamps: bool, random: np.random.Generator) -> None:
     """The ego first, then lanes, side roads, parked vehicles, cyclists and people."""
-    crowd.add(vehicles.grown_own_car(), crowd.drive.rows)
+    crowd.add(vehicles.own_car(), crowd.drive.rows)
     density = float(random.uniform(0.25, 1.1))
     for index in range(-crowd.street.main.lanes_left, crowd.street.main.lanes_right):
         _lane(crowd, index, density, lamps, random)
@@ -152,12 +152,12 @@ def fill(crowd: Crowd, lamps: bool, random: np.random.Generator) -> None:
 def _vehicle(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     draw = float(random.random())
     if draw < 0.08:
-        return vehicles.grown_truck(random, lamps, near)
+        return vehicles.random_truck(random, lamps, near)
     if draw < 0.13:
-        return vehicles.grown_bus(random, lamps, near)
+        return vehicles.random_bus(random, lamps, near)
     if draw < 0.17:
-        return vehicles.grown_motorcyclist(random, lamps)
-    return vehicles.grown_car(random, lamps, near)
+        return vehicles.random_motorcyclist(random, lamps)
+    return vehicles.random_car(random, lamps, near)
 
 
 def _lane(crowd: Crowd, index: int, density: float, lamps: bool, random: np.random.Generator) -> None:
@@ -209,7 +209,7 @@ def _parked(crowd: Crowd, road: Road, random: np.random.Generator) -> None:
         while strip > 0 and s < min(170.0, road.end_m):
             near = crowd.is_near(road.at(s)[:2])
             wide = random.random() < 0.05
-            made = vehicles.grown_truck(random, Lamps(), near) if wide else vehicles.grown_car(random, Lamps(), near)
+            made = vehicles.random_truck(random, Lamps(), near) if wide else vehicles.random_car(random, Lamps(), near)
             s += made.length + float(random.uniform(0.7, 1.5))
             middle = s - made.length / 2
             if random.random() < fullness and road.is_free(middle, 7.5 + made.length / 2):
@@ -240,7 +240,7 @@ def _cyclists(crowd: Crowd, random: np.random.Generator) -> None:
             covered = travelled(float(random.uniform(2.5, 6.0)), 0.0, frames)
             start = float(random.uniform(-15, 70))
             rows = _along(road, start - side * covered, side * (edge - 0.42), side > 0)
-            crowd.add(vehicles.grown_cyclist(random), rows)
+            crowd.add(vehicles.random_cyclist(random), rows)
 
 
 def _walkers(crowd: Crowd, random: np.random.Generator) -> None:
@@ -258,7 +258,7 @@ def _walkers(crowd: Crowd, random: np.random.Generator) -> None:
                 if all(road.is_free(float(at), 2.5) for at in (path[0], path[-1])):
                     rows = _along(road, path, lateral, way < 0)
                     rows[:, 2] = PAVEMENT_M
-                    crowd.add(vehicles.grown_person(random, not stands), rows)
+                    crowd.add(vehicles.random_person(random, not stands), rows)
 
 
 def _crossing_people(crowd: Crowd, random: np.random.Generator) -> None:
@@ -274,4 +274,4 @@ def _crossing_people(crowd: Crowd, random: np.random.Generator) -> None:
                 across = (start if way > 0 else -start) + way * travelled(float(random.uniform(0.9, 1.7)), 0.0, frames)
                 rows = np.stack([x - across * np.sin(heading), y + across * np.cos(heading),
                                  np.zeros(frames), np.full(frames, heading + way * np.pi / 2)], -1)  # fmt: skip
-                crowd.add(vehicles.grown_person(random, walks=True), rows.astype(np.float32))
+                crowd.add(vehicles.random_person(random, walks=True), rows.astype(np.float32))

@@ -1,4 +1,4 @@
-"""The ground of a grown driving world: asphalt, kerbs, rounded corners, pavements, marks, and what rain leaves."""
+"""The ground of the driving world: asphalt, kerbs, rounded corners, pavements, marks, and what rain leaves."""
 
 from collections.abc import Iterator
 

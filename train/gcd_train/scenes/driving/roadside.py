@@ -1,4 +1,4 @@
-"""What stands beside the streets of a grown driving world: nothing on a road, nothing in another thing, and nothing
+"""What stands beside the streets of the driving world: nothing on a road, nothing in another thing, and nothing
 where a camera passes.
 
 A footprint is [..., 5]: x and y of its centre, yaw in radians, half its length along the yaw and half its width.

@@ -1,4 +1,4 @@
-"""Who drives, rides and walks in a grown driving world: x ahead, y left, z up, on the ground at the origin.
+"""Who drives, rides and walks in the driving world: x ahead, y left, z up, on the ground at the origin.
 
 `near` asks for what only a close look shows.
 """
@@ -85,13 +85,13 @@ _CARS: tuple[tuple[_Style, float], ...] = (
 )  # fmt: skip
 
 
-def grown_car(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+def random_car(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     """One of eight body styles in one of many paints."""
     style = _CARS[int(random.choice(len(_CARS), p=[share for _, share in _CARS]))][0]
     return _car(style, random_paint(random), lamps, near)
 
 
-def grown_own_car() -> Assembly:
+def own_car() -> Assembly:
     """The ego car, always the same; its nose ends just behind the forward camera, which therefore never sees it."""
     car = _car(_CARS[1][0], OWN_PAINT, Lamps(), near=True)
     parts = tuple(replace(part.placed(-_OWN_BACK_M, 0.0, 0.0, 0.0), label=Label.OWN_CAR) for part in car.parts)
@@ -184,7 +184,7 @@ def _wheels(axles: tuple[float, ...], width: float, radius: float, label: Label,
     return parts
 
 
-def grown_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+def random_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     """A box truck, a tipper or a lorry with a long trailer."""
     kind = str(random.choice(["box", "tipper", "trailer"], p=[0.55, 0.2, 0.25]))
     length = float(random.uniform(11, 13.5) if kind == "trailer" else random.uniform(6, 8.5))
@@ -211,7 +211,7 @@ def grown_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assemb
     return Assembly(parts=tuple(parts), length=length + 0.1, width=2.52)
 
 
-def grown_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
+def random_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     """A city bus or a coach."""
     length, label = float(random.uniform(9.5, 12.2)), Label.BUS
     paint = varied(picked(random, _LIVERIES), random)
@@ -235,7 +235,7 @@ def _cloth(random: np.random.Generator) -> Colour:
     return varied(picked(random, _CLOTHES), random)
 
 
-def grown_person(random: np.random.Generator, walks: bool) -> Assembly:
+def random_person(random: np.random.Generator, walks: bool) -> Assembly:
     """A grown-up or a child, walking or standing; some carry a bag."""
     height = float(random.uniform(1.52, 1.92) if random.random() < 0.88 else random.uniform(1.0, 1.35))
     stride = float(random.uniform(0.12, 0.24)) * height / 1.7 if walks else 0.0
@@ -264,13 +264,13 @@ def _figure(random: np.random.Generator, height: float, label: Label, stride: fl
     ]
 
 
-def grown_cyclist(random: np.random.Generator) -> Assembly:
+def random_cyclist(random: np.random.Generator) -> Assembly:
     """A person on a bicycle."""
     parts = (*_two_wheels(_cloth(random), 0.34, 0.05, Label.CYCLIST), *_figure(random, 1.25, Label.CYCLIST, 0.1, 0.45))
     return Assembly(parts=parts, length=1.85, width=0.65)
 
 
-def grown_motorcyclist(random: np.random.Generator, lamps: Lamps) -> Assembly:
+def random_motorcyclist(random: np.random.Generator, lamps: Lamps) -> Assembly:
     """A person on a motorcycle, with a helmet."""
     label = Label.MOTORCYCLIST
     helmet = block((0.02, 0, 1.62), (0.28, 0.26, 0.28), random_paint(random), label, gloss=0.6, shape="ball")

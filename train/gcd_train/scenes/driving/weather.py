@@ -1,4 +1,4 @@
-"""Light and weather of a grown driving world: sun, sky, clouds and fog, how wet it is, and what shines when it is dark.
+"""Light and weather of the driving world: sun, sky, clouds and fog, how wet it is, and what shines when it is dark.
 
 The renderer has no lamps; lit ground is brighter paint just above the asphalt, below the lane marks.
 """

@@ -1,4 +1,4 @@
-"""The driving worlds put together: a grown one seen by the nineteen cameras of ParallelDomain-4D, and both as pairs.
+"""The driving world put together, seen by the nineteen cameras of ParallelDomain-4D, or by the two of a pair.
 
 Source: Van Hoorick et al. 2024 (GCD), ParallelDomain-4D: a forward ego camera, a fixed path to a pose above and
 behind the car, 10 frames per second.
@@ -20,10 +20,8 @@ from gcd_model.geometry import (
     driving_trajectory,
     look_at,
 )
-from gcd_train.errors import DataError
 from gcd_train.scenes.description import Floats, Part, Point, Scene, upright
 from gcd_train.scenes.driving.classes import Label, coarse
-from gcd_train.scenes.driving.first_edition import first_edition
 from gcd_train.scenes.driving.flow import Crowd, RoadUser, fill, random_drive
 from gcd_train.scenes.driving.ground import ground_sheets
 from gcd_train.scenes.driving.roads import Doubles, random_street
@@ -32,7 +30,8 @@ from gcd_train.scenes.driving.things import DISTRICTS, random_district, sky_dome
 from gcd_train.scenes.driving.weather import beams, lamp_pools, lit_windows, random_weather, shadow_focus
 
 HFOV_DEG = 85.0
-_GROWN = 2
+EDITION = 2
+"""Rises whenever a seed draws another world."""
 _PATH_STEPS = 8
 _PAVED = ("city", "business")
 _SIDE_YAW_DEG, _SIDE_M = 60.0, 0.25
@@ -62,54 +61,45 @@ the rig sees 99.9 % of what the path sees within 150 m, and 98 % of what is seen
 
 
 def driving_drive(seed: int, frames: int = 50) -> Scene:
-    """One drive through a grown world. Its cameras are named as the data set names them (see `vehicle_from_camera`).
+    """One drive. Its cameras are named as the data set names them (see `vehicle_from_camera`).
 
     Args:
         seed: 0 or more; it and the number of frames decide all that is drawn.
         frames: time steps at 10 Hz; the world's origin lies amid the way that the vehicle goes meanwhile.
     """
-    scene, users = grown_world(seed, frames)
+    scene, users = random_world(seed, frames)
     return replace(scene, cameras=_on_vehicle(users[0].rows))
 
 
 def driving_scene(
-    seed: int, *, frames: int = 14, mount: CameraMount | None = None, edition: int = 1, move_time: int | None = None
+    seed: int, *, frames: int = 14, mount: CameraMount | None = None, move_time: int | None = None
 ) -> Scene:
-    """A scene for pairs, seen by a source and a target camera that ride on the vehicle; the arguments decide it all.
+    """A scene for pairs, seen by a source and a target camera that ride on the vehicle, in the class head's thirteen
+    classes; the arguments decide it all.
 
     Args:
         seed: 0 or more.
         frames: time steps at 10 Hz.
         mount: where the source camera sits, if not where ParallelDomain-4D has it; the target path stays.
-        edition: 1 for the world that the packaged model was trained in, 2 for the grown one. Both speak of the class
-            head's thirteen classes.
         move_time: the frame in which the target camera is at its goal, the last if left out; 0 is the direct path.
-    Raises:
-        DataError: there is no such edition.
     """
-    if edition == 1:
-        scene, ego = first_edition(seed, frames)
-    elif edition == _GROWN:
-        scene, users = grown_world(seed, frames)
-        parts = tuple(replace(part, label=coarse(part.label)) for part in scene.parts)
-        sheets = tuple(replace(sheet, label=coarse(sheet.label)) for sheet in scene.sheets)
-        scene, ego = replace(scene, parts=parts, sheets=sheets), users[0].rows
-    else:
-        raise DataError(f"the driving world has editions 1 and 2, got {edition}; leave it out for the first one")
+    scene, users = random_world(seed, frames)
+    parts = tuple(replace(part, label=coarse(part.label)) for part in scene.parts)
+    sheets = tuple(replace(sheet, label=coarse(sheet.label)) for sheet in scene.sheets)
     mount = mount or CameraMount()
-    world_from_vehicle, source = rigid(ego), mount.vehicle_from_camera.numpy()
+    world_from_vehicle, source = rigid(users[0].rows), mount.vehicle_from_camera.numpy()
     path = driving_trajectory(frames=frames, move_time=frames - 1 if move_time is None else move_time, mount=mount)
     goal = source @ path.source_from_target.numpy()
     cameras = {"source": world_from_vehicle @ source, "target": world_from_vehicle @ goal}
-    return replace(scene, cameras=cameras, hfov_deg=mount.hfov_deg)
+    return replace(scene, parts=parts, sheets=sheets, cameras=cameras, hfov_deg=mount.hfov_deg)
 
 
-def grown_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
+def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
     """The world of a seed over so many time steps at 10 Hz, without cameras, and its road users, the ego first.
 
     The ego is instance 1 and body 1; a road user that stands still belongs to the world.
     """
-    layout, sky, way, standing, moving, ground = (np.random.default_rng([seed, _GROWN, part]) for part in range(6))
+    layout, sky, way, standing, moving, ground = (np.random.default_rng([seed, EDITION, part]) for part in range(6))
     street, weather = random_street(layout), random_weather(sky)
     district = random_district(layout)
     paved = district in _PAVED
@@ -139,7 +129,7 @@ def grown_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
         light=weather.light,
         facts={
             "seed": seed,
-            "edition": _GROWN,
+            "edition": EDITION,
             "district": district,
             "weather": weather.kind,
             "lanes": street.main.lanes_left + street.main.lanes_right,

@@ -1,22 +1,25 @@
-"""`gcd-train lora`: adapters and their bases."""
+"""Weights: adapters joined with their bases, and how the families of checkpoints were trained."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
+from rich.box import SIMPLE
 from rich.console import Console
-from typer import Argument, Option, Typer
+from rich.table import Table
+from typer import Argument, BadParameter, Option, Typer
 
-from gcd_train.cli.errors import errors_shown
+from gcd_model import FAMILIES, Family
+from gcd_train.cli.common import errors_shown
 
-app = Typer(no_args_is_help=True, help="Adapters that a run with model.train = lora writes, and their bases.")
+lora = Typer(no_args_is_help=True, help="Adapters that a run with model.train = lora writes, and their bases.")
 
 
-@app.callback()
+@lora.callback()
 def about() -> None:
     """Keep `lora` a command with sub-commands, however many there are."""
 
 
-@app.command()
+@lora.command()
 def merge(
     base: Annotated[Path, Argument(metavar="BASE", help="The weight file the adapter was trained from, any layout.")],
     adapter: Annotated[Path, Argument(metavar="ADAPTER", help="NAME-adapter.safetensors of a run.")],
@@ -44,3 +47,28 @@ def merge(
         else:
             save_weights(networks, out, card, overwrite=overwrite)
     Console(markup=False).print(f"wrote {out}", soft_wrap=True)
+
+
+def families_command(
+    name: Annotated[str | None, Argument(help="Show one family only.", metavar="FAMILY")] = None,
+) -> None:
+    """List the model families: how each was trained, and what a finetuned checkpoint will accept."""
+    if name is not None and name not in FAMILIES:
+        raise BadParameter(f"no family is called {name!r}; there are {', '.join(FAMILIES)}")
+    table = Table(title="Model families", box=SIMPLE, pad_edge=False, padding=(0, 0))
+    for column in ("family", "camera", "az / el / r", "rates", "hfov", "size"):
+        table.add_column(column, no_wrap=True)
+    for family in FAMILIES.values():
+        if name in (None, family.name):
+            table.add_row(*_family_row(family))
+    Console().print(table)
+
+
+def _family_row(family: Family) -> tuple[str, ...]:
+    limits = family.limits
+    span = "fixed"
+    if limits is not None:
+        span = f"±{limits.azimuth_deg:g}° ±{limits.elevation_deg:g}° ±{limits.radius_m:g}"
+    rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
+    hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
+    return family.name, family.camera, span, rates, hfov, f"{family.width}x{family.height}"

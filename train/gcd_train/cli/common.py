@@ -1,11 +1,16 @@
-"""Errors of every `gcd-train` command, as its user sees them."""
+"""What all commands have in common: errors as their user sees them, what is said meanwhile, how they are stopped."""
 
-from collections.abc import Generator
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from pathlib import Path
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gcd_model import ModelError, printable
 from gcd_train.errors import Interrupted, RunError, TrainError
@@ -36,7 +41,7 @@ def errors_shown() -> Generator[None]:
             raise
         _say(
             f"{error}; give fewer clips at once (clip_batch), compute.checkpoint_activations, 8-bit Adam or precision "
-            '"bfloat16": `gcd-train bench train` says what each takes'
+            '"bfloat16"; docs/training.md says what each takes'
         )
         raise typer.Exit(RunError.exit_code) from error
     except OSError as error:
@@ -50,5 +55,28 @@ def _out_of_memory(error: RuntimeError) -> bool:
 
 
 def _say(message: object) -> None:
-    line = printable(" ".join(str(message).split()), _LONGEST)
-    Console(stderr=True, highlight=False).print(f"gcd-train: {line}", markup=False, soft_wrap=True)
+    say("gcd-train: " + printable(" ".join(str(message).split()), _LONGEST))
+
+
+@contextmanager
+def progress_bar(what: str, total: int, *, keep: bool = False) -> Generator[Callable[[int], None]]:
+    """A bar on stderr; call what this gives with the number done so far. keep: leave the bar there at the end."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=not keep) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def say(line: str) -> None:
+    """A line on stderr, as it is."""
+    Console(stderr=True, highlight=False).print(line, markup=False, soft_wrap=True)
+
+
+def stop_as_by_ctrl_c() -> None:
+    """From now on SIGTERM ends this process as Ctrl-C does, so that no worker is left behind."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+def command_line() -> str:
+    """As it could be typed again."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
