@@ -1,13 +1,12 @@
 """Frames as the network takes them, encoded one by one: while the window fills, and once for all windows that overlap.
 
-What is encoded of a frame follows from its pixels, its number and what is in EncodeTerms alone. One frame is encoded at
+What is encoded of a frame follows from its pixels, its number and the configuration alone. One frame is encoded at
 a time, always, because the last bits of a convolution may depend on how many there are. So a window is the same to the
 last bit whether its frames were encoded when they arrived, for the window before, or all at its end.
 """
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -16,9 +15,7 @@ from numpy.typing import NDArray
 
 from gcd_model import (
     Augmentation,
-    CameraMount,
     Clip,
-    Intrinsics,
     PoseError,
     SourceFeatures,
     ViewSynthesizer,
@@ -31,29 +28,6 @@ from gcd_node.stream_context import StreamContext
 from gcd_node.window import PartialWindow, PlacedFrame
 
 _Key: TypeAlias = tuple[int, int]  # epoch and stamp: a builder never gives the same twice
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class EncodeTerms:
-    """What decides, beside the frames, how they are encoded. digest: see config_digest(). strength: of the noise, None
-    for the checkpoint's own. mount, lens: of the source camera. depth: instead of the model's own."""
-
-    digest: str
-    strength: float | None
-    mount: CameraMount | None
-    lens: Intrinsics | None = None
-    depth: DepthSource | None = None
-
-
-def encode_terms(context: StreamContext) -> EncodeTerms:
-    """Of a stream."""
-    return EncodeTerms(
-        digest=context.digest,
-        strength=context.config.model.cond_aug,
-        mount=context.mount,
-        lens=context.intrinsics if context.traits.live else None,
-        depth=context.depth,
-    )
 
 
 class EncodedFrames:
@@ -72,7 +46,7 @@ class EncodedFrames:
         self._beat, self._on_bad_depth, self._on_odometry = beat, on_bad_depth, on_odometry
         self._last_pose: tuple[int, torch.Tensor] | None = None
         self._rows: dict[_Key, tuple[SourceFeatures, bool]] = {}  # and whether its depth is guessed
-        self._alike: tuple[EncodeTerms, float] | None = None
+        self._alike: tuple[object, ...] = ()  # of all frames that are kept: what decides, beside them, how
 
     def __len__(self) -> int:
         """How many frames are kept."""
@@ -87,53 +61,54 @@ class EncodedFrames:
         """Keep nothing."""
         self._rows.clear()
 
-    def ahead(self, synthesizer: ViewSynthesizer, frames: PartialWindow, terms: EncodeTerms) -> bool:
+    def ahead(self, synthesizer: ViewSynthesizer, frames: PartialWindow, context: StreamContext) -> bool:
         """Encode one more of these frames, the oldest that is not yet. False, and nothing was done, if all are.
 
         Raises: as ViewSynthesizer.encode.
         """
-        missing = self._missing(frames, terms)
+        missing = self._missing(frames, context)
         if missing:
-            self._encode(synthesizer, frames, missing[0], terms)
+            self._encode(synthesizer, frames, missing[0], context)
         return bool(missing)
 
-    def features(self, synthesizer: ViewSynthesizer, frames: PartialWindow, terms: EncodeTerms) -> SourceFeatures:
+    def features(self, synthesizer: ViewSynthesizer, frames: PartialWindow, context: StreamContext) -> SourceFeatures:
         """All of these frames, at least one; what is not yet encoded is now.
 
         Raises: as ViewSynthesizer.encode.
         """
-        for frame in self._missing(frames, terms):
-            self._encode(synthesizer, frames, frame, terms)
+        for frame in self._missing(frames, context):
+            self._encode(synthesizer, frames, frame, context)
         keys = [(frames.epoch, stamp_ns) for stamp_ns in frames.stamps_ns]
         first, *others = (self._rows[key][0] for key in keys)
         joined = first.followed_by(*others)  # the windows before may go
         self._rows = {key: (joined.rows(i, i + 1), self._rows[key][1]) for i, key in enumerate(keys)}
         return joined
 
-    def _missing(self, frames: PartialWindow, terms: EncodeTerms) -> list[PlacedFrame]:
+    def _missing(self, frames: PartialWindow, context: StreamContext) -> list[PlacedFrame]:
         """The frames that are not encoded; all others but these are forgotten."""
-        if self._alike != (terms, frames.fps):
+        alike = context.digest, context.mount, context.intrinsics, context.depth, frames.fps
+        if self._alike != alike:
             self.forget()
-            self._alike = (terms, frames.fps)
+            self._alike = alike
         by_key = {(frames.epoch, frame.stamp_ns): frame for frame in frames.frames}
         self._rows = {key: row for key, row in self._rows.items() if key in by_key}
         return [frame for key, frame in by_key.items() if key not in self._rows]
 
     def _encode(
-        self, synthesizer: ViewSynthesizer, window: PartialWindow, frame: PlacedFrame, terms: EncodeTerms
+        self, synthesizer: ViewSynthesizer, window: PartialWindow, frame: PlacedFrame, context: StreamContext
     ) -> None:
         self._beat()
-        depth = self._depth(frame, terms.depth)
+        depth = self._depth(frame, context.depth)
         clip = Clip(
             video=torch.from_numpy(to_clip_tensor(frame.image[None])),
             fps=window.fps,
-            mount=terms.mount,
-            lens=terms.lens,
+            mount=context.mount,
+            lens=context.intrinsics if context.traits.live else None,
             depth=None if depth is None else torch.from_numpy(depth)[None],
             odometry=self._odometry(frame, window.epoch),
         )
-        noise = Augmentation(strength=terms.strength, seed=frame_seed(terms.digest, frame.seq))
-        is_guessed = depth is None and (frame.depth is not None or terms.depth is not None)
+        noise = Augmentation(strength=context.config.model.cond_aug, seed=frame_seed(context.digest, frame.seq))
+        is_guessed = depth is None and (frame.depth is not None or context.depth is not None)
         self._rows[window.epoch, frame.stamp_ns] = synthesizer.encode(clip, noise), is_guessed
 
     def _depth(self, frame: PlacedFrame, network: DepthSource | None) -> NDArray[np.float32] | None:

@@ -23,14 +23,13 @@ from gcd_model import (
     Trajectory,
     View,
 )
-from gcd_node.encoded_frames import EncodedFrames, encode_terms, window_seed
+from gcd_node.encoded_frames import EncodedFrames, window_seed
 from gcd_node.errors import DepthError
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import (
     Failure,
     FailureCounter,
     ModelSlot,
-    OomLevel,
     Pulse,
     model_errors,
     oom_levels,
@@ -115,7 +114,8 @@ class Renderer:
         self._views = VirtualViews(model.traits)
         self._views.sync(live.settings(), context_at(-1).mount)
         self._failures = FailureCounter(announcer)
-        self.pulse = Pulse(announcer.health, lambda: self._failures.level)
+        self._given_up = self._failures.given_up
+        self.pulse = Pulse(announcer.health, self._given_up)
         self._encoded = EncodedFrames(self.pulse.beat, self._count_bad_depth, self._tell_odometry)
         self._seeing, self._placing = threading.Lock(), threading.Lock()
         """Held by whoever encodes or makes the model forget, and by whoever places; both, in this order, by whoever
@@ -128,11 +128,6 @@ class Renderer:
         self._epoch = -1
         self._latest: tuple[StreamContext, StreamContext] | None = None
 
-    @property
-    def level(self) -> OomLevel:
-        """How much is asked of the device."""
-        return self._failures.level
-
     def warm_up(self) -> None:
         """Render a grey clip in one step. Raises NonFiniteError, DeviceMemoryError."""
         settings, mount = self._live.settings(), self._context_at(-1).mount
@@ -143,8 +138,8 @@ class Renderer:
         """Encode one frame of the window that fills; False if there is nothing to do. Raises DeviceMemoryError."""
         with self._seeing, model_errors():
             try:
-                terms = encode_terms(self._context(self._live.settings(), filling.epoch))
-                return self._encoded.ahead(self._model.synthesizer, filling, terms)
+                context = self._context(self._live.settings(), filling.epoch)
+                return self._encoded.ahead(self._model.synthesizer, filling, context)
             except DeviceMemoryError:
                 self._encoded.forget()
                 raise
@@ -210,7 +205,7 @@ class Renderer:
         settings = self._live.settings()
         context = self._context(settings, window.epoch)
         views = self._views.sync(settings, context.mount)
-        views = views[:1] if self.level.single else views
+        views = views[:1] if "a single view" in self._given_up else views
         paths = [view.trajectory(window.stamps_ns[-1], window.epoch) for view in views]
         return Job(
             window=window,
@@ -239,7 +234,7 @@ class Renderer:
             self._model.forget_frames()
             self._epoch = window.epoch
         started_s = time.monotonic()
-        features = self._encoded.features(synthesizer, window, encode_terms(context))
+        features = self._encoded.features(synthesizer, window, context)
         guessed = self._encoded.guessed
         if guessed and context.config.model.on_bad_depth == "stop":
             raise DepthError(f"the depth of {guessed} frames of this window cannot be used; it is not rendered")
@@ -285,7 +280,7 @@ class Renderer:
             self._forget()
             job = replace(job, memory=self._memory)
             if isinstance(failure, DeviceMemoryError):
-                most = 1 if self.level.single else len(job.views)
+                most = 1 if "a single view" in self._given_up else len(job.views)
                 context = self._context(job.settings, job.window.epoch)
                 job = replace(job, context=context, views=job.views[:most], paths=job.paths[:most])
             seen = self._seen(job)
@@ -300,7 +295,7 @@ class Renderer:
             can_part=not self._model.streams,
         )
         self._failures.out_of_memory(job.window.window_id, error, levels)
-        if self.level.half and self._model.can_halve:
+        if "bfloat16" in self._given_up and self._model.can_halve:
             with self._seeing, self._placing:
                 self.pulse.load()
                 self._forget()
@@ -310,10 +305,10 @@ class Renderer:
         if isinstance(placed, Failure):
             raise placed
         assert placed is not None, "only this thread makes the memory begin anew"
-        level = self.level
-        steps = max(1, sampler_in_use(job.context.config.model, job.context.traits).steps // level.steps_divisor)
+        section, halved = job.context.config.model, "half the steps" in self._given_up
+        steps = max(1, sampler_in_use(section, job.context.traits).steps // (2 if halved else 1))
         with model_errors():
-            views = self._draw(job, seed, placed, steps if level.steps_divisor > 1 else job.context.config.model.steps)
+            views = self._draw(job, seed, placed, steps if halved else section.steps)
         if self.cancel.is_set():  # a model that ignores cancel: nothing may follow the end
             raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
@@ -342,7 +337,7 @@ class Renderer:
         self.pulse.beat()
         if not isinstance(placed, SourceFeatures):
             views = self._frames.paint(placed, job.paths, options)
-        elif self.level.one_by_one:
+        elif self._given_up:  # the views are one by one then, if there is more than one
             views = [self._model.synthesizer.render(placed, [path], options)[0] for path in job.paths]
         else:
             views = self._model.synthesizer.render(placed, job.paths, options)
@@ -352,7 +347,7 @@ class Renderer:
 
     def _options(self, settings: Settings, seed: int, *, steps: int | None) -> RenderOptions:
         model = settings.config.model
-        samples = 1 if self.level.single else model.samples
+        samples = 1 if "a single view" in self._given_up else model.samples
         return replace(
             drawing_options(model),
             steps=steps,

@@ -9,8 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Container, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import torch
 from msgspec.structs import replace
@@ -154,9 +153,9 @@ def interruptible(cancel: threading.Event, threads: Container[int]) -> Generator
 class Pulse:
     """When each of the model's threads began the step that it is at; tells the node's health whether any is at one."""
 
-    def __init__(self, health: Health, level: "Callable[[], OomLevel]") -> None:
-        """level: how much is asked of the device now."""
-        self._health, self._level = health, level
+    def __init__(self, health: Health, given_up: "Sequence[GiveUp]") -> None:
+        """given_up: what is not asked of the device any more."""
+        self._health, self._given_up = health, given_up
         self._begun_s: dict[int, float] = {}
         self._order = threading.Lock()
 
@@ -168,7 +167,7 @@ class Pulse:
 
     def beat(self) -> None:
         """This thread begins a step."""
-        self._begin(time.monotonic(), "busy" if self._level() is FULL else "degraded")
+        self._begin(time.monotonic(), "degraded" if self._given_up else "busy")
 
     def load(self) -> None:
         """This thread begins to load a model, which takes as long as it takes."""
@@ -179,7 +178,7 @@ class Pulse:
         with self._order:
             self._begun_s.pop(threading.get_ident(), None)
             if not self._begun_s:
-                self._health.model("ready" if self._level() is FULL else "degraded")
+                self._health.model("degraded" if self._given_up else "ready")
 
     def _begin(self, at_s: float, state: ModelState) -> None:
         with self._order:
@@ -205,47 +204,24 @@ class IdleTimer:
 
 # What it gives up.
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OomLevel:
-    """How much less is asked of the device. Each level keeps what the ones before it gave up.
-
-    name: as events and logs say it.
-    one_by_one: views are rendered after each other, so that only one is in memory.
-    half: weights in bfloat16, loaded anew.
-    steps_divisor: so many times fewer steps.
-    single: the first view alone, with one sample.
-    """
-
-    name: str
-    one_by_one: bool = False
-    half: bool = False
-    steps_divisor: int = 1
-    single: bool = False
+GiveUp: TypeAlias = Literal["views one by one", "bfloat16", "half the steps", "a single view"]
+"""One thing less that is asked of the device: only one view is in memory at a time; weights are loaded anew in
+bfloat16; half as many steps; the first view alone, with one sample. In this order."""
 
 
-FULL = OomLevel(name="as asked")
-"""Nothing is given up."""
-
-
-def oom_levels(*, views: int, samples: int, steps: int, can_halve: bool, can_part: bool = True) -> tuple[OomLevel, ...]:
-    """The way down from what was asked; levels that would change nothing are left out.
+def oom_levels(*, views: int, samples: int, steps: int, can_halve: bool, can_part: bool = True) -> list[GiveUp]:
+    """The way down from what was asked; what would change nothing is left out.
 
     views, samples, steps: as asked. can_halve: the weights are wider than bfloat16, on a device that gains by it.
     can_part: views may be rendered one by one.
     """
-    levels, divisor = [FULL], 2 if steps > 1 else 1
-    if views > 1 and can_part:
-        levels.append(OomLevel(name="views one by one", one_by_one=True))
-    if can_halve:
-        levels.append(OomLevel(name="bfloat16", one_by_one=can_part, half=True))
-    if steps > 1:
-        levels.append(OomLevel(name="half the steps", one_by_one=can_part, half=can_halve, steps_divisor=2))
-    if views > 1 or samples > 1:
-        levels.append(
-            OomLevel(name="a single view", one_by_one=can_part, half=can_halve, steps_divisor=divisor, single=True)
-        )
-    return tuple(levels)
+    levels: dict[GiveUp, bool] = {
+        "views one by one": views > 1 and can_part,
+        "bfloat16": can_halve,
+        "half the steps": steps > 1,
+        "a single view": views > 1 or samples > 1,
+    }
+    return [name for name, changes in levels.items() if changes]
 
 
 class FailureCounter:
@@ -257,37 +233,34 @@ class FailureCounter:
     def __init__(self, announcer: Announcer, clock: Callable[[], float] = time.monotonic) -> None:
         """clock: monotonic seconds."""
         self._announcer, self._clock = announcer, clock
-        self._levels: list[OomLevel] = []  # this one, and those still to come
+        self._to_come: list[GiveUp] | None = None  # unknown until the device was full
+        self.given_up: list[GiveUp] = []
         self._full_s: deque[float] = deque(maxlen=_TRIES)
         self._bad_in_a_row = 0
-
-    @property
-    def level(self) -> OomLevel:
-        """How much to ask of the device."""
-        return self._levels[0] if self._levels else FULL
 
     def success(self) -> None:
         """A window came out well."""
         self._bad_in_a_row = 0
 
-    def out_of_memory(self, window_id: int, error: DeviceMemoryError, levels: tuple[OomLevel, ...]) -> None:
+    def out_of_memory(self, window_id: int, error: DeviceMemoryError, levels: Sequence[GiveUp]) -> None:
         """The device was full: from here on less is asked of it. levels: down from what is asked; see oom_levels().
 
         Raises:
             ModelFailedError: nothing is left to give up, and it was full three times within a minute.
         """
         self._announcer.health.count("oom_count")
-        self._levels = self._levels or list(levels)
-        if len(self._levels) > 1:
-            del self._levels[0]
+        self._to_come = list(levels) if self._to_come is None else self._to_come
+        if self._to_come:
+            self.given_up.append(self._to_come.pop(0))
         else:
             self._full_s.append(self._clock())
-        _LOG.warning("window %d: %s; from here on: %s", window_id, error, self.level.name)
-        fields = {"window_id": window_id, "rung": self.level.name, "message": str(error)}
+        rung = self.given_up[-1] if self.given_up else "as asked"
+        _LOG.warning("window %d: %s; from here on: %s", window_id, error, rung)
+        fields = {"window_id": window_id, "rung": rung, "message": str(error)}
         self._announcer.event("GPU_OOM", Level.ERROR, fields)
         if len(self._full_s) == _TRIES and self._full_s[-1] - self._full_s[0] <= _SPAN_S:
             raise ModelFailedError(
-                f"the device had no memory three times within a minute although little is asked ({self.level.name}): "
+                f"the device had no memory three times within a minute although little is asked ({rung}): "
                 f"{error} Free memory, or use a smaller model"
             )
 

@@ -12,7 +12,7 @@ from gcd_model import DeviceMemoryError, RenderOptions, SourceFeatures, Trajecto
 from gcd_node.config import ModelSection
 from gcd_node.errors import ModelFailedError
 from gcd_node.health import Health
-from gcd_node.model import FULL, FailureCounter, oom_levels
+from gcd_node.model import FailureCounter, oom_levels
 from gcd_node.status import Announcer
 
 
@@ -20,10 +20,10 @@ def test_only_three_failures_within_a_minute_at_the_bottom_are_the_end() -> None
     clock = iter((0.0, 31.0, 62.0, 90.0))  # asked for where nothing is left to give up
     failures = FailureCounter(Announcer("n", "b", Box(), Health()), clock.__next__)
     levels = oom_levels(views=2, samples=1, steps=1, can_halve=False)
-    assert failures.level is FULL
+    assert failures.given_up == []
     for _ in range(5):
         failures.out_of_memory(1, DeviceMemoryError("full"), levels)
-    assert failures.level.single
+    assert failures.given_up == ["views one by one", "a single view"]
     with pytest.raises(ModelFailedError):
         failures.out_of_memory(1, DeviceMemoryError("full"), levels)
 

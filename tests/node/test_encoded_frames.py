@@ -18,12 +18,12 @@ from media import frames_at
 
 from gcd_model import Augmentation, CameraMount, Clip, RenderOptions, SourceFeatures, load_synthesizer
 from gcd_node.config import NodeConfig, parse_config
-from gcd_node.encoded_frames import EncodedFrames, EncodeTerms
+from gcd_node.encoded_frames import EncodedFrames
 from gcd_node.frame import Frame
+from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.window import FrameWindow, WindowBuilder
 
 T = 14
-TERMS = EncodeTerms(digest="0123456789ab", strength=0.02, mount=None)
 
 
 class Encoder(FakeSynthesizer):
@@ -92,6 +92,9 @@ def config(more: str = "", *, stride: int = T, pace: str = "lockstep") -> NodeCo
     return parse_config(text.encode(), "test")
 
 
+CONTEXT = prepare_stream(config(), traits(), FakeSource(1).info)
+
+
 @dataclass
 class Life:
     """A node whose source and model a test controls, in a thread of its own."""
@@ -149,9 +152,9 @@ def test_windows_that_overlap_agree_to_the_last_bit_on_the_frames_they_share() -
     picture = np.random.default_rng(0).integers(0, 256, (128, 192, 3), np.uint8)
     frames = [changed(frame, image=np.roll(picture, frame.seq, axis=1)) for frame in frames_at([0, 100, 200, 300, 400])]
     one, two = placed(frames, builder=WindowBuilder(frames=4, fps=10.0, stride=1))
-    first, second = (encoded.features(model, window, TERMS) for window in (one, two))
+    first, second = (encoded.features(model, window, CONTEXT) for window in (one, two))
     assert same(first.rows(1, 4), second.rows(0, 3))
-    assert same(second, kept().features(model, two, TERMS))
+    assert same(second, kept().features(model, two, CONTEXT))
 
 
 @functools.cache
@@ -186,9 +189,9 @@ def test_it_makes_no_difference_in_what_order_frames_are_encoded(seed: int) -> N
     for frame in ten_fps(50):
         for window in builder.push(frame, frame.stamp_ns):
             windows += 1
-            wanted = kept().features(Encoder(), window, TERMS)
-            assert same(encoded.features(model, window, TERMS), wanted)
-        while chance.random() < 0.6 and encoded.ahead(model, builder.filling, TERMS):
+            wanted = kept().features(Encoder(), window, CONTEXT)
+            assert same(encoded.features(model, window, CONTEXT), wanted)
+        while chance.random() < 0.6 and encoded.ahead(model, builder.filling, CONTEXT):
             assert len(encoded) <= T
     assert windows >= 3
     assert sorted(set(model.encoded)) == sorted(model.encoded)  # each once
@@ -216,15 +219,14 @@ def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> No
 @pytest.mark.parametrize(
     "other",
     [
-        changed(TERMS, digest="ba9876543210"),
-        changed(TERMS, strength=0.5),
-        changed(TERMS, mount=CameraMount(height_m=2.0)),
+        changed(CONTEXT, config=config("strict = true", stride=5)),
+        changed(CONTEXT, mount=CameraMount(height_m=2.0)),
     ],
 )
-def test_what_was_encoded_on_other_terms_is_encoded_anew(other: EncodeTerms) -> None:
+def test_what_was_encoded_on_other_terms_is_encoded_anew(other: StreamContext) -> None:
     (window,) = placed(ten_fps(T))
     model, encoded = Encoder(), kept()
-    encoded.features(model, window, TERMS)
+    encoded.features(model, window, CONTEXT)
     again = encoded.features(model, window, other)
     assert model.encoded == [*range(T), *range(T)]
     assert same(again, kept().features(Encoder(), window, other))
