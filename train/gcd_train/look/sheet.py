@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.evaluation.galleries import HOLD_S, Strip, beside, write_mp4
+from gcd_train.evaluation.galleries import write_sheet as write_rows
 from gcd_train.evaluation.plots import new_figure, save
-from gcd_train.look.clip import SKY_M, UNSEEN, Bytes, Footage
+from gcd_train.look.clip import SKY_M, Bytes, Footage
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import SubFigure
     from mpl_toolkits.mplot3d import Axes3D
 
 Doubles = NDArray[np.float64]
@@ -116,12 +115,6 @@ def _frame(axes: "Axes3D", footage: Footage, low: Doubles, high: Doubles) -> Non
     axes.view_init(elev=24, azim=float(np.degrees(np.arctan2(-ahead[1], -ahead[0]))) + 50.0)
 
 
-_COLUMNS, _LEGEND_ROWS = 5, 14
-_BADGE: dict[str, Any] = {
-    "xytext": (5, 6),
-    "textcoords": "offset points",
-    "bbox": {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
-}
 _INK, _FAINT = "#1b2530", "#5c6875"
 _UNKNOWN = (38, 38, 38)
 """Colour of depth that is not known, and of sky."""
@@ -142,11 +135,11 @@ def _rows(footage: Footage) -> list[_Row]:
     """Everything there is to see of a clip, in the order of the sheet."""
     depth = _depth_colours(footage.depth, *footage.depth_range_m)
     rows = [
-        _Row(name="input", told=f"{footage.source_camera}, colour", pictures=footage.source),
+        _Row(name="input", told=footage.source_camera, pictures=footage.source),
         _Row(name="target", told=footage.target_is, pictures=footage.target),
-        _Row(name="splat", told="the input's points from\nthe target; black: none", pictures=footage.splat),
-        _Row(name="visibility", told="orange: surfaces\nthe input never saw", pictures=footage.seen()),
-        _Row(name="depth", told="of the input, along\nthe optical axis", pictures=depth),
+        _Row(name="splat", told="points of the input", pictures=footage.splat),
+        _Row(name="visibility", told="orange: never seen", pictures=footage.seen()),
+        _Row(name="depth", told="near is red", pictures=depth),
     ]
     painted = footage.painted()
     if painted is not None:
@@ -164,20 +157,12 @@ def _depth_colours(depth: NDArray[np.float32], near_m: float, far_m: float) -> B
 
 
 def write_sheet(footage: Footage, out: Path) -> None:
-    """One page as PNG. Raises: RenderError without matplotlib, RunError where it cannot be written."""
-    rows = _rows(footage)
-    height, width = footage.source.shape[1:3]
-    tall = 1.84 * height / width
-    figure = new_figure(15.2, 0.78 + len(rows) * (tall + 0.045))
-    figure.text(0.012, 0.99, footage.title, fontsize=15, fontweight="bold", color=_INK, va="top")
-    parts = figure.add_gridspec(1, 2, width_ratios=[3.05, 1.0], wspace=0.0)
-    _draw_rows(figure.add_subfigure(parts[0]), footage, rows)
-    _draw_side(figure.add_subfigure(parts[1]), footage)
-    save(figure, out)
+    """All kinds of pictures, one below the other, as PNG. Raises RunError where it cannot be written."""
+    write_rows([(row.told, [Strip.of(row.name, row.pictures)]) for row in _rows(footage)], out)
 
 
 def write_trajectory(footage: Footage, out: Path) -> None:
-    """The camera path alone, as PNG. Raises as `write_sheet`."""
+    """The camera path alone, as PNG. Raises: RenderError without matplotlib, RunError."""
     figure = new_figure(7.2, 5.6)
     axes: Axes3D = figure.add_axes((0.03, 0.03, 0.93, 0.84), projection="3d")  # pyright: ignore[reportAssignmentType]
     _draw_trajectory(axes, footage)
@@ -188,110 +173,9 @@ def write_trajectory(footage: Footage, out: Path) -> None:
     save(figure, out)
 
 
-def _draw_rows(grid: "SubFigure", footage: Footage, rows: Sequence[_Row]) -> None:
-    """All pictures in one piece (thirty axes would take longer than all else), names and times around them.
-
-    Always as wide as five moments, so that a shorter clip leaves white and no picture is stretched.
-    """
-    moments = np.unique(np.linspace(0, footage.frames - 1, _COLUMNS).round().astype(int))
-    height, width = footage.source.shape[1:3]
-    gap = round(width / 60)
-    mosaic = np.full((len(rows) * (height + gap) - gap, _COLUMNS * (width + gap) - gap, 3), 255, np.uint8)
-    axes: Axes = grid.add_axes((0.128, 0.012, 0.807, 0.906))
-    axes.set_axis_off()
-    for number, row in enumerate(rows):
-        top = number * (height + gap)
-        for column, moment in enumerate(moments):
-            left = column * (width + gap)
-            mosaic[top : top + height, left : left + width] = row.pictures[moment]
-            if row.name == "visibility":
-                seen = f"{100 * footage.seen_shares[moment]:.0f} % seen"
-                axes.annotate(seen, (left, top + height), fontsize=8, color=_INK, **_BADGE)
-        x, y = -0.02 * width, top + 0.4 * height
-        axes.text(x, y, row.name, fontsize=11.5, fontweight="bold", color=_INK, va="center", ha="right")
-        y += 0.115 * height
-        axes.text(x, y, row.told, fontsize=7, color=_FAINT, va="top", ha="right", linespacing=1.15)
-    for column, moment in enumerate(moments):
-        time = f"t = {footage.seconds[moment]:.2f} s\nframe {footage.frame_numbers[moment]}"
-        place = column * (width + gap) + width / 2
-        axes.text(place, -0.04 * height, time, fontsize=9, color=_FAINT, ha="center", va="bottom")
-    axes.imshow(mosaic, interpolation="antialiased", aspect="auto")
-    share = height / len(mosaic)
-    _depth_bar(axes.inset_axes((1.008, 0.02 * share, 0.012, 0.94 * share)), footage)
-
-
-def _depth_bar(bar: "Axes", footage: Footage) -> None:
-    """Fill axes with the colours of depth, near at the bottom, ticks in metres."""
-    near, far = footage.depth_range_m
-    bar.set_xticks([])
-    for edge in bar.spines.values():
-        edge.set_visible(False)
-    if far <= near:
-        bar.set_yticks([])
-        return
-    bar.imshow(_TURBO[::-1][:, None], aspect="auto", origin="lower", extent=(0, 1, 0, 1))
-    ticks = _depth_ticks(near, far)
-    bar.set_yticks([float(np.log(tick / near) / np.log(far / near)) for tick in ticks], [f"{t:g}" for t in ticks])
-    bar.yaxis.tick_right()
-    bar.tick_params(labelsize=7, length=2, colors=_FAINT)
-    bar.set_title("m", fontsize=8, color=_FAINT, pad=2)
-
-
-def _depth_ticks(near_m: float, far_m: float) -> list[float]:
-    """Round numbers of metres between two depths, at most eight; in a narrow range evenly spaced."""
-    rounds = [digit * 10.0**power for power in range(-2, 5) for digit in (1, 2, 3, 5, 7)]
-    ticks = [number for number in rounds if near_m <= number <= far_m]
-    if len(ticks) > 8:
-        return [tick for tick in ticks if f"{tick:e}"[0] in "125"]
-    if len(ticks) >= 3 or far_m <= near_m:
-        return ticks
-    step = next(number for number in rounds if number >= (far_m - near_m) / 5)
-    return [round(number * step, 3) for number in range(int(near_m / step) + 1, int(far_m / step) + 1)]
-
-
-def _draw_side(side: "SubFigure", footage: Footage) -> None:
-    axes: Axes3D = side.add_axes((0.02, 0.60, 0.96, 0.335), projection="3d")  # pyright: ignore[reportAssignmentType]
-    _draw_trajectory(axes, footage)
-    axes.tick_params(labelsize=6.5, pad=-1)
-    axes.legend(loc="upper left", bbox_to_anchor=(0.02, 1.18), fontsize=7.5, frameon=False, ncol=1)
-    top = 0.575
-    for name, value in footage.facts():
-        side.text(0.03, top, name, fontsize=8, color=_FAINT, va="top")
-        side.text(0.27, top, value, fontsize=8, color=_INK, va="top", linespacing=1.2)
-        top -= 0.0195 + 0.0165 * value.count("\n")
-    _legend(side, footage, top - 0.015)
-
-
-def _legend(side: "SubFigure", footage: Footage, top: float) -> None:
-    """Names, colours and pixel shares of what is most seen, then the colours that have no bar."""
-    shares = footage.shares()
-    if shares:
-        side.text(0.03, top, f"{footage.kind_plural}, share of the input's pixels", fontsize=8, color=_FAINT, va="top")
-        top -= 0.027
-    for label, share in shares[:_LEGEND_ROWS]:
-        _swatch(side, top, label.colour, label.name, percent(share))
-        top -= 0.0195
-    if len(shares) > _LEGEND_ROWS:
-        rest = percent(sum(share for _, share in shares[_LEGEND_ROWS:]))
-        side.text(0.09, top, f"and {len(shares) - _LEGEND_ROWS} more, {rest}", fontsize=7.5, color=_FAINT, va="top")
-        top -= 0.0195
-    top -= 0.008
-    _swatch(side, top, UNSEEN, "surfaces the input never saw", "")
-    _swatch(side, top - 0.0195, _UNKNOWN, "sky, or no depth", "")
-
-
 def percent(share: float) -> str:
     """A share of 0 to 1 in words; what is there is never told as nothing."""
     return f"{100 * share:.1f} %" if share >= 0.0005 else "< 0.1 %"
-
-
-def _swatch(side: "SubFigure", top: float, colour: tuple[int, int, int], name: str, value: str) -> None:
-    face = tuple(channel / 255 for channel in colour)
-    side.text(
-        0.035, top, "      ", fontsize=6, va="top", bbox={"facecolor": face, "edgecolor": "#00000030", "pad": 1.2}
-    )
-    side.text(0.09, top, name, fontsize=7.5, color=_INK, va="top")
-    side.text(0.93, top, value, fontsize=7.5, color=_INK, va="top", ha="right")
 
 
 def write_video(footage: Footage, out: Path) -> None:
