@@ -11,6 +11,7 @@ from fakes import Box, FakeSource, FakeSynthesizer, made_node, traits
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_ros2.decoder import DecoderFactory
+from zstandard import ZstdError
 
 from gcd_model import Traits
 from gcd_node.config import NodeConfig, parse_config
@@ -163,6 +164,6 @@ def salvaged(path: Path, topic: str) -> list[int]:
             for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
                 if channel.topic == topic:
                     found.append(message.sequence)
-        except (McapError, EOFError, ValueError):
+        except (McapError, EOFError, ValueError, ZstdError):
             pass  # where it was cut
     return found

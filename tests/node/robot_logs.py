@@ -152,16 +152,14 @@ def write_bag(
     messages: Sequence[Sent],
     storage: StoragePlugin = StoragePlugin.SQLITE3,
     compression: CompressionMode = CompressionMode.NONE,
-    *,
-    folded: bool = False,
 ) -> Path:
-    """A ROS 1 bag if `path` ends in .bag, by bz2 if folded, else a folder of ROS 2; a message every PERIOD_NS."""
+    """A ROS 1 bag if `path` ends in .bag, packed by bz2, else a folder of ROS 2; a message every PERIOD_NS."""
     is_ros1 = path.suffix == ".bag"
     store, ros2 = ros1_types() if is_ros1 else get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS2_HUMBLE)
     writer = Bag1Writer(path) if is_ros1 else Bag2Writer(path, version=9, storage_plugin=storage)
     if isinstance(writer, Bag2Writer):
         writer.set_compression(compression, CompressionFormat.ZSTD)
-    elif folded:
+    else:
         writer.set_compression(Bag1Writer.CompressionFormat.BZ2)
     with writer:
         connections: dict[str, Any] = {}

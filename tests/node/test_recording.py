@@ -148,10 +148,8 @@ def test_a_recording_says_who_made_it_with_what(tmp_path: Path) -> None:
     (path,) = files(tmp_path)
     told = metadata(path)
     assert told["gcd-node"]["boot_id"] == box.of("win")[0].header.boot_id
-    assert told["gcd-node/weights"]["cfg_digest"] == box.of("win")[0].header.cfg_digest
     assert told["gcd-node"]["version/torch"]
-    assert told["gcd-node/weights"]["sha256_12"] == "0" * 12
-    assert told["gcd-node/source"]["calibrated"] == "yes"
+    assert "hfov_deg" not in told["gcd-node/source"]  # it is calibrated
     launch = attachments(path)["config.toml"]
     again = parse_config(launch, "recorded")
     assert again.source.url == "rtsp://robot:***@camera/stream"
@@ -223,11 +221,8 @@ def test_camera_info_says_what_is_known_of_the_camera(known: str, tmp_path: Path
     if known == "lens":
         assert (each.distortion_model, tuple(each.d)) == ("plumb_bob", LENS.coefficients)
         np.testing.assert_array_equal(k, LENS.matrix)
-    elif known == "none":
-        assert not k.any()
     else:
-        np.testing.assert_allclose(k, [[96, 0, 95.5], [0, 96, 63.5], [0, 0, 1]])
-        np.testing.assert_allclose(np.reshape(each.p, (3, 4))[:, :3], k)
+        assert not k.any()  # uncalibrated, by ROS's rule
     info = replayed(files(tmp_path)[0])[0].info
     assert (info.lens, info.hfov_deg, info.stamp_uncertainty_us) == (lens, hfov_deg, 500)
 
