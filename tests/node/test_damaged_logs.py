@@ -27,14 +27,14 @@ from robot_logs import (
     COMPRESSED,
     IMAGE,
     INFO,
-    TOPIC,
     at,
     camera_info,
     coded,
     compressed,
+    foxglove,
+    of_pictures,
     raw,
     ros_log,
-    stamped,
     stamps,
     write_bag,
     write_foxglove,
@@ -44,7 +44,6 @@ from rosbags.rosbag2 import CompressionMode
 from runs import copied, made_run
 
 from gcd_node.errors import DamagedRunError, SourceError
-from gcd_node.frame import Image
 from gcd_node.replay.compare import compare
 from gcd_node.replay.run import MANIFEST, open_run
 from gcd_node.sources import log_reader, logs
@@ -54,15 +53,12 @@ MOST_BYTES = 2**31  # of a process that meets such a log
 BIG = 200 * 2**20
 
 
-def noisy(count: int) -> list[Image]:
-    return list(np.random.default_rng(0).integers(0, 255, (count, HEIGHT, WIDTH, 3), np.uint8))
-
-
 @pytest.mark.parametrize("is_cut", [True, False], ids=["cut", "damaged"])
 def test_a_log_plays_to_where_it_was_cut_or_is_damaged_and_says_so(
     is_cut: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = write_log(tmp_path / "log.mcap", noisy(60), compression=CompressionType.NONE, chunk_size=1 << 13)
+    images = list(np.random.default_rng(0).integers(0, 255, (60, HEIGHT, WIDTH, 3), np.uint8))
+    path = write_log(tmp_path / "log.mcap", images, compression=CompressionType.NONE, chunk_size=1 << 13)
     assert len(list(LogSource(path).frames())) == 60
     assert caplog.text == ""
     data = bytearray(path.read_bytes())
@@ -78,12 +74,10 @@ def test_a_log_plays_to_where_it_was_cut_or_is_damaged_and_says_so(
 
 def test_damaged_pictures_are_counted_and_left_out(tmp_path: Path) -> None:
     bad = [b"", b"\xff\xd8\xff nothing", coded(flat(1, 2, 3))[:200], b"GIF89a" + bytes(99)]
-    with ros_log(tmp_path / "log.mcap") as log:
-        for i in range(8):
-            message = compressed(flat(9, 9, 9), at(i))
-            log.say(TOPIC, COMPRESSED, message if i % 2 else message | {"data": bad[i // 2]}, sequence=i)
-    source = LogSource(tmp_path / "log.mcap")
-    assert [frame.seq for frame in source.frames()] == [1, 3, 5, 7]
+    good = [compressed(flat(9, 9, 9), at(i)) for i in range(8)]
+    sent = [fields if i % 2 else fields | {"data": bad[i // 2]} for i, fields in enumerate(good)]
+    source = of_pictures(tmp_path / "log.mcap", sent)
+    assert stamps(list(source.frames())) == [at(i) for i in (1, 3, 5, 7)]
     assert source.corrupt == 4
 
 
@@ -120,8 +114,7 @@ def test_a_calibration_that_lacks_what_its_name_promises_is_left_out(
     file.message_type.add(name="CameraCalibration").field.add(name="frame_id", number=2, type=9, label=1)
     pool.Add(file)
     odd = GetMessageClass(pool.FindMessageTypeByName("foxglove.CameraCalibration"))(frame_id="cam")
-    picture = CompressedImage(frame_id="cam", data=coded(flat(9, 9, 9)), format="jpeg")
-    drawn = [stamped(CompressedImage.FromString(picture.SerializeToString()), at(i)) for i in range(3)]
+    drawn = [foxglove(CompressedImage, at(i), coded(flat(9, 9, 9))) for i in range(3)]
     log = LogSource(write_foxglove(tmp_path / "log.mcap", [odd, *drawn]))
     assert len(list(log.frames())) == 3
     assert log.info.lens is None
@@ -135,13 +128,12 @@ def mutation_seeds(folder: Path) -> list[bytes]:
     for kind in CompressionType:
         seeds.append(write_log(folder / "a.mcap", small, compression=kind, checked=False).read_bytes())
     camera = CameraCalibration(width=16, height=16, K=[9.0, 0, 8, 0, 9.0, 8, 0, 0, 1.0], D=[0.1] * 5)
-    picture = CompressedImage(frame_id="cam", data=coded(flat(9, 9, 9)), format="jpeg")
-    drawn = [camera, *(stamped(CompressedImage.FromString(picture.SerializeToString()), at(i)) for i in range(3))]
-    seeds.append(write_foxglove(folder / "b.mcap", drawn, compression=none, checked=False).read_bytes())
-    with ros_log(folder / "c.mcap", compression=none, checked=False) as log:
-        log.say("/camera_info", INFO, camera_info(8, 8))
+    drawn = [camera, *(foxglove(CompressedImage, at(i), coded(flat(9, 9, 9))) for i in range(3))]
+    seeds.append(write_foxglove(folder / "b.mcap", drawn, compression=none, enable_crcs=False).read_bytes())
+    with ros_log(folder / "c.mcap", compression=none, checked=False) as say:
+        say("/camera_info", INFO, camera_info(8, 8))
         for i in range(3):
-            log.say("/image", IMAGE, raw(bytes(8 * 8 * 3), 8, 8, "bgr8", 24, at(i)))
+            say("/image", IMAGE, raw(np.zeros((8, 8, 3), np.uint8), "bgr8", at(i)))
     return [*seeds, (folder / "c.mcap").read_bytes()]
 
 
