@@ -49,20 +49,6 @@ LIVE = SourceInfo(kind="v4l2", id="t", width=100, height=100, fps_nominal=10.0, 
 START_S = 120.0  # what a busy machine may take to start a process
 
 
-class Steady(FakeSource):
-    """Noise at its rhythm until it is closed."""
-
-    def __init__(self) -> None:
-        super().__init__(10_000_000)
-        self.period_s = 0.005
-
-    def frames(self) -> Iterator[Frame]:
-        draw = np.random.default_rng(0)
-        for frame in super().frames():
-            image = draw.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-            yield Frame(image=image, stamp_ns=frame.stamp_ns, seq=frame.seq)
-
-
 def hashes(box: Box, kind: str) -> list[str]:
     return [hashlib.sha256(each.payload).hexdigest() for each in box.of(kind)]
 
@@ -73,7 +59,7 @@ def section(folder: Path, more: str = "") -> str:
 
 def ended(box: Box) -> dict[str, object]:
     """The event that says how a recording ended."""
-    (fields,) = [dict(fields) for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED"]
+    (fields,) = (dict(fields) for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED")
     return fields
 
 
@@ -227,7 +213,7 @@ def test_f22_a_full_disk_ends_the_recording_with_a_readable_file_and_the_stream_
     tmp_path: Path, small_disk: Path
 ) -> None:
     more = section(small_disk / "here", ', autostart = true, input_encoding = "raw"')
-    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, more=more, keep=False) as rig:
+    with Rig(tmp_path, lambda _: Calibrated(10_000_000), config=LOCKSTEP, more=more, keep=False) as rig:
         stopped = rig.await_event("REC_STOPPED")
         status = rig.await_status(lambda status: "REC_FAILED" in status["reasons"])
         rig.await_views(len(rig.of()) + 2)
