@@ -1,5 +1,6 @@
 """What a node saw, drew, said and was asked, as ROS 2 messages: by the definitions of rosbags, no ROS needed."""
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,15 +22,8 @@ from gcd_node.verbs import VERBS
 
 IMAGE_TOPIC, COMMAND_TOPIC = "/src/image", "/gcd/command"
 _VIEW_NAMES = {"win": "image", "cls": "classes", "std": "std", "vis": "visibility", "depth": "depth"}
-_LATEST_S = 2**31 - 1  # builtin_interfaces/Time ends in 2038
-_WORSE: Mapping[tuple[str, str], Level] = {
-    ("source", "lost"): Level.ERROR,
-    ("source", "stalled"): Level.WARN,
-    ("model", "failed"): Level.ERROR,
-    ("model", "degraded"): Level.WARN,
-    ("rec", "failed"): Level.WARN,
-}
-"""Levels of a part of the node in a state that is not all right."""
+_LEVELS = {"lost": Level.ERROR, "failed": Level.ERROR, "stalled": Level.WARN, "degraded": Level.WARN}
+"""Of a part of the node in a state that is not all right."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -147,23 +141,14 @@ def note_messages(
 
 def _diagnostics(node_id: str, fields: Mapping[str, Any]) -> Iterator[Any]:
     """One line for the node and one for each of its parts, whose message is its state, so that it can be plotted."""
-    node = {key: value for key, value in fields.items() if not isinstance(value, Mapping | list)}
-    node["reasons"] = ", ".join(map(str, fields.get("reasons", ())))
-    parts = {"node": node} | {name: part for name, part in fields.items() if isinstance(part, Mapping)}
-    for name, part in parts.items():
+    node = {key: value for key, value in fields.items() if not isinstance(value, Mapping)}
+    for name, part in [("node", node), *((key, part) for key, part in fields.items() if isinstance(part, Mapping))]:
         state = str(part.get("state", ""))
-        level = int(fields.get("level", 0)) if part is node else _WORSE.get((name, state), Level.OK)
-        pairs = [_make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in _flat(part, "")]
-        status = {"name": f"{node_id}: {name}", "message": state, "hardware_id": node_id, "values": pairs}
+        level = int(fields.get("level", 0)) if part is node else _LEVELS.get(state, Level.OK)
+        texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in part.items()}
+        values = [_make("diagnostic_msgs/msg/KeyValue", key=key, value=text) for key, text in texts.items()]
+        status = {"name": f"{node_id}: {name}", "message": state, "hardware_id": node_id, "values": values}
         yield _make("diagnostic_msgs/msg/DiagnosticStatus", level=int(level), **status)
-
-
-def _flat(fields: Mapping[str, Any], place: str) -> Iterator[tuple[str, object]]:
-    for key, value in fields.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{place}{key}.")
-        else:
-            yield f"{place}{key}", value
 
 
 def command_messages(request: bytes, reply: bytes, client: Client, log_ns: int) -> Iterator[RosMessage]:
@@ -192,12 +177,12 @@ def _make(kind: str, **fields: Any) -> Any:
 
 def _text(topic: str, text: bytes, log_ns: int, sent_ns: int, sequence: int = 0) -> RosMessage:
     fields = _make("std_msgs/msg/String", data=text.decode())
-    return RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=sent_ns, sequence=max(0, sequence))
+    return RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=sent_ns, sequence=sequence)
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    stamp = _make("builtin_interfaces/msg/Time", sec=min(seconds, _LATEST_S), nanosec=nanoseconds)
+    stamp = _make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     return _make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 

@@ -207,8 +207,8 @@ def test_a_status_is_a_diagnosis_of_every_part() -> None:
         ("gcd: model", 1, "degraded"),
         ("gcd: stages", 0, ""),
     ]
-    assert [(each.key, each.value) for each in parts[3].values] == [("age.p50_ms", "7.5")]
-    assert ("reasons", "SRC_LOST") in [(each.key, each.value) for each in parts[0].values]
+    assert [(each.key, each.value) for each in parts[3].values] == [("age", '{"p50_ms": 7.5}')]
+    assert ("reasons", '["SRC_LOST"]') in [(each.key, each.value) for each in parts[0].values]
 
 
 @pytest.mark.parametrize("known", ["stated", "source", "lens", "none"])
