@@ -2,9 +2,9 @@
 
 import contextlib
 import logging
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -14,7 +14,7 @@ import numpy as np
 
 from gcd_model import printable
 from gcd_node.errors import SourceError, TooShortError
-from gcd_node.frame import MAX_FPS, Frame, SourceInfo
+from gcd_node.frame import MAX_FPS, Frame, Image, SourceInfo
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.files import Pace, Recording
 from gcd_node.sources.log_messages import Cameras, ImageDecoder, depth_of, head_of, pose_of
@@ -116,26 +116,6 @@ class LogSource(Recording):
         return nearest if is_near else None
 
 
-@dataclass(slots=True)
-class _Pictures:
-    """What was seen of one topic. stamps_ns: of their headers, and when they were sent. size, codec: of a picture that
-    could be decoded."""
-
-    decoder: ImageDecoder = field(default_factory=ImageDecoder)
-    stamps_ns: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
-    frame_id: str = ""
-    size: tuple[int, int] = (0, 0)
-    codec: str = ""
-
-    def add(self, message: LogMessage) -> None:
-        """Count a message. Raises as a library does if it is damaged."""
-        fields = message.decode()
-        stamp_ns, self.frame_id = head_of(fields)
-        if not self.codec and (decoded := self.decoder.decode(message.kind, fields)) is not None:
-            self.size, self.codec = decoded[0].shape[1::-1], decoded[1]
-        self.stamps_ns.append((stamp_ns, message.sent_ns))
-
-
 class _Survey:
     """The first seconds of a log, or as much of it as it takes to find the pictures and what goes along with them.
 
@@ -145,53 +125,63 @@ class _Survey:
     def __init__(self, path: Path, wanted: str | None, companions: set[str]) -> None:
         """See LogSource. companions: topics of depth and odometry."""
         self._reader, self._wanted, self._companions = LogReader(path, _SEARCH_S), wanted, companions
-        self._pictures, self.cameras = dict[str, _Pictures](), Cameras()
-        self._troubles: dict[str, str] = {}  # by topic: why a message is left out
+        self._first: dict[str, tuple[str, Image, str]] = {}  # of each topic: frame_id, picture and what it was coded as
+        self._stamps_ns = defaultdict[str, list[tuple[int, int]]](list)  # of the header, and when it was sent
+        self.cameras = Cameras()
         try:
-            self._read()
+            notes = self._read()
         except SourceError as limit:
-            self._reader.trouble = str(limit)
-        usable, missing = self._usable(), companions - self._reader.topics.keys()
+            notes, self._reader.trouble = {}, str(limit)
+        usable, missing, topics = self._usable(), companions - self._reader.topics.keys(), self._reader.topics | notes
         if missing or len(usable) != 1:
             lack = f"pictures on {_shown(usable)}: say which with topic in [source]" if usable else "no pictures"
-            topics = [f"{name} ({self._troubles.get(name, kind)})" for name, kind in self._reader.topics.items()]
             raise SourceError(
                 f"{path} has {f'no topic {_shown(missing)}' if missing else lack}; wanted are pictures on "
-                f"{self._wanted or 'one topic'}, its topics are {_shown(topics)}. {self._reader.trouble}"
+                f"{wanted or 'one topic'}, it has {_shown(map(' as '.join, topics.items()))}. {self._reader.trouble}"
             )
-        [(self.topic, chosen)] = usable.items()
-        self.frame_id, self.header_stamps = chosen.frame_id, chosen.stamps_ns[-1][0] > chosen.stamps_ns[0][0]
-        self.info = self._describe(path, chosen)
+        (self.topic,) = usable
+        stamps_ns = self._stamps_ns[self.topic]
+        self.header_stamps = stamps_ns[-1][0] > stamps_ns[0][0]
+        self.frame_id, picture, codec = self._first[self.topic]
+        self.info = self._describe(path, picture, codec)
 
-    def _read(self) -> None:
-        end_ns = None
+    def _read(self) -> dict[str, str]:
+        """Returns why messages are damaged, by topic."""
+        end_ns, troubles, decoders = None, dict[str, str](), defaultdict[str, ImageDecoder](ImageDecoder)
         for message in self._reader.messages():
+            topic = message.topic
             try:
-                if message.kind in PICTURES and message.topic not in self._companions:
-                    self._pictures.setdefault(message.topic, _Pictures()).add(message)
+                if message.kind in PICTURES and topic not in self._companions:
+                    fields = message.decode()
+                    stamp_ns, frame_id = head_of(fields)
+                    if topic not in self._first and (found := decoders[topic].decode(message.kind, fields)):
+                        self._first[topic] = frame_id, *found
+                    self._stamps_ns[topic].append((stamp_ns, message.sent_ns))
                 else:
                     self.cameras.add(message)
-            except Exception as error:  # of a library, or SourceError: the message is damaged
-                self._troubles[message.topic] = line_of(error)
+            except Exception as error:  # of a library, or SourceError
+                troubles[topic] = line_of(error)
             end_ns = end_ns or message.log_ns + _SURVEYED_NS
             if (
                 message.log_ns > end_ns
                 and self._companions <= self._reader.topics.keys()
-                and any(len(each.stamps_ns) > 1 for each in self._usable().values())
+                and any(len(self._stamps_ns[name]) > 1 for name in self._usable())
             ):
-                return
+                break
+        return troubles
 
     def _own(self, name: str) -> dict[str, str]:
         """What a recording of this node says of itself; nothing of other logs."""
         return self._reader.metadata.get(name, {})
 
-    def _usable(self) -> dict[str, _Pictures]:
-        """Whose pictures can be decoded, and are wanted; of a recording of this node its input."""
+    def _usable(self) -> list[str]:
+        """Topics whose pictures can be decoded, and are wanted; of a recording of this node its input."""
         wanted = self._wanted or self._own("gcd-node").get("input_topic")
-        return {name: each for name, each in self._pictures.items() if each.codec and wanted in (None, name)}
+        return [name for name in self._first if wanted in (None, name)]
 
-    def _describe(self, path: Path, chosen: _Pictures) -> SourceInfo:
-        stamps = [header_ns if self.header_stamps else sent_ns for header_ns, sent_ns in chosen.stamps_ns]
+    def _describe(self, path: Path, picture: Image, codec: str) -> SourceInfo:
+        height, width = picture.shape[:2]
+        stamps = [header_ns if self.header_stamps else sent_ns for header_ns, sent_ns in self._stamps_ns[self.topic]]
         steps = [later - earlier for earlier, later in pairwise(stamps) if later > earlier]
         if not steps:
             raise TooShortError(f"TOO_SHORT n={len(stamps)}: pictures on {self.topic} of {path} make no video")
@@ -201,12 +191,12 @@ class _Survey:
         info = SourceInfo(
             kind="mcap",
             id=path.name,
-            width=chosen.size[0],
-            height=chosen.size[1],
+            width=width,
+            height=height,
             fps_nominal=fps,
             clock="replay",
-            codec=chosen.codec,
-            lens=self.cameras.lens(self.topic, chosen.size),
+            codec=codec,
+            lens=self.cameras.lens(self.topic, (width, height)),
             stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if self.header_stamps else round(1e6 / fps),
         )
         facts = self._own("gcd-node/source") if self.topic == self._own("gcd-node").get("input_topic") else {}
