@@ -33,7 +33,7 @@ from gcd_client.images import depth_m, images
 from gcd_client.protocol import to_json
 from gcd_node.config import parse_config
 from gcd_node.ros_messages import note_messages, view_messages
-from gcd_node.sources.log_messages import pose_of
+from gcd_node.sources.logs import pose_of
 
 pytestmark = pytest.mark.timeout(120)
 
