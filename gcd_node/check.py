@@ -29,8 +29,8 @@ from gcd_node.auth import load_server_security
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError, NodeError, SourceError
 from gcd_node.frame import SourceInfo
-from gcd_node.mcap_file import RoomError, check_room
 from gcd_node.preprocess import in_words
+from gcd_node.recorder import RoomError, check_room
 from gcd_node.session import load_model, model_threads, open_session
 from gcd_node.sources import open_source
 from gcd_node.stream_context import StreamContext, drawing_options, family_name, prepare_stream, sampler_in_use

@@ -22,16 +22,8 @@ from gcd_node.verbs import VERBS
 
 IMAGE_TOPIC, COMMAND_TOPIC = "/src/image", "/gcd/command"
 _VIEW_NAMES = {"win": "image", "cls": "classes", "std": "std", "vis": "visibility", "depth": "depth"}
-_LATEST_S = 2**31 - 1  # builtin_interfaces/Time ends in 2038
-_LONGEST_ARGS = 4096
-_WORSE: Mapping[tuple[str, str], Level] = {
-    ("source", "lost"): Level.ERROR,
-    ("source", "stalled"): Level.WARN,
-    ("model", "failed"): Level.ERROR,
-    ("model", "degraded"): Level.WARN,
-    ("rec", "failed"): Level.WARN,
-}
-"""Levels of a part of the node in a state that is not all right."""
+_LEVELS = {"lost": Level.ERROR, "failed": Level.ERROR, "stalled": Level.WARN, "degraded": Level.WARN}
+"""Of a part of the node in a state that is not all right."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -66,25 +58,18 @@ def serialized(fields: Any) -> memoryview:
 # Inputs and views.
 
 
-def input_messages(
-    frame: Frame, info: SourceInfo, stamp_ns: int, log_ns: int, record: RecordConfig
-) -> Iterator[RosMessage]:
-    """A frame and its camera. info: with the lens and the field of view in use. stamp_ns: when it was captured, UTC of
-    a live source."""
-    head, size = _header(stamp_ns, f"{info.kind}_optical"), frame.size
+def input_messages(frame: Frame, info: SourceInfo, log_ns: int, record: RecordConfig) -> Iterator[RosMessage]:
+    """A frame, of a live source with its stamp in UTC, and its camera. info: with the calibration in use."""
+    head, size = _header(frame.stamp_ns, f"{info.kind}_optical"), frame.size
     if record.input_encoding == "raw":
         picture = _image(head, frame.image)
     else:
         picture = _jpeg(head, encode_jpegs(frame.image[None], record.jpeg_quality)[0])
+    camera = _camera_info(head, size, (0.0,) * 9, "", ())  # unknown, by ROS's rule
     if info.lens is not None and info.lens.fits(*size):
         lens = info.lens.resized(*size)
         kind = "plumb_bob" if lens.distortion == "none" else lens.distortion
         camera = _camera_info(head, size, lens.matrix, kind, lens.coefficients or (0.0,) * 5)
-    elif info.lens is None and info.hfov_deg is not None:
-        focal = size[0] / 2 / math.tan(math.radians(info.hfov_deg / 2))
-        camera = _camera_info(head, size, (focal, 0, (size[0] - 1) / 2, 0, focal, (size[1] - 1) / 2, 0, 0, 1))
-    else:
-        camera = _camera_info(head, size, (0.0,) * 9, "", ())  # unknown, by ROS's rule
     for topic, fields in ((IMAGE_TOPIC, picture), ("/src/camera_info", camera)):
         yield RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=log_ns, sequence=frame.seq)
 
@@ -142,54 +127,41 @@ def _pictures(message: ViewMessage, heads: Sequence[Any], quality: int) -> list[
 
 
 def note_messages(
-    kind: StatusTopic, header: OriginHeader, fields: Mapping[str, Any], log_ns: int
+    kind: StatusTopic, header: OriginHeader, fields: Mapping[str, Any], begun_ns: int
 ) -> Iterator[RosMessage]:
-    """A status, an event or the metadata; a status also as diagnostics. log_ns: when it was said, or is said again."""
-    sent_ns = header.t_publish_ns
-    yield _text(f"/gcd/{kind}", to_text(header, fields), log_ns, sent_ns)
+    """A status, an event or the metadata; a status also as diagnostics. begun_ns: of the file; what was said before is
+    said again at its begin."""
+    times = {"log_ns": max(header.t_publish_ns, begun_ns), "sent_ns": header.t_publish_ns}
+    yield _text(f"/gcd/{kind}", to_text(header, fields), **times)
     if kind == "status":
         parts = list(_diagnostics(header.node_id, fields))
-        array = _make("diagnostic_msgs/msg/DiagnosticArray", header=_header(sent_ns, ""), status=parts)
-        yield RosMessage(topic="/diagnostics", fields=array, log_ns=sent_ns, sent_ns=sent_ns)
+        array = _make("diagnostic_msgs/msg/DiagnosticArray", header=_header(header.t_publish_ns, ""), status=parts)
+        yield RosMessage(topic="/diagnostics", fields=array, **times)
 
 
 def _diagnostics(node_id: str, fields: Mapping[str, Any]) -> Iterator[Any]:
     """One line for the node and one for each of its parts, whose message is its state, so that it can be plotted."""
-    node = {key: value for key, value in fields.items() if not isinstance(value, Mapping | list)}
-    node["reasons"] = ", ".join(map(str, fields.get("reasons", ())))
-    parts = {"node": node} | {name: part for name, part in fields.items() if isinstance(part, Mapping)}
-    for name, part in parts.items():
+    node = {key: value for key, value in fields.items() if not isinstance(value, Mapping)}
+    for name, part in [("node", node), *((key, part) for key, part in fields.items() if isinstance(part, Mapping))]:
         state = str(part.get("state", ""))
-        level = int(fields.get("level", 0)) if part is node else _WORSE.get((name, state), Level.OK)
-        pairs = [_make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in _flat(part, "")]
-        status = {"name": f"{node_id}: {name}", "message": state, "hardware_id": node_id, "values": pairs}
+        level = int(fields.get("level", 0)) if part is node else _LEVELS.get(state, Level.OK)
+        texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in part.items()}
+        values = [_make("diagnostic_msgs/msg/KeyValue", key=key, value=text) for key, text in texts.items()]
+        status = {"name": f"{node_id}: {name}", "message": state, "hardware_id": node_id, "values": values}
         yield _make("diagnostic_msgs/msg/DiagnosticStatus", level=int(level), **status)
 
 
-def _flat(fields: Mapping[str, Any], place: str) -> Iterator[tuple[str, object]]:
-    for key, value in fields.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{place}{key}.")
-        else:
-            yield f"{place}{key}", value
-
-
 def command_messages(request: bytes, reply: bytes, client: Client, log_ns: int) -> Iterator[RosMessage]:
-    """A request and its reply. Questions that were answered change nothing and are left out."""
+    """A request and its reply, as one object. Questions that were answered change nothing and are left out."""
     asked, answered = _object(request), _object(reply)
     verb = VERBS.get(str(asked.get("verb")))
-    if answered.get("ok") is True and verb is not None and verb.role == "viewer":
-        return
-    fields = {key: answered.get(key) for key in ("id", "code", "message", "state")}
-    fields |= {"client": client.name, "role": client.role, "verb": str(asked.get("verb", ""))[:64]}
-    fields |= {key: asked[key] for key in ("dry_run", "if_view_rev") if isinstance(asked.get(key), bool | int)}
-    args = json.dumps(asked.get("args", {}))
-    fields |= {"args": asked.get("args", {})} if len(args) <= _LONGEST_ARGS else {"args_cut": args[:_LONGEST_ARGS]}
-    yield _text(COMMAND_TOPIC, json.dumps(fields).encode(), log_ns, log_ns)
+    if not (answered.get("ok") is True and verb is not None and verb.role == "viewer"):
+        fields = asked | answered | {"client": client.name, "role": client.role}
+        yield _text(COMMAND_TOPIC, msgspec.json.encode(fields), log_ns, log_ns)
 
 
 def _object(text: bytes) -> dict[str, Any]:
-    """What a client sent, if it is a JSON object; NaN, which few readers know, is no JSON."""
+    """What a client sent, if it is a JSON object."""
     try:
         return msgspec.json.decode(text, type=dict[str, Any])
     except (ValueError, RecursionError):
@@ -205,12 +177,12 @@ def _make(kind: str, **fields: Any) -> Any:
 
 def _text(topic: str, text: bytes, log_ns: int, sent_ns: int, sequence: int = 0) -> RosMessage:
     fields = _make("std_msgs/msg/String", data=text.decode())
-    return RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=sent_ns, sequence=max(0, sequence))
+    return RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=sent_ns, sequence=sequence)
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    stamp = _make("builtin_interfaces/msg/Time", sec=min(seconds, _LATEST_S), nanosec=nanoseconds)
+    stamp = _make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     return _make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 

@@ -1,24 +1,23 @@
 """Messages of robot logs, front to back: MCAP files, ROS 2 bags (folders and .db3 files) and ROS 1 bags.
 
 `mcap` and `rosbags` read what is there; how much and how long is limited here, because a log of a few kB can unfold
-into gigabytes. ROS messages are read by the definitions that ship with rosbags, whatever the log says of them. What is
-damaged in a way that is not looked for raises whatever the library does that found it.
+into gigabytes. ROS messages are read by the definitions that ship with rosbags, whatever the log says of them. A file
+that was cut or is damaged ends there.
 """
 
 import bz2
+import contextlib
 import functools
 import io
 import logging
 import re
-import shutil
-import tempfile
 import time
 import zlib
-from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, cast
+from types import SimpleNamespace
+from typing import IO, Any, Literal, TypeAlias, cast
 
 import lz4.frame
 import msgspec
@@ -32,297 +31,205 @@ from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from gcd_model import FileError, printable, read_small
+from gcd_model import printable
 from gcd_node.errors import SourceError
 
 _LOG = logging.getLogger(__name__)
 
-CODED_IMAGES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
-VIDEOS = frozenset({"foxglove.CompressedVideo", "foxglove_msgs/msg/CompressedVideo"})
-IMAGES = CODED_IMAGES | VIDEOS | {"sensor_msgs/msg/Image", "foxglove.RawImage"}
-CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
-ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
-_READABLE = IMAGES | CAMERAS | {ODOMETRY, TRANSFORMS}
+Kind: TypeAlias = Literal["raw", "coded", "video", "camera", "odometry", "transforms"]
+KINDS: dict[str, Kind] = {
+    "sensor_msgs/msg/Image": "raw",
+    "foxglove.RawImage": "raw",
+    "sensor_msgs/msg/CompressedImage": "coded",
+    "foxglove.CompressedImage": "coded",
+    "foxglove.CompressedVideo": "video",
+    "foxglove_msgs/msg/CompressedVideo": "video",
+    "sensor_msgs/msg/CameraInfo": "camera",
+    "foxglove.CameraCalibration": "camera",
+    "nav_msgs/msg/Odometry": "odometry",
+    "tf2_msgs/msg/TFMessage": "transforms",
+}
+"""Types of messages that are read."""
+PICTURES = frozenset[Kind](("raw", "coded", "video"))
 
 MAX_BYTES = 96 * 2**20
 """Of a record, of an unfolded chunk, and of an unfolded message."""
 _MAX_KEPT = 16 * 2**20  # of all topics and definitions together
-_HEADS = {b"\x89MCAP0\r\n": ".mcap", b"#ROSBAG V": ".bag", b"SQLite format 3\0": ".db3"}
-_MODE = re.compile(r"compression_mode:\s*[\"']?(message|file)", re.IGNORECASE)
-_ROS1_TYPE = re.compile(r"^(\w+)/(\w+)$")
-
-
-class LogLimitError(SourceError):
-    """A log takes more time or memory than it may, or nobody waits for it any more."""
+_SUFFIXES = (".mcap", ".db3", ".bag")
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LogMessage:
-    """One message. kind: its type. sequence: as recorded, may stay 0. log_ns, sent_ns: when it was recorded and sent.
-
-    decode: gives its fields, by the names its definition has. Raises whatever the library does if it is damaged.
-    """
+    """One message. sequence: as recorded, may stay 0. log_ns, sent_ns: when it was recorded and sent."""
 
     topic: str
-    kind: str
-    sequence: int
+    kind: Kind
+    read: Callable[[bytes], Any]
+    data: bytes
     log_ns: int
     sent_ns: int
-    decode: Callable[[], Any]
+    sequence: int = 0
+
+    def decode(self) -> Any:
+        """Its fields, by the names its definition has. Raises whatever the library does if it is damaged."""
+        return self.read(self.data)
 
 
 class LogReader:
-    """One reading of a log. `messages` gives those of the types in this file.
+    """One reading of a log. `messages` gives those of KINDS.
 
-    damaged: chunks left out so far. topics: every one so far, and the type of its messages. metadata: what a recording
-    of this node says of itself, by name.
+    topics: every one so far, and the type of its messages. metadata: what a recording of this node says of itself, by
+    name. trouble: why a file of it ended early, "" if none did.
     """
 
     def __init__(self, path: Path, search_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Look at what is there.
+        """Look for its files.
 
         Args:
             search_s: time to find something in it; `renew` it with every find. stopped: whether to give up at once.
         Raises:
-            SourceError: it is missing, empty or no log.
+            SourceError: it is missing or no log.
         """
-        self._path, self._search_s, self._stopped = path, search_s, stopped
-        try:
-            self._files, self._packed = _files_of(path) if path.is_dir() else ([path], "")
-            if not self._files or (not path.is_dir() and _kind_of(path) is None):
-                raise SourceError(f"{path} is no log, empty or missing; give an MCAP file, a ROS bag or its folder")
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise SourceError(f"cannot read the log {path}: {reason}; check path and permissions") from error
-        self.renew()
-        self.damaged = self._kept_bytes = 0
+        self._files, self._search_s, self._stopped = _files_of(path), search_s, stopped
+        self._kept_bytes, self.trouble = 0, ""
         self.topics: dict[str, str] = {}
         self.metadata: dict[str, dict[str, str]] = {}
+        self.renew()
 
     def renew(self) -> None:
         """Begin to search anew, now."""
         self._end_s = time.monotonic() + self._search_s
 
     def messages(self) -> Iterator[LogMessage]:
-        """Messages of one file after the other.
-
-        Raises:
-            SourceError: it cannot be read at all. LogLimitError: see there.
-        """
+        """Messages of one file after the other. Raises SourceError: nothing was found in time."""
         for file in self._files:
             try:
-                with _unpacked(file) if self._packed == "file" else nullcontext(file) as plain:
-                    kind = _kind_of(plain)
-                    yield from (
-                        self._bag(plain, is_ros1=kind == ".bag") if kind in (".bag", ".db3") else self._mcap(plain)
-                    )
-            except zstandard.ZstdError as error:
-                raise SourceError(f"{file} cannot be unpacked: {line_of(error)}") from error
-            except OSError as error:
-                raise SourceError(f"cannot read {file}: {error.strerror or error}; check the disk") from error
+                yield from self._mcap(file) if file.suffix == ".mcap" else self._bag(file)
+            except SourceError:
+                if self._stopped():
+                    return
+                raise
+            except Exception as error:  # of a library, a decompressor or the disk
+                remedy = "mcap recover" if file.suffix == ".mcap" else "ros2 bag reindex, or rosbag reindex"
+                self.trouble = f"{file.name} was not finished, or is damaged: {line_of(error)}; try {remedy}"
+                _LOG.warning("%s; it is read up to there", self.trouble)
 
     def _check(self) -> None:
         if time.monotonic() > self._end_s or self._stopped():
-            raise LogLimitError(f"nothing was found in {self._search_s:g} s of reading")
+            raise SourceError(
+                f"nothing was found in {self._search_s:g} s of reading: cut the log to the pictures: "
+                "mcap filter LOG -y TOPIC -o NEW"
+            )
 
     def _mcap(self, file: Path) -> Iterator[LogMessage]:
         known: dict[tuple[type, int], Schema | Channel] = {}
-        readable: dict[int, tuple[str, str, Callable[[bytes], Any]]] = {}  # topic, type and what reads it
-        for record in self._records(functools.partial(file.open, "rb")):
-            if isinstance(record, Message):
-                if record.channel_id in readable:
-                    topic, kind, decode = readable[record.channel_id]
-                    yield LogMessage(
-                        topic=topic,
-                        kind=kind,
-                        sequence=record.sequence,
-                        log_ns=record.log_time,
-                        sent_ns=record.publish_time,
-                        decode=functools.partial(self._decoded, decode, record.data),
-                    )
-            elif isinstance(record, Schema | Channel):
-                if known.get(key := (type(record), record.id)) != record:  # many writers repeat them
+        readable: dict[int, Callable[..., LogMessage]] = {}  # what makes one, by channel
+        with file.open("rb") as stream:
+            for record in self._records(stream):
+                if isinstance(record, Message) and record.channel_id in readable:
+                    times = {"log_ns": record.log_time, "sent_ns": record.publish_time}
+                    yield readable[record.channel_id](data=record.data, sequence=record.sequence, **times)
+                elif isinstance(record, Metadata) and record.name.startswith("gcd-node"):
                     self._keep(record)
+                    self.metadata[record.name] = record.metadata
+                elif isinstance(record, Schema | Channel) and known.get(key := (type(record), record.id)) != record:
+                    self._keep(record)  # many writers repeat them
                     known[key] = record
-                    if isinstance(record, Channel):
-                        kind, decode = _decoder_of(record, known.get((Schema, record.schema_id)))
-                        self.topics[record.topic] = kind
-                        if decode is not None:
-                            readable[record.id] = record.topic, kind, decode
-            elif isinstance(record, Metadata) and record.name.startswith("gcd-node"):
-                self._keep(record)
-                self.metadata[record.name] = record.metadata
+                    if isinstance(record, Channel) and isinstance(
+                        schema := known.get((Schema, record.schema_id)), Schema
+                    ):
+                        self.topics[record.topic] = schema.name
+                        if schema.name in KINDS and (read := _decoder_of(record.message_encoding, schema)):
+                            kind = KINDS[schema.name]
+                            readable[record.id] = functools.partial(
+                                LogMessage, topic=record.topic, kind=kind, read=read
+                            )
 
-    def _records(self, open_stream: Callable[[], IO[bytes]], *, in_chunk: bool = False) -> Iterator[McapRecord]:
-        """Everything before the index, chunks unfolded; of what was cut or is damaged, what is whole."""
-        try:
-            with open_stream() as stream:
-                limited = cast(IO[bytes], _LimitedStream(stream, self._check))
-                reader = StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=MAX_BYTES)
-                for record in reader.records:
-                    if isinstance(record, DataEnd):
-                        return
-                    if isinstance(record, Chunk) and not in_chunk:
-                        yield from self._records(functools.partial(_unfolded, record), in_chunk=True)
-                    else:
-                        yield record
-        except (LogLimitError, OSError):
-            raise
-        except Exception as error:  # of the library, or of its decompressors
-            if in_chunk and isinstance(error, EndOfFile):
-                return  # of the chunk
-            what = "a part is left out" if in_chunk else "it was not finished, or is damaged, and is read up to there"
-            _LOG.log(
-                logging.DEBUG if in_chunk and self.damaged else logging.WARNING,
-                "%s: %s: %s",
-                self._path,
-                what,
-                line_of(error),
-            )
-            self.damaged += in_chunk
+    def _records(self, stream: IO[bytes], *, in_chunk: bool = False) -> Iterator[McapRecord]:
+        """Everything before the index, chunks unfolded."""
+
+        def read(size: int) -> bytes:
+            self._check()
+            if size > MAX_BYTES:
+                raise ValueError(f"it states {size} bytes at once, more than {MAX_BYTES}")
+            return stream.read(size)
+
+        limited = cast(IO[bytes], SimpleNamespace(read=read))
+        reader = StreamReader(limited, skip_magic=in_chunk, emit_chunks=True, record_size_limit=MAX_BYTES)
+        for record in reader.records:
+            if isinstance(record, DataEnd):
+                return
+            if isinstance(record, Chunk) and not in_chunk:
+                with contextlib.suppress(EndOfFile):  # of the chunk
+                    yield from self._records(io.BytesIO(_unfolded_chunk(record)), in_chunk=True)
+            else:
+                yield record
 
     def _keep(self, record: McapRecord) -> None:
         self._kept_bytes += len(msgspec.json.encode(vars(record)))
         if self._kept_bytes > _MAX_KEPT:
-            raise LogLimitError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")
+            raise ValueError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")
 
-    def _bag(self, path: Path, *, is_ros1: bool) -> Iterator[LogMessage]:
-        decode = ros1_types().deserialize_ros1 if is_ros1 else ros2_types().deserialize_cdr
-        try:
-            with Ros1Reader(path) if is_ros1 else Ros2Reader(path) as reader:
-                self.topics |= {each.topic: each.msgtype for each in reader.connections}
-                if isinstance(reader, Ros1Reader):  # which lets a chunk unfold to whatever it holds
-                    for place, chunk in reader.chunks.items():
-                        kinds = {bz2.decompress: "bz2", lz4.frame.decompress: "lz4"}
-                        if kind := kinds.get(chunk.decompressor):
-                            limited = functools.partial(unfolded, compression=kind)
-                            reader.chunks[place] = chunk._replace(decompressor=limited)
-                wanted = [each for each in reader.connections if each.msgtype in _READABLE]
-                for connection, at_ns, data in reader.messages(connections=wanted) if wanted else ():
-                    self._check()
-                    kind = connection.msgtype
-                    read = functools.partial(self._decoded, functools.partial(decode, typename=kind), data)
-                    yield LogMessage(
-                        topic=connection.topic, kind=kind, sequence=0, log_ns=at_ns, sent_ns=at_ns, decode=read
-                    )
-        except (LogLimitError, OSError):
-            raise
-        except Exception as error:  # of rosbags, SQLite or a decompressor
-            raise SourceError(
-                f"{path} cannot be read as a ROS bag: {line_of(error)}; try ros2 bag reindex, or rosbag reindex"
-            ) from error
-
-    def _decoded(self, decode: Callable[[bytes], Any], data: bytes) -> Any:
-        """What a message says, unfolded first where each is packed for itself."""
-        return decode(unfolded(data, "zstd") if self._packed == "message" else data)
+    def _bag(self, file: Path) -> Iterator[LogMessage]:
+        with Ros1Reader(file) if file.suffix == ".bag" else Ros2Reader(file) as reader:
+            self.topics |= {each.topic: each.msgtype for each in reader.connections}
+            decode = _decoded_cdr
+            if isinstance(reader, Ros1Reader):  # which lets a chunk unfold to whatever it holds
+                decode = ros1_types().deserialize_ros1
+                for place, chunk in reader.chunks.items():
+                    kinds = {bz2.decompress: "bz2", lz4.frame.decompress: "lz4"}
+                    if kind := kinds.get(chunk.decompressor):
+                        limited = functools.partial(unfolded, compression=kind)
+                        reader.chunks[place] = chunk._replace(decompressor=limited)
+            wanted = [each for each in reader.connections if each.msgtype in KINDS]
+            for connection, at_ns, data in reader.messages(connections=wanted) if wanted else ():
+                self._check()
+                read = functools.partial(decode, typename=connection.msgtype)
+                kind = KINDS[connection.msgtype]
+                yield LogMessage(topic=connection.topic, kind=kind, read=read, data=data, log_ns=at_ns, sent_ns=at_ns)
 
 
-# Files, and how they are packed.
-
-
-def _kind_of(file: Path) -> str | None:
-    """By its first bytes: ".mcap", ".bag" of ROS 1, ".db3" of ROS 2; None if it is none, or no regular file."""
-    if not file.is_file():  # to open a pipe would wait for its writer
-        return None
-    with file.open("rb") as stream:
-        head = stream.read(max(map(len, _HEADS)))
-    return next((kind for begin, kind in _HEADS.items() if head.startswith(begin)), None)
-
-
-def _files_of(folder: Path) -> tuple[list[Path], str]:
-    """What is read one after another, the files of one recording in the order of their numbers; and what is packed:
-    each "message", each "file", or "". Raises SourceError: there are several logs."""
-    metadata, mode = folder / "metadata.yaml", None
-    if metadata.is_file():
-        try:
-            mode = _MODE.search(read_small(metadata))
-        except FileError as error:
-            raise SourceError(f"{metadata} {error}; run ros2 bag reindex") from error
-    packed = "" if mode is None else mode[1].lower()
+def _files_of(path: Path) -> list[Path]:
+    """What is read one after another: one file, or those of a folder, by their numbers. Raises SourceError."""
     found: list[Path] = []
-    for suffix in (".mcap", ".db3"):
-        pattern = f"*{suffix}{'.zstd' if packed == 'file' else ''}"
-        files = [file for file in folder.glob(pattern) if file.is_file()]
-        found = found or sorted(files, key=lambda file: (len(file.name), file.name))
-    if not metadata.is_file() and len({re.sub(r"_?\d*$", "", file.stem) for file in found}) > 1:
-        raise SourceError(f"{folder} is a folder of several logs; give one of them, such as {found[0].name}")
-    return found, packed
+    try:
+        for suffix in _SUFFIXES:  # to open a pipe would wait for its writer
+            files = path.glob(f"*{suffix}") if path.is_dir() else (path,) if path.suffix == suffix else ()
+            found = found or [file for file in files if file.is_file()]
+        is_one = (path / "metadata.yaml").is_file() or len({re.sub(r"_?\d*$", "", each.stem) for each in found}) < 2
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise SourceError(f"cannot read the log {path}: {reason}; check path and permissions") from error
+    if not found:
+        raise SourceError(
+            f"{path} is no log or missing; give a {', '.join(_SUFFIXES)} file, or the folder of a bag; unpack one that "
+            "was recorded with --compression-mode file: zstd -d FOLDER/*.zstd"
+        )
+    if not is_one:
+        raise SourceError(f"{path} is a folder of several logs; give one of them, such as {found[0].name}")
+    return sorted(found, key=lambda file: (len(file.name), file.name))
 
 
-@contextmanager
-def _unpacked(file: Path) -> Generator[Path]:
-    """A file that was packed whole, in a folder of its own for as long. It takes half of the free room at most."""
-    with tempfile.TemporaryDirectory(prefix="gcd-node-") as folder:
-        most, plain = shutil.disk_usage(folder).free // 2, Path(folder, file.stem)
-        with file.open("rb") as packed, plain.open("wb") as out:
-            for part in zstandard.ZstdDecompressor().read_to_iter(packed):
-                most -= len(part)
-                if most < 0:
-                    raise SourceError(f"{file} unpacks to more than half of the room in {folder}; unpack it elsewhere")
-                out.write(part)
-        yield plain
+def _unfolded_chunk(chunk: Chunk) -> bytes:
+    """Its records. The library itself would let a decompressor write more than the chunk states."""
+    data = unfolded(chunk.data, chunk.compression) if chunk.compression else chunk.data
+    if len(data) != chunk.uncompressed_size or zlib.crc32(data) != (chunk.uncompressed_crc or zlib.crc32(data)):
+        raise ValueError("size or checksum of a chunk is wrong")
+    return data
 
 
-def unfolded(data: bytes, compression: str, most: int | None = None) -> bytes:
-    """The content of a packed message or chunk: "zstd", "lz4" or "bz2". most: bytes, None for MAX_BYTES.
-
-    Raises SourceError if there are more.
-    """
-    most = MAX_BYTES if most is None else most
+def unfolded(data: bytes, compression: str) -> bytes:
+    """The content of a packed message or chunk: "zstd", "lz4" or "bz2". Raises ValueError: over MAX_BYTES."""
     if compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as unfolding:
-            content = io.BufferedReader(cast(io.RawIOBase, unfolding)).read(most + 1)
+        with zstandard.ZstdDecompressor().stream_reader(data) as unfolding:
+            content = unfolding.read(MAX_BYTES + 1)
     else:
         decompressor = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
-        content = cast(Any, decompressor).decompress(data, max_length=most + 1)
-    if len(content) > most:
-        raise SourceError(f"a packed part holds more than {most} bytes")
+        content = cast(Any, decompressor).decompress(data, max_length=MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"a packed part holds more than {MAX_BYTES} bytes")
     return content
-
-
-class _LimitedStream:
-    """What `mcap` reads from: only while `check` raises nothing, and never very much at once."""
-
-    def __init__(self, stream: IO[bytes], check: Callable[[], None]) -> None:
-        self._stream, self._check = stream, check
-
-    def read(self, size: int) -> bytes:
-        """As of a file. Raises LogLimitError; EndOfFile for a length that cannot be."""
-        self._check()
-        if size > MAX_BYTES:
-            raise EndOfFile(f"{size} bytes at once, more than {MAX_BYTES}")
-        return self._stream.read(size)
-
-
-def _unfolded(chunk: Chunk) -> IO[bytes]:
-    """Its records. The library itself would let a decompressor write more than the chunk states."""
-    size = chunk.uncompressed_size
-    if size > MAX_BYTES:
-        raise SourceError(f"a chunk states {size} bytes, more than {MAX_BYTES}")
-    records = unfolded(chunk.data, chunk.compression, size) if chunk.compression in ("zstd", "lz4") else chunk.data
-    if len(records) != size:
-        raise SourceError(f"a chunk states {size} bytes and holds {len(records)}: it is damaged")
-    if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
-        raise SourceError("the checksum of a chunk is wrong: it is damaged")
-    return io.BytesIO(records)
-
-
-def _decoder_of(channel: Channel, schema: Any) -> tuple[str, Callable[[bytes], Any] | None]:
-    """The type of a channel's messages, and what reads them; None if nothing does, or nobody needs them."""
-    if schema is None:
-        return "", None
-    encoding = channel.message_encoding
-    kind = _ROS1_TYPE.sub(r"\1/msg/\2", schema.name) if encoding == "ros1" else schema.name
-    if kind not in _READABLE:
-        return kind, None
-    if encoding in ("cdr", "ros1"):
-        decode = ros2_types().deserialize_cdr if encoding == "cdr" else ros1_types().deserialize_ros1
-        return kind, lambda data: decode(data, kind)
-    try:
-        return kind, DecoderFactory().decoder_for(encoding, schema)
-    except Exception as error:  # of protobuf: the definition is damaged
-        _LOG.warning("messages of type %s cannot be read: %s", kind, line_of(error))
-        return kind, None
 
 
 def line_of(error: Exception) -> str:
@@ -331,6 +238,19 @@ def line_of(error: Exception) -> str:
 
 
 # Types of messages.
+
+
+def _decoder_of(encoding: str, schema: Schema) -> Callable[[bytes], Any] | None:
+    """What reads messages; None if nothing does."""
+    if encoding == "cdr":
+        return functools.partial(_decoded_cdr, typename=schema.name)
+    return DecoderFactory().decoder_for(encoding, schema)
+
+
+def _decoded_cdr(data: bytes, typename: str) -> Any:
+    if data.startswith(_ZSTD):  # recorded with --compression-mode message; CDR begins with a zero
+        data = unfolded(data, "zstd")
+    return ros2_types().deserialize_cdr(data, typename)
 
 
 @functools.cache

@@ -11,6 +11,7 @@ from fakes import Box, FakeSource, FakeSynthesizer, made_node, traits
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_ros2.decoder import DecoderFactory
+from zstandard import ZstdError
 
 from gcd_model import Traits
 from gcd_node.config import NodeConfig, parse_config
@@ -20,15 +21,9 @@ from gcd_node.sources import open_source
 
 SECOND_NS = 10**9
 LENS = LensModel(
-    width=192,
-    height=128,
-    fx=200.0,
-    fy=201.0,
-    cx=95.5,
-    cy=63.5,
-    distortion="plumb_bob",
+    width=192, height=128, fx=200.0, fy=201.0, cx=95.5, cy=63.5, distortion="plumb_bob",
     coefficients=(-0.1, 0.02, 0.0, 0.0, 0.0),
-)
+)  # fmt: skip
 
 
 class Calibrated(FakeSource):
@@ -49,8 +44,6 @@ class Said:
     """One message of a recording; value: decoded by the reference library for ROS 2."""
 
     topic: str
-    schema: str
-    encoding: str
     log_ns: int
     publish_ns: int
     sequence: int
@@ -76,19 +69,8 @@ def recorder_config(
     keep_free_mb: float = 0.0,
 ) -> NodeConfig:
     """more: of [model]."""
-    text = f"""
-        [source]
-        {source}
-        [model]
-        weights = "fake"
-        {more}
-        [view.main]
-        [record]
-        folder = "{folder}"
-        keep_free_mb = {keep_free_mb}
-        autostart = true
-        {record}
-    """
+    where = f'folder = "{folder}"\nkeep_free_mb = {keep_free_mb}\nautostart = true\n'
+    text = f'[source]\n{source}\n[model]\nweights = "fake"\n{more}\n[view.main]\n[record]\n{where}{record}'
     return parse_config(text.encode(), "test")
 
 
@@ -121,18 +103,11 @@ def files(folder: Path) -> list[Path]:
 def said(path: Path) -> list[Said]:
     """Every message of a finished file."""
     with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
         return [
-            Said(
-                topic=channel.topic,
-                schema="" if schema is None else schema.encoding,
-                encoding=channel.message_encoding,
-                log_ns=message.log_time,
-                publish_ns=message.publish_time,
-                sequence=message.sequence,
-                value=decoded,
-            )
-            for schema, channel, message, decoded in reader.iter_decoded_messages()
+            Said(channel.topic, message.log_time, message.publish_time, message.sequence, decoded)
+            for _, channel, message, decoded in make_reader(
+                file, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
         ]
 
 
@@ -163,6 +138,6 @@ def salvaged(path: Path, topic: str) -> list[int]:
             for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
                 if channel.topic == topic:
                     found.append(message.sequence)
-        except (McapError, EOFError, ValueError):
+        except (McapError, EOFError, ValueError, ZstdError):
             pass  # where it was cut
     return found

@@ -33,7 +33,7 @@ from gcd_client.images import depth_m, encode_jpegs
 from gcd_client.protocol import Message, StatusMessage, ViewMessage, encode
 from gcd_node.control import ControlServer, Outcome
 from gcd_node.lifecycle import PATHS, Lifecycle, State
-from gcd_node.sources.log_messages import pose_of
+from gcd_node.sources.logs import pose_of
 
 PACKAGE = Path(__file__).parents[2] / "launch" / "ros2" / "gcd_views"
 

@@ -194,10 +194,10 @@ def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
     from robot_logs import START_NS, TOPIC, compressed, ros_log
 
     period_ns = 2_000_000_000 if slow else 40_000_000
-    with ros_log(folder / "log.mcap") as log:
+    with ros_log(folder / "log.mcap") as say:
         for i in range(COUNT):
             stamp_ns = START_NS + i * period_ns
-            log.say(TOPIC, "sensor_msgs/msg/CompressedImage", compressed(RED, stamp_ns), log_ns=stamp_ns, sequence=i)
+            say(TOPIC, "sensor_msgs/msg/CompressedImage", compressed(RED, stamp_ns), log_ns=stamp_ns, sequence=i)
     return play("mcap", folder / "log.mcap", slow)
 
 
