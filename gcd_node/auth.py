@@ -17,7 +17,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
@@ -42,13 +42,14 @@ from gcd_client.endpoints import (
 )
 from gcd_node.config import SecurityConfig
 from gcd_node.errors import ConfigError, EndpointError, OutputError
+from gcd_node.health import Level
 
 _LOG = logging.getLogger(__name__)
 
 Socket: TypeAlias = "zmq.Socket[bytes]"
 Context: TypeAlias = "zmq.Context[zmq.Socket[bytes]]"
-EventSink: TypeAlias = Callable[[str, dict[str, object]], None]
-"""Takes an event's code and its fields; called from threads of sockets, so it must not wait."""
+EventSink: TypeAlias = Callable[[str, Level, Mapping[str, object]], None]
+"""Takes an event: its code, how bad it is, its fields. Called from threads of sockets, so it must not wait."""
 Role: TypeAlias = Literal["viewer", "operator"]
 """What a client may do: look, or also command. A viewer's verbs change nothing."""
 ClientName: TypeAlias = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")]
@@ -219,13 +220,13 @@ class AllowList:
         try:
             clients = load_clients(self._path)
         except ConfigError as error:
-            _report(self._on_event, "ALLOW_REFUSED", {"level": 2, "message": str(error)})
+            _report(self._on_event, "ALLOW_REFUSED", Level.ERROR, {"message": str(error)})
             return
         before, self._clients = set(self._clients.items()), clients
         added = sorted(client.name for _, client in clients.items() - before)
         removed = sorted(client.name for _, client in before - clients.items())
         if added or removed:
-            _report(self._on_event, "ALLOW_CHANGED", {"level": 0, "added": added, "removed": removed})
+            _report(self._on_event, "ALLOW_CHANGED", Level.OK, {"added": added, "removed": removed})
 
 
 def load_clients(path: Path) -> dict[str, Client]:
@@ -262,11 +263,11 @@ def _version(path: Path) -> tuple[int, int, int] | None:
     return status.st_ctime_ns, status.st_ino, status.st_size
 
 
-def _report(on_event: EventSink | None, code: str, fields: dict[str, object]) -> None:
+def _report(on_event: EventSink | None, code: str, level: Level, fields: Mapping[str, object]) -> None:
     if on_event is None:
         _LOG.warning("%s: %s", code, fields)
     else:  # who publishes it logs it
-        on_event(code, fields)
+        on_event(code, level, fields)
 
 
 # Sockets.
@@ -394,6 +395,5 @@ class _Denials:
                 return
             self._reported_s[key, domain] = now_s
             suppressed, self._suppressed = self._suppressed, 0
-        fields: dict[str, object] = {"level": 1, "fingerprint": None if key is None else fingerprint(key)}
-        fields |= {"domain": domain, "address": address, "suppressed": suppressed}
-        _report(self._on_event, "AUTH_DENIED", fields)
+        who = {"fingerprint": None if key is None else fingerprint(key), "domain": domain, "address": address}
+        _report(self._on_event, "AUTH_DENIED", Level.WARN, {**who, "suppressed": suppressed})

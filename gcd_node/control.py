@@ -22,6 +22,7 @@ from gcd_client.control import MAX_REPLY, MAX_REQUEST, Code, Reply
 from gcd_client.protocol import ClientError
 from gcd_node.auth import Client, Context, EventSink, Role, ServerSecurity, SocketGuard, own_endpoint, unbind
 from gcd_node.errors import NodeError
+from gcd_node.health import Level
 from gcd_node.verbs import VERBS, Command, RequestError, parse_command
 
 _LOG = logging.getLogger(__name__)
@@ -153,9 +154,9 @@ class ControlServer:
             return
         reply, refusal = self._answer([part.bytes for part in parts], client, received_ns)
         if refusal is Code.TOO_LARGE:
-            self._on_event("TOO_LARGE", {"level": 1, "channel": "control"})
+            self._on_event("TOO_LARGE", Level.WARN, {"channel": "control"})
         if refusal in _MALFORMED and self._flood.bad(peer.bytes, time.monotonic()):
-            self._on_event("CONTROL_FLOOD", {"level": 1, "client": client.name, "ignored_s": self._ignore_s})
+            self._on_event("CONTROL_FLOOD", Level.WARN, {"client": client.name, "ignored_s": self._ignore_s})
             return
         self._socket.send_multipart((peer.bytes, reply), zmq.NOBLOCK)  # to a peer that left: thrown away
         if self._on_answer is not None:

@@ -7,7 +7,7 @@ import enum
 import math
 import threading
 import time
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, TypeAlias, get_args
@@ -95,14 +95,14 @@ class Health:
         self._state, self._lost = "unconfigured", False
         self._source: SourceState = "closed"
         self._model: ModelState = "absent"
-        self._counts: Counter[str] = Counter()
+        self._rec = RecordHealth()
+        self._counts: defaultdict[str, int] = defaultdict(int)
         self._stages: dict[Stage, StageTimes] = {name: StageTimes() for name in get_args(Stage)}
         self._stamps: deque[int] = deque(maxlen=_RATE_FRAMES)
-        self._arrival_ns: int | None = None
         self._arrivals: deque[tuple[int, bool]] = deque(maxlen=1024)  # when, and whether whole
-        self._faults: dict[str, int] = {}
+        self._arrival_ns: int | None = None
+        self._faults: Mapping[str, int] = {}
         self._measures: dict[str, float | None] = {}
-        self._rec = RecordHealth()
         self._raised: dict[str, Level] = {}
         self._views: dict[str, int | None] = {}  # when each was published last
         self._window_s: float | None = None
@@ -112,8 +112,6 @@ class Health:
     def state(self, name: str) -> None:
         """The lifecycle's state, lower case (lifecycle.State.label)."""
         with self._lock:
-            if name != self._state:
-                self._due_from_ns = self._clock()
             self._state = name
 
     def source(self, state: SourceState) -> None:
@@ -122,7 +120,6 @@ class Health:
             if state != self._source and state != "stalled":
                 self._stamps.clear()  # no rate across a break
             if state == "streaming" and self._source != "streaming":
-                self._due_from_ns = self._clock()
                 self._counts["reconnects"] += self._lost
             self._lost = state == "lost" or (self._lost and state not in ("streaming", "closed", "ended"))
             self._source = state
@@ -130,9 +127,12 @@ class Health:
     def model(self, state: ModelState) -> None:
         """The model's state."""
         with self._lock:
-            if state in _WORKING and self._model not in _WORKING:
-                self._due_from_ns = self._clock()
             self._model = state
+
+    def recording(self, now: RecordHealth) -> None:
+        """How the recording does."""
+        with self._lock:
+            self._rec = now
 
     def frame(self, stamp_ns: int, arrival_ns: int) -> None:
         """A frame arrived whole. stamp_ns: on the source's clock; arrival_ns: on this object's clock."""
@@ -149,11 +149,12 @@ class Health:
             if gap_ns > 0:
                 self._stages["capture_gap"].add(arrival_ns, gap_ns / 1e9)
 
-    def corrupt(self, count: int = 1) -> None:
-        """So many more frames arrived damaged."""
+    def corrupt(self, total: int) -> None:
+        """So many frames have arrived damaged since the source was opened first."""
         with self._lock:
-            self._counts["corrupt"] += count
-            self._arrivals.extend(min(count, 1024) * [(self._clock(), False)])
+            new = total - self._counts["corrupt"]
+            self._counts["corrupt"] = total
+            self._arrivals.extend(min(new, 1024) * [(self._clock(), False)])
 
     def stage(self, name: Stage, seconds: float) -> None:
         """How long a stage took once."""
@@ -168,14 +169,12 @@ class Health:
     def totals(self, **totals: int) -> None:
         """So many in total, by the names of Count, from whoever counts for himself."""
         with self._lock:
-            for name, total in totals.items():
-                self._counts[name] = total
+            self._counts |= totals
 
     def windows(self, built: int, faults: Mapping[str, int]) -> None:
-        """What the window builder counts: windows built, and what spoilt how many; sets the hop "window"."""
+        """What the window builder counts: windows built, and what spoilt how many."""
         with self._lock:
-            self._counts["built"], self._faults = built, dict(faults)
-            self._counts["window"] = sum(faults.values())
+            self._counts["built"], self._faults = built, faults
 
     def expect(self, views: Iterable[str], window_s: float | None) -> None:
         """Which views are rendered, and how often a window begins, seconds; None if nobody waits for the clock
@@ -192,26 +191,28 @@ class Health:
             if view_id in self._views:
                 self._views[view_id] = now_ns
 
-    def recording(self, now: RecordHealth) -> None:
-        """How the recording does."""
-        with self._lock:
-            self._rec = now
-
     def measure(self, name: Literal["ood_score", "gpu_mem_mb"], value: float | None) -> None:
         """How unlike the training the last window looked to the model; the device's memory in use. None: unknown."""
         with self._lock:
             self._measures[name] = value
 
-    def raise_reason(self, code: str, level: Level) -> None:
-        """Something lasting that the rules do not know, such as "fps" out of the trained set or MODEL_HUNG."""
+    def raise_reason(self, code: str, level: Level) -> bool:
+        """Something lasting that the rules do not know, such as "fps" out of the trained set or MODEL_HUNG; whether
+        that is new."""
         with self._lock:
+            is_new = code not in self._raised
             self._raised[code] = level
+            return is_new
 
     def clear_reason(self, code: str) -> None:
         """It is over; nothing happens if it never was."""
         with self._lock:
-            if self._raised.pop(code, None) is not None and code == IDLE:
-                self._due_from_ns = self._clock()
+            self._raised.pop(code, None)
+
+    def forget_reasons(self) -> None:
+        """Clear what the last activation raised: all but a dead thread."""
+        with self._lock:
+            self._raised = {code: level for code, level in self._raised.items() if code == THREAD_DIED}
 
     def snapshot(self) -> Snapshot:
         """Everything as it stands now."""
@@ -234,17 +235,17 @@ class Health:
     # What follows is called with the lock held.
 
     def _snapshot(self, now_ns: int) -> Snapshot:
-        findings, missing, counts = self._findings(now_ns), self._missing(now_ns), self._counts
+        findings, missing = self._judged(now_ns)
+        counts = self._counts | {"window": sum(self._faults.values())}
         stages = {str(name): times.summary(now_ns) for name, times in self._stages.items() if times.count}
         render, memory_mb, ood = stages.get("render", {}), *map(self._measures.get, ("gpu_mem_mb", "ood_score"))
-        views = {view_id: None if at is None else round((now_ns - at) / 1e6) for view_id, at in self._views.items()}
         age_ns = None if self._arrival_ns is None else max(0, now_ns - self._arrival_ns)
         status: dict[str, Any] = {
             "state": self._state,
             "level": int(max(findings.values(), default=Level.OK)),
             "reasons": list(findings),
             "ready": not missing,
-            "not_ready": list(missing),
+            "not_ready": missing,
             "source": _known(
                 state=self._source,
                 fps=self._fps(),
@@ -273,7 +274,10 @@ class Health:
             "publish": {"dropped": counts["queue"], **{name: counts[name] for name in ("sent", "subs", "bytes")}},
             "drops": {hop: counts[hop] for hop in get_args(Hop)},
             "stages": stages,
-            "views": {view_id: _known(last_ms=age_ms) for view_id, age_ms in views.items()},
+            "views": {
+                view_id: {} if at is None else {"last_ms": round((now_ns - at) / 1e6)}
+                for view_id, at in self._views.items()
+            },
             "rec": self._rec.to_status(),
         }
         stages_s = {str(name): times.total_s for name, times in self._stages.items()}
@@ -282,8 +286,7 @@ class Health:
     def _essence(self, now_ns: int) -> object:
         """What is worth a status message at once."""
         model = "ready" if self._model == "busy" else self._model
-        states = self._state, self._source, model, self._rec.state
-        return states, self._findings(now_ns), self._missing(now_ns)
+        return self._state, self._source, model, self._rec.state, self._judged(now_ns)
 
     def _fps(self) -> float | None:
         """By the latest stamps; None if there are too few."""
@@ -293,50 +296,41 @@ class Health:
             return None
         return round((len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0]), 2)
 
-    def _findings(self, now_ns: int) -> dict[str, Level]:
+    def _judged(self, now_ns: int) -> tuple[dict[str, Level], list[str]]:
+        """Every reason with its level, the worst first; and what the node lacks to be ready."""
+        is_streaming, works = self._source == "streaming", self._model in _WORKING
+        is_idle, is_active = IDLE in self._raised, self._state == "active"
+        render, window_s = self._stages["render"], self._window_s or 0.0
+        slowest_s = render.summary(now_ns)["p99_ms"] / 1000 if render.count else 0.0
+        patience_ns = 1e9 * max(_LEAST_PATIENCE_S, 2 * slowest_s, 2 * window_s)
+        if not (is_active and is_streaming and works) or is_idle:
+            self._due_from_ns = now_ns  # no view can come
+        waited_ns = max((now_ns - max(at or 0, self._due_from_ns) for at in self._views.values()), default=0)
+        is_overdue = self._window_s is not None and waited_ns > patience_ns + 1e9 * window_s
+        oldest_ns = -math.inf if self._window_s is None else now_ns - patience_ns
+        is_fresh = bool(self._views) and all(at is not None and at >= oldest_ns for at in self._views.values())
+        recent = [whole for at_ns, whole in self._arrivals if now_ns - at_ns <= _RECENT_NS]
+        is_corrupt = len(recent) >= _LEAST_ARRIVALS and recent.count(False) > _CORRUPT_LIMIT * len(recent)
         rules = (
             (self._state == "errorprocessing", "NODE_ERROR", Level.ERROR),
             (self._lost, "SRC_LOST", Level.ERROR),
             (self._source == "stalled" and not self._lost, "SRC_STALLED", Level.WARN),
-            (self._is_corrupt(now_ns), "SRC_CORRUPT", Level.WARN),
+            (is_corrupt, "SRC_CORRUPT", Level.WARN),
             (self._model == "failed", "MODEL_FAILED", Level.ERROR),
             (self._model == "degraded", "MODEL_DEGRADED", Level.WARN),
-            (self._overdue(now_ns), "VIEWS_OVERDUE", Level.WARN),
+            (is_overdue, "VIEWS_OVERDUE", Level.WARN),
             (self._rec.state == "failed", "REC_FAILED", Level.WARN),
         )
         found = self._raised | {code: level for holds, code, level in rules if holds}
-        return dict(sorted(found.items(), key=lambda each: (-each[1], each[0])))
-
-    def _is_corrupt(self, now_ns: int) -> bool:
-        recent = [whole for at_ns, whole in self._arrivals if now_ns - at_ns <= _RECENT_NS]
-        return len(recent) >= _LEAST_ARRIVALS and recent.count(False) > _CORRUPT_LIMIT * len(recent)
-
-    def _missing(self, now_ns: int) -> tuple[str, ...]:
-        oldest_ns = -math.inf if self._window_s is None else now_ns - self._patience_ns(now_ns)
-        fresh = bool(self._views) and all(at is not None and at >= oldest_ns for at in self._views.values())
-        rules = (
-            (self._state == "active", "NOT_ACTIVE"),
-            (self._source == "streaming", "SRC_NOT_STREAMING"),
-            (self._model in _WORKING, "MODEL_NOT_READY"),
-            (fresh or IDLE in self._raised, "VIEWS_NOT_FRESH"),
+        missing = (
+            (is_active, "NOT_ACTIVE"),
+            (is_streaming, "SRC_NOT_STREAMING"),
+            (works, "MODEL_NOT_READY"),
+            (is_fresh or is_idle, "VIEWS_NOT_FRESH"),
             (THREAD_DIED not in self._raised, THREAD_DIED),
         )
-        return tuple(code for holds, code in rules if not holds)
-
-    def _overdue(self, now_ns: int) -> bool:
-        """Whether views should have come by now: frames do, the model works, and one window more than patience passed
-        since the last view, or since whatever had to happen first."""
-        works = self._state == "active" and self._source == "streaming" and self._model in _WORKING
-        if self._window_s is None or not works or not self._views or IDLE in self._raised:
-            return False
-        allowed_ns = self._patience_ns(now_ns) + self._window_s * 1e9
-        return any(now_ns - max(at or 0, self._due_from_ns) > allowed_ns for at in self._views.values())
-
-    def _patience_ns(self, now_ns: int) -> float:
-        """How old the last view may be: two windows, or two renderings if those take longer, and at least a second."""
-        render = self._stages["render"]
-        slowest_s = render.summary(now_ns)["p99_ms"] / 1000 if render.count else 0.0
-        return 1e9 * max(_LEAST_PATIENCE_S, 2 * slowest_s, 2 * (self._window_s or 0.0))
+        worst_first = sorted(found.items(), key=lambda each: (-each[1], each[0]))
+        return dict(worst_first), [code for holds, code in missing if not holds]
 
 
 class StageTimes:

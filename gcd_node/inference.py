@@ -46,8 +46,7 @@ _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
 _HOLD_S = 1.0
 _OTHER_WORLD = "this is another world than the model learned from: depth and classes are guesses"
-WORK_REASONS = ("DEPTH_BAD", "ODOMETRY_BAD", "MOTION_LOST", "world")
-"""What a model thread raises of the node's health by what its windows show."""
+_WORK_REASONS = ("DEPTH_BAD", "ODOMETRY_BAD", "MOTION_LOST", "world")
 
 
 @dataclass(slots=True)
@@ -123,7 +122,7 @@ class Renderer:
         self._memory = 0
         hold_s = _HOLD_S if model.streams else 0.0
         self._bad_depth, self._bad_odometry, self._lost_motion, self._other_world = (
-            Condition(code, announcer, hold_s=hold_s) for code in WORK_REASONS
+            Condition(code, announcer, hold_s=hold_s) for code in _WORK_REASONS
         )
         self._epoch = -1
         self._latest: tuple[StreamContext, StreamContext] | None = None

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Mapping
 
 from cameras import until
 
@@ -56,9 +57,9 @@ class Events:
         self.seen: list[tuple[str, dict[str, object]]] = []
         self._lock = threading.Lock()
 
-    def __call__(self, code: str, fields: dict[str, object]) -> None:
+    def __call__(self, code: str, level: int, fields: Mapping[str, object]) -> None:
         with self._lock:
-            self.seen.append((code, fields))
+            self.seen.append((code, {"level": int(level), **fields}))
 
     def codes(self) -> list[str]:
         with self._lock:
