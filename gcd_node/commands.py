@@ -12,14 +12,13 @@ from gcd_client.protocol import PROTO
 from gcd_model import ASSUMED_SOURCE, DeltaFit, ModelError, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.auth import Role
 from gcd_node.config import ViewConfig, pose_matrix, without_secrets
-from gcd_node.control import Outcome
 from gcd_node.health import Level
 from gcd_node.lifecycle import Transitions, Verb
 from gcd_node.preprocess import stated_sphere
 from gcd_node.recorder import Recorder
 from gcd_node.status import Announcer, calibration
 from gcd_node.stream_context import config_digest
-from gcd_node.verbs import Command, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
+from gcd_node.verbs import Command, Outcome, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
 from gcd_node.views import LiveConfig, VirtualView
 
 _TOLERATED_DEG = 2.0

@@ -13,7 +13,6 @@ from gcd_model import ModelError, Traits
 from gcd_node.auth import Role
 from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig
-from gcd_node.control import Outcome
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
@@ -25,7 +24,7 @@ from gcd_node.service import ServiceManager, Watchdog
 from gcd_node.sources import LIVE_KINDS
 from gcd_node.sources.live import backoff_s
 from gcd_node.status import Announcer
-from gcd_node.verbs import Command
+from gcd_node.verbs import Command, Outcome
 from gcd_node.views import LiveConfig
 
 _LOG = logging.getLogger(__name__)

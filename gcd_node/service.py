@@ -78,13 +78,10 @@ class Watchdog:
     def __init__(self, report: EventSink, health: Health, hang_s: float) -> None:
         """hang_s: how long a step of the model may take."""
         self._report, self._health, self._hang_s = report, health, hang_s
-        self._watched: list[Callable[[], list[str]]] = []
+        self.threads: list[threading.Thread] = []
+        """threads: what the node is not ready without."""
         self._dead: set[str] = set()
         self._offset_ns = time.time_ns() - time.monotonic_ns()
-
-    def watch(self, dead_threads: Callable[[], list[str]]) -> None:
-        """Ask this for the names of threads that have died, from now on: without them the node is not ready."""
-        self._watched.append(dead_threads)
 
     def check(self, silent_s: float) -> bool:
         """Whether all is well; call it often. silent_s: how long the model has been at one step."""
@@ -93,7 +90,7 @@ class Watchdog:
             self._health.clear_reason("MODEL_HUNG")
         elif self._health.raise_reason("MODEL_HUNG", Level.ERROR):
             self._report("MODEL_HUNG", Level.ERROR, {"silent_s": round(silent_s, 1)})
-        was_dead, self._dead = self._dead, {name for names in self._watched for name in names()}
+        was_dead, self._dead = self._dead, {each.name for each in self.threads if not each.is_alive()}
         for name in self._dead - was_dead:
             self._report(THREAD_DIED, Level.ERROR, {"thread": name, "message": "restart the node"})
             self._health.raise_reason(THREAD_DIED, Level.ERROR)

@@ -15,7 +15,7 @@ import torch
 
 from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, Traits, ViewSynthesizer, load_synthesizer
-from gcd_node.auth import EventSink, ServerSecurity, load_server_security
+from gcd_node.auth import EventSink, ServerSecurity, load_server_security, log_event
 from gcd_node.config import ModelSection, NodeConfig, ViewerConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
@@ -88,10 +88,7 @@ def open_session(
     node: Node | None = None  # what publishes its events is made before it
 
     def emit(code: str, level: Level, fields: Mapping[str, object]) -> None:
-        if node is None:
-            _LOG.warning("%s: %s", code, fields)
-        else:
-            node.event(code, level, fields)
+        (log_event if node is None else node.event)(code, level, fields)
 
     security = load_server_security(config.security, emit)
     with ExitStack() as stack:
@@ -106,11 +103,10 @@ def open_session(
             on_window=on_window,
             service=service,
         )
-        node.watchdog.watch(publisher.dead_threads)
         control: ControlServer | None = None
         if config.control.endpoint is not None:
             control = stack.enter_context(_control_server(config.control.endpoint, node, emit, security))
-            node.watchdog.watch(control.dead_threads)
+            node.watchdog.threads.append(control.thread)
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:

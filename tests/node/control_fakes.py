@@ -8,9 +8,8 @@ from cameras import until
 
 from gcd_client.control import Code
 from gcd_node.auth import Role
-from gcd_node.control import Outcome
 from gcd_node.errors import NodeError
-from gcd_node.verbs import Command, RequestError, SetView
+from gcd_node.verbs import Command, Outcome, RequestError, SetView
 
 
 class FakeCommands:

@@ -113,16 +113,16 @@ def test_the_same_id_for_another_request_is_refused(client: ControlClient, comma
 
 
 def test_replies_are_forgotten_in_time_and_kept_within_bounds() -> None:
-    cache = ReplyCache(60.0, most=3, most_bytes=100)
+    cache = ReplyCache(60.0, most_bytes=10_000)
     cache.keep("a", b"?", b"1", 0.0)
     assert cache.find("a", b"?", 59.9) == b"1"
     assert cache.find("a", b"?", 60.0) is None
-    for i in range(5):
+    for i in range(50):
         cache.keep(i, b"?", b"x", 61.0)
-    assert len(cache) == 3
-    cache.keep("big", b"?", b"x" * 99, 62.0)
-    assert len(cache) == 2
-    assert cache.find("big", b"?", 63.0) == b"x" * 99
+    assert [cache.find(i, b"?", 62.0) is None for i in (0, 49)] == [True, False]
+    cache.keep("big", b"?" * 4000, b"x" * 4900, 62.0)
+    assert [cache.find(i, b"?", 62.0) is None for i in (48, 49)] == [True, False]
+    assert cache.find("big", b"?" * 4000, 63.0) == b"x" * 4900
 
 
 # Strangers
@@ -163,6 +163,7 @@ def test_f16_the_guard_counts_each_peer_by_itself_and_only_the_last_second() -> 
     assert guard.ignores(b"fast", 5.1)
     assert not guard.ignores(b"slow", 5.1)
     assert not guard.ignores(b"fast", 5.21)
+    assert [guard.bad(b"fast", 6.0 + 0.01 * i) for i in range(21)] == [False] * 20 + [True]
 
 
 def test_f17_an_oversize_request_is_refused_and_reported(

@@ -76,7 +76,7 @@ def test_f14_an_unknown_verb_names_the_nearest() -> None:
         ({"view": "top", "azimuth_deg": None}, "azimuth_deg"),
         ({"view": "top", "kind": "spiral"}, "kind"),
         ({"view": "top", "T_src_dst": IDENTITY[:15]}, "T_src_dst"),
-        ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "T_src_dst"),
+        ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "radius, or"),
         ({"view": "top", "source_from_view": IDENTITY}, "source_from_view"),
         ({"view": "top", "kind": "orbit"}, "rate_deg_s"),
         ({"view": "top", "rate_deg_s": 3}, "rate_deg_s"),
