@@ -41,7 +41,7 @@ class NodeCommands:
         self._queries: dict[str, Callable[[], dict[str, object]]] = {
             "describe": self._describe,
             "state": self._state,
-            "stats": lambda: self._health.snapshot().status,
+            "stats": self._health.status,
             "views": self._views,
             "get_config": self._config,
             "get_calib": self._calibration,
@@ -94,7 +94,7 @@ class NodeCommands:
         return result
 
     def _state(self) -> dict[str, object]:
-        status = self._health.snapshot().status
+        status = self._health.status()
         states = {name: status[name]["state"] for name in ("source", "model")}
         return {key: status[key] for key in ("state", "level", "reasons")} | states
 

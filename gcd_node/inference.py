@@ -379,7 +379,7 @@ class Renderer:
     def _tell_source(self, context: StreamContext, view: View) -> None:
         """Whether the model knows such a source, and how it moved; the same for all views of a window."""
         self._lost_motion.update({"message": view.lost[0], "frames": len(view.lost)} if view.lost else None)
-        self._health.measure("ood_score", view.ood)
+        self._health.ood_score = view.ood
         is_foreign = bool(world_flags(context.traits, view))
         self._other_world.update({"message": _OTHER_WORLD, "ood_score": view.ood} if is_foreign else None)
 
@@ -390,6 +390,6 @@ class Renderer:
         self.counts.render_s.append(seconds)
         self.counts.age_ms.append(age_ms)
         if self._model.traits.device.startswith("cuda"):
-            self._health.measure("gpu_mem_mb", torch.cuda.memory_allocated() / 1e6)
+            self._health.gpu_mem_mb = torch.cuda.memory_allocated() / 1e6
         if self._on_window is not None:
             self._on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))

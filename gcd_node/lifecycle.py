@@ -186,13 +186,13 @@ class Transitions:
         if self._live.config.source.kind not in LIVE_KINDS:
             self._source = self._open()
         try:
-            self._health.model("loading")
+            self._health.model = "loading"
             self._model = ModelSlot(self._live.config.model, self._parts.load_model)
             VirtualViews(self._model.traits).sync(self._live.settings())
         except BaseException:
             self.cleanup()
             raise
-        self._health.model("ready")
+        self._health.model = "ready"
 
     def activate(self) -> None:
         """Open the source, and let views come once the model is warm.
@@ -248,7 +248,7 @@ class Transitions:
         """Let go of the model."""
         self._release()
         gc.collect()
-        self._health.model("absent")
+        self._health.model = "absent"
 
     def interrupt(self) -> None:
         """End what is under way soon, for good; from another thread than the transitions'."""

@@ -156,7 +156,7 @@ class Node:
             stream.tick()
         if self.watchdog.check(0.0 if stream is None else stream.renderer.pulse.silent_s):
             self._service.alive()
-        self.health.recording(self.recorder.report())
+        self.health.recording = self.recorder.report()
         if self._stop_s is not None:
             self._begin("shutdown")
         elif state is State.ACTIVE and stream is not None and stream.over:
@@ -178,7 +178,7 @@ class Node:
         return max(least_s, _PATIENCE_S - since_s)
 
     def _publish_state(self) -> None:
-        self.health.state(self.state.label)
+        self.health.state = self.state.label
         self._announcer.status()
 
     # Transitions.
@@ -212,7 +212,7 @@ class Node:
             self._life.error()
             _LOG.error("%s broke", verb, exc_info=error)
             self._transitions.close(_PATIENCE_S)
-            self.health.model("absent")
+            self.health.model = "absent"
             self._life.recover()
         self._publish_state()
         self._announcer.event(_code(error).value, Level.ERROR, {"verb": verb, "message": str(error)})

@@ -167,9 +167,10 @@ class Stream:
         """Pass on what the builder and the source count, with an event for every new kind of trouble."""
         with self._order:
             rejected = self._rejected
-            self._health.windows(self._builder.built, rejected)
+            self._health.faults = rejected
             self._health.corrupt(self._watch.corrupt)
-            self._health.totals(source=self._builder.dropped + self._watch.skipped, slot=self._newest.dropped)
+            dropped = self._builder.dropped + self._watch.skipped
+            self._health.counts.update(built=self._builder.built, source=dropped, slot=self._newest.dropped)
             for reason, count in rejected.items():
                 if count > self._reported.get(reason, 0) and reason != "SRC_LOST":
                     self._announcer.event(reason, Level.WARN, {"count": count})
@@ -180,7 +181,7 @@ class Stream:
         self.tick()
         code, source = ending(self.failure, stopped=self._stopped)
         self._health.source(source)
-        self._health.model("failed" if code == MODEL_FAILED else "ready")
+        self._health.model = "failed" if code == MODEL_FAILED else "ready"
         if self.failure is None:
             self._announcer.event(code, Level.OK)
         else:

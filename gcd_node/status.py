@@ -57,7 +57,7 @@ class Announcer:
         with self._order:
             self._next_s = self._clock() + _PERIOD_S
             sent = self.sink.stats
-            self.health.totals(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
+            self.health.counts.update(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
             self.sink.note("status", self._origin(), self.health.report())
 
     def status_if_due(self) -> None:

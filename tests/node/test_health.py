@@ -38,9 +38,9 @@ def health(clock: Clock) -> Health:
 
 def work(health: Health, clock: Clock, *, window_s: float | None = 1.4) -> None:
     """A node that has just published its first view."""
-    health.state("active")
+    health.state = "active"
     health.source("streaming")
-    health.model("ready")
+    health.model = "ready"
     health.expect(("topdown",), window_s)
     stream(health, clock, frames=14)
     health.published("topdown", 0.25)
@@ -53,7 +53,7 @@ def stream(health: Health, clock: Clock, *, frames: int, fps: float = 10.0) -> N
 
 
 def status(health: Health) -> dict[str, Any]:
-    return health.snapshot().status
+    return health.status()
 
 
 def level(health: Health) -> Level:
@@ -151,8 +151,8 @@ def test_what_is_missing_is_named(health: Health, clock: Clock) -> None:
     work(health, clock)
     health.source("stalled")
     assert missing(health) == ["SRC_NOT_STREAMING"]
-    health.model("failed")
-    health.state("inactive")
+    health.model = "failed"
+    health.state = "inactive"
     assert missing(health) == ["NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY"]
     health.raise_reason(THREAD_DIED, Level.ERROR)
     assert missing(health)[-1] == "THREAD_DIED"
@@ -160,12 +160,12 @@ def test_what_is_missing_is_named(health: Health, clock: Clock) -> None:
 
 def test_a_status_holds_every_key_of_the_protocol_that_is_known(health: Health, clock: Clock) -> None:
     work(health, clock)
-    health.windows(5, {"WIN_GAP": 2, "CLOCK_STEP": 1})
-    health.totals(source=7, slot=4, model=2, queue=9, sent=31, subs=2, bytes=4_130_000)
+    health.counts["built"], health.faults = 5, {"WIN_GAP": 2, "CLOCK_STEP": 1}
+    health.counts.update(source=7, slot=4, model=2, queue=9, sent=31, subs=2, bytes=4_130_000)
     health.corrupt(1)
     for name in ("model", "oom_count", "nan_windows"):
         health.count(name)
-    health.measure("gpu_mem_mb", 812.25)
+    health.gpu_mem_mb = 812.25
     health.stage("render", 0.25)
     health.raise_reason("fps", Level.WARN)
     clock.sleep(0.05)
@@ -196,7 +196,7 @@ def test_a_change_is_noticed_once_and_rendering_is_none(health: Health, clock: C
     work(health, clock)
     assert health.changed()
     assert health.report()["heartbeat_seq"] == 1
-    health.model("busy")
+    health.model = "busy"
     health.stage("render", 0.1)
     stream(health, clock, frames=1)
     assert not health.changed()
