@@ -17,7 +17,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
@@ -42,13 +42,14 @@ from gcd_client.endpoints import (
 )
 from gcd_node.config import SecurityConfig
 from gcd_node.errors import ConfigError, EndpointError, OutputError
+from gcd_node.health import Level
 
 _LOG = logging.getLogger(__name__)
 
 Socket: TypeAlias = "zmq.Socket[bytes]"
 Context: TypeAlias = "zmq.Context[zmq.Socket[bytes]]"
-EventSink: TypeAlias = Callable[[str, dict[str, object]], None]
-"""Takes an event's code and its fields; called from threads of sockets, so it must not wait."""
+EventSink: TypeAlias = Callable[[str, Level, Mapping[str, object]], None]
+"""Takes an event: its code, how bad it is, its fields. Called from threads of sockets, so it must not wait."""
 Role: TypeAlias = Literal["viewer", "operator"]
 """What a client may do: look, or also command. A viewer's verbs change nothing."""
 ClientName: TypeAlias = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")]
@@ -59,17 +60,16 @@ _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DE
 _DENIAL_SPAN_S, _MOST_DENIALS = 10.0, 8
 
 
+def log_event(code: str, _: Level, fields: Mapping[str, object]) -> None:
+    """An EventSink where there is no node yet that publishes and logs them."""
+    _LOG.warning("%s: %s", code, fields)
+
+
 # Endpoints.
 
 
-def own_endpoint(endpoint: str, channel: Channel) -> str:
-    """resolve_endpoint() for who binds: the runtime folder is made, with mode 0700, if it is needed.
-
-    Raises:
-        SetupError: see resolve_endpoint(). EndpointError: the folder cannot be made, or belongs to another user.
-    """
-    if endpoint != "ipc":
-        return resolve_endpoint(endpoint, channel)
+def _own_runtime_folder() -> None:
+    """Make it, with mode 0700. Raises EndpointError: it cannot be made, or belongs to another user."""
     folder = runtime_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -78,7 +78,6 @@ def own_endpoint(endpoint: str, channel: Channel) -> str:
         raise EndpointError(f"cannot create the runtime folder {folder}: {error.strerror}") from error
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & stat.S_IWOTH:
         raise EndpointError(f"the runtime folder {folder} must be ours alone; remove it or set RUNTIME_DIRECTORY")
-    return resolve_endpoint(endpoint, channel)
 
 
 def is_loopback(endpoint: str) -> bool:
@@ -94,24 +93,23 @@ def _free_ipc_path(path: Path) -> None:
     """Remove the file that a dead process left; ZeroMQ itself would take a live endpoint away without a word.
 
     Raises:
-        EndpointError: a process answers there, it is no socket, or its folder is missing.
+        EndpointError: a process answers there, or it is no socket.
     """
-    if not path.parent.is_dir():
-        raise EndpointError(f"ipc://{path} needs the folder {path.parent}, which does not exist")
-    if not os.path.lexists(path):
-        return
-    if not path.is_socket():
-        raise EndpointError(f"ipc://{path} is taken by something that is no socket; choose another name")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(0.5)
         try:
             probe.connect(str(path))
-        except ConnectionRefusedError:
-            path.unlink(missing_ok=True)
+            reason = "a running process"
+        except FileNotFoundError:
             return
+        except ConnectionRefusedError:
+            if path.is_socket():
+                path.unlink(missing_ok=True)
+                return
+            reason = "something that is no socket"
         except OSError as error:
-            raise EndpointError(f"ipc://{path} is in use or not ours: {error}") from error
-    raise EndpointError(f"ipc://{path} is in use by a running process; stop it or choose another endpoint")
+            reason = str(error)
+    raise EndpointError(f"ipc://{path} is in use: {reason}; stop it or choose another endpoint")
 
 
 def unbind(bound: Socket, endpoint: str, linger_ms: int) -> None:
@@ -170,13 +168,11 @@ def write_key_pair(folder: Path, pair: KeyPair) -> None:
         for name, text, mode in ((SECRET_FILE, pair.secret, 0o600), (PUBLIC_FILE, pair.public, 0o644)):
             with os.fdopen(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w") as file:
                 file.write(text + "\n")
-    except FileExistsError as error:
-        raise OutputError(f"{folder} holds keys already; choose another folder, or move the old keys away") from error
     except OSError as error:
         raise OutputError(f"cannot write keys to {folder}: {error.strerror}; choose another folder") from error
 
 
-def load_server_security(config: SecurityConfig, on_event: EventSink | None = None) -> ServerSecurity | None:
+def load_server_security(config: SecurityConfig, on_event: EventSink = log_event) -> ServerSecurity | None:
     """Keys and clients of a launch file; None if it states neither. on_event: see AllowList.
 
     Raises:
@@ -198,11 +194,9 @@ class AllowList:
         ConfigError: as load_server_security(); or nobody is on the list.
     """
 
-    def __init__(self, path: Path, on_event: EventSink | None = None) -> None:
-        self._path, self._on_event = path, on_event
-        self._lock = threading.Lock()
-        self._version = _version(path)
-        self._clients = load_clients(path)
+    def __init__(self, path: Path, on_event: EventSink = log_event) -> None:
+        self._path, self._on_event, self._lock = path, on_event, threading.Lock()
+        self._version, self._clients = _version(path), load_clients(path)
         if not self._clients:
             raise ConfigError(f"{path} names no client, so nobody could connect; add one, see docs/node.md")
 
@@ -219,37 +213,30 @@ class AllowList:
         try:
             clients = load_clients(self._path)
         except ConfigError as error:
-            _report(self._on_event, "ALLOW_REFUSED", {"level": 2, "message": str(error)})
+            self._on_event("ALLOW_REFUSED", Level.ERROR, {"message": str(error)})
             return
         before, self._clients = set(self._clients.items()), clients
         added = sorted(client.name for _, client in clients.items() - before)
         removed = sorted(client.name for _, client in before - clients.items())
         if added or removed:
-            _report(self._on_event, "ALLOW_CHANGED", {"level": 0, "added": added, "removed": removed})
+            self._on_event("ALLOW_CHANGED", Level.OK, {"added": added, "removed": removed})
 
 
 def load_clients(path: Path) -> dict[str, Client]:
     """Clients by public key; may be none. Raises ConfigError as load_server_security()."""
     from gcd_model import FileError, decode_toml, read_small  # only now: it brings torch, and clients need none
 
-    try:
-        text, mode = read_small(path), stat.S_IMODE(path.stat().st_mode)
-        if mode & stat.S_IWOTH:
-            raise ConfigError(f"{path} can be written by everybody, mode {mode:04o}; run chmod o-w on it")
-        entries = msgspec.convert(decode_toml(text), AllowFile).client
-        for name, entry in entries.items():
-            check_key(entry.key, f"{path}: the key of {name}")
-    except FileError as error:
-        raise ConfigError(f"cannot read the allow-list {path}: it {error}; see docs/node.md") from error
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {str(error).replace('`$.', '`')}; see docs/node.md") from error
-    except SetupError as error:
-        raise ConfigError(str(error)) from error
     clients: dict[str, Client] = {}
-    for name, entry in entries.items():
-        if entry.key in clients:
-            raise ConfigError(f"{path}: {name} and {clients[entry.key].name} have the same key; give each its own")
-        clients[entry.key] = Client(name=name, role=entry.role)
+    try:
+        if path.stat().st_mode & stat.S_IWOTH:
+            raise ConfigError(f"{path} can be written by everybody; run chmod o-w on it")
+        for name, entry in msgspec.convert(decode_toml(read_small(path)), AllowFile).client.items():
+            check_key(entry.key, f"the key of {name}")
+            if entry.key in clients:
+                raise ConfigError(f"{path}: {name} and {clients[entry.key].name} have the same key")
+            clients[entry.key] = Client(name=name, role=entry.role)
+    except (OSError, FileError, msgspec.ValidationError, SetupError) as error:
+        raise ConfigError(f"the allow-list {path}: {error}; see docs/node.md") from error
     return clients
 
 
@@ -262,27 +249,26 @@ def _version(path: Path) -> tuple[int, int, int] | None:
     return status.st_ctime_ns, status.st_ino, status.st_size
 
 
-def _report(on_event: EventSink | None, code: str, fields: dict[str, object]) -> None:
-    if on_event is None:
-        _LOG.warning("%s: %s", code, fields)
-    else:  # who publishes it logs it
-        on_event(code, fields)
-
-
 # Sockets.
 
 
 class SocketGuard:
-    """Binds the sockets of one context, and answers who may connect to those that are secured.
+    """Has the ZeroMQ context of a thread's sockets, binds them, and answers who may connect to those that are secured.
 
-    on_event gets AUTH_DENIED, limited so that a hostile client cannot flood with it. Close after the sockets.
+    on_event gets AUTH_DENIED: once for each key and socket in 10 s and at most 8 in all in that time, so that a hostile
+    client cannot flood with it.
     """
 
-    def __init__(self, context: Context, security: ServerSecurity | None, on_event: EventSink | None) -> None:
-        self._security, self._denials = security, _Denials(on_event)
-        self._monitors: dict[Socket, Channel] = {}
-        self._authenticator = None if security is None else _Authenticator(context, security, self._denials)
-        if self._authenticator is not None:
+    def __init__(self, security: ServerSecurity | None, on_event: EventSink | None = None) -> None:
+        self.context: Context = zmq.Context()
+        self.monitors: dict[Socket, Channel] = {}
+        """monitors: readable once there is something for report_failures()."""
+        self._security, self._on_event, self._lock = security, on_event or log_event, threading.Lock()
+        self._reported_s: dict[tuple[str | None, str], float] = {}
+        self._suppressed = 0
+        self._authenticator: _Authenticator | None = None
+        if security is not None:
+            self._authenticator = _Authenticator(self.context, security.find_client, self._deny)
             self._authenticator.start()
 
     def bind(self, unbound: Socket, endpoint: str, channel: Channel) -> str:
@@ -291,8 +277,12 @@ class SocketGuard:
         Returns:
             The endpoint, with the port that was chosen if 0 was asked for.
         Raises:
-            ConfigError: others than this machine could reach it without keys. EndpointError: in use, or impossible.
+            SetupError: no endpoint. ConfigError: others than this machine could reach it without keys. EndpointError:
+                in use, or impossible.
         """
+        if endpoint == "ipc":
+            _own_runtime_folder()
+        endpoint = resolve_endpoint(endpoint, channel)
         if endpoint.startswith("ipc://"):
             _free_ipc_path(Path(endpoint.removeprefix("ipc://")))
         elif self._security is not None:
@@ -300,7 +290,7 @@ class SocketGuard:
             unbound.set(zmq.CURVE_SECRETKEY, self._security.keys.secret.encode())
             unbound.set(zmq.ZAP_DOMAIN, f"gcd.{channel}".encode())
             unbound.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without an authenticator: closed to all, not open to all
-            self._monitors[unbound.get_monitor_socket(_FAILED)] = channel
+            self.monitors[unbound.get_monitor_socket(_FAILED)] = channel
         elif not is_loopback(endpoint):
             raise ConfigError(
                 f"{endpoint} can be reached from other machines, which needs CURVE keys and a list of allowed clients: "
@@ -321,70 +311,24 @@ class SocketGuard:
 
     def report_failures(self) -> None:
         """Report handshakes that failed before there was a key to judge; call it often, in the sockets' own thread."""
-        for monitor, channel in self._monitors.items():
+        for monitor, channel in self.monitors.items():
             for _ in range(_MOST_EVENTS):
                 if not monitor.poll(0):
                     break
                 if int(parse_monitor_message(monitor.recv_multipart())["event"]) & _FAILED:
-                    self._denials.add(None, f"gcd.{channel}", "")
-
-    @property
-    def monitors(self) -> list[Socket]:
-        """Readable once there is something for report_failures()."""
-        return list(self._monitors)
-
-    @property
-    def alive(self) -> bool:
-        """Whether clients are let in: False once the authenticator's thread has died."""
-        return self._authenticator is None or self._authenticator.is_alive()
+                    self._deny(None, f"gcd.{channel}", "")
 
     def close(self) -> None:
-        """Stop; a second call does nothing."""
-        for monitor in self._monitors:
+        """Let nobody in any more, close what is still open, and wait until what was sent has left. A second call does
+        nothing."""
+        for monitor in self.monitors:
             monitor.close(0)
-        self._monitors.clear()
+        self.monitors.clear()
         if self._authenticator is not None:
-            self._authenticator.close()
+            self._authenticator.stop()
+        self.context.destroy()
 
-
-class _Authenticator(ThreadAuthenticator):
-    """Lets clients of the allow-list in; their messages carry the public key as `User-Id`."""
-
-    def __init__(self, context: Context, security: ServerSecurity, denials: "_Denials") -> None:
-        super().__init__(context)
-        self._find_client, self._denials, self._address = security.find_client, denials, ""
-        for channel in _CHANNELS:  # exactly these: a provider for "*" does not apply to a socket with a domain
-            self.configure_curve_callback(f"gcd.{channel}", self)
-
-    def callback(self, domain: str, key: bytes) -> bool:
-        """Whether a key may connect: it is on the allow-list, to push frames as an operator's; called by zmq.auth."""
-        client = self._find_client(key.decode())
-        if client is not None and (client.role == "operator" or domain != "gcd.frames"):
-            return True
-        self._denials.add(key.decode(), domain, self._address)
-        return False
-
-    async def handle_zap_message(self, msg: list[bytes]) -> None:
-        self._address = msg[3].decode("ascii", "backslashreplace")[:64] if len(msg) > 3 else ""
-        await super().handle_zap_message(msg)
-
-    def close(self) -> None:
-        """Stop; a second call does nothing."""
-        if self.pipe and not self.is_alive():  # stop() would wait for ever for a thread that has died
-            self.pipe.close(0)
-            self.pipe = None  # pyright: ignore[reportAttributeAccessIssue]  as pyzmq itself does
-        self.stop()
-
-
-class _Denials:
-    """AUTH_DENIED events, limited: one for each key and socket in 10 s, and at most 8 in all in that time."""
-
-    def __init__(self, on_event: EventSink | None) -> None:
-        self._on_event, self._lock = on_event, threading.Lock()
-        self._reported_s: dict[tuple[str | None, str], float] = {}
-        self._suppressed = 0
-
-    def add(self, key: str | None, domain: str, address: str) -> None:
+    def _deny(self, key: str | None, domain: str, address: str) -> None:
         """Report a refusal, or count it; key: None if the handshake came to none. From any thread."""
         with self._lock:
             now_s = time.monotonic()
@@ -394,6 +338,37 @@ class _Denials:
                 return
             self._reported_s[key, domain] = now_s
             suppressed, self._suppressed = self._suppressed, 0
-        fields: dict[str, object] = {"level": 1, "fingerprint": None if key is None else fingerprint(key)}
-        fields |= {"domain": domain, "address": address, "suppressed": suppressed}
-        _report(self._on_event, "AUTH_DENIED", fields)
+        who = {"fingerprint": None if key is None else fingerprint(key), "domain": domain, "address": address}
+        self._on_event("AUTH_DENIED", Level.WARN, {**who, "suppressed": suppressed})
+
+
+class _Authenticator(ThreadAuthenticator):
+    """Lets clients of the allow-list in; their messages carry the public key as `User-Id`."""
+
+    def __init__(
+        self,
+        context: Context,
+        find_client: Callable[[str], Client | None],
+        deny: Callable[[str, str, str], None],
+    ) -> None:
+        super().__init__(context)
+        self._find_client, self._deny, self._address = find_client, deny, ""
+        for channel in _CHANNELS:  # exactly these: a provider for "*" does not apply to a socket with a domain
+            self.configure_curve_callback(f"gcd.{channel}", self)
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Whether a key may connect: it is on the allow-list, to push frames as an operator's; called by zmq.auth.
+        Whatever breaks on the way lets nobody in, and does not end the thread."""
+        try:
+            client = self._find_client(key.decode())
+        except Exception:
+            _LOG.exception("a client could not be judged, and is not let in")
+            client = None
+        if client is not None and (client.role == "operator" or domain != "gcd.frames"):
+            return True
+        self._deny(key.decode(), domain, self._address)
+        return False
+
+    async def handle_zap_message(self, msg: list[bytes]) -> None:
+        self._address = msg[3].decode("ascii", "backslashreplace")[:64] if len(msg) > 3 else ""
+        await super().handle_zap_message(msg)

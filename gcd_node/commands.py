@@ -12,14 +12,13 @@ from gcd_client.protocol import PROTO
 from gcd_model import ASSUMED_SOURCE, DeltaFit, ModelError, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.auth import Role
 from gcd_node.config import ViewConfig, pose_matrix, without_secrets
-from gcd_node.control import Outcome
 from gcd_node.health import Level
 from gcd_node.lifecycle import Transitions, Verb
 from gcd_node.preprocess import stated_sphere
 from gcd_node.recorder import Recorder
 from gcd_node.status import Announcer, calibration
 from gcd_node.stream_context import config_digest
-from gcd_node.verbs import Command, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
+from gcd_node.verbs import Command, Outcome, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
 from gcd_node.views import LiveConfig, VirtualView
 
 _TOLERATED_DEG = 2.0
@@ -42,7 +41,7 @@ class NodeCommands:
         self._queries: dict[str, Callable[[], dict[str, object]]] = {
             "describe": self._describe,
             "state": self._state,
-            "stats": lambda: self._health.snapshot().status,
+            "stats": self._health.status,
             "views": self._views,
             "get_config": self._config,
             "get_calib": self._calibration,
@@ -95,7 +94,7 @@ class NodeCommands:
         return result
 
     def _state(self) -> dict[str, object]:
-        status = self._health.snapshot().status
+        status = self._health.status()
         states = {name: status[name]["state"] for name in ("source", "model")}
         return {key: status[key] for key in ("state", "level", "reasons")} | states
 

@@ -4,14 +4,12 @@ Who reaches it over ipc, or over loopback where no keys are set up, is an operat
 Elsewhere the key decides. The client: gcd_client.control.
 """
 
-import hashlib
 import logging
 import os
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from types import TracebackType
 from typing import TypeAlias
 
@@ -20,9 +18,10 @@ import zmq
 
 from gcd_client.control import MAX_REPLY, MAX_REQUEST, Code, Reply
 from gcd_client.protocol import ClientError
-from gcd_node.auth import Client, Context, EventSink, Role, ServerSecurity, SocketGuard, own_endpoint, unbind
+from gcd_node.auth import Client, EventSink, Role, ServerSecurity, SocketGuard, unbind
 from gcd_node.errors import NodeError
-from gcd_node.verbs import VERBS, Command, RequestError, parse_command
+from gcd_node.health import Level
+from gcd_node.verbs import VERBS, Command, Outcome, RequestError, parse_command
 
 _LOG = logging.getLogger(__name__)
 _LINGER_MS = 500
@@ -30,21 +29,12 @@ _QUEUED = 16
 _SECOND_NS = 1_000_000_000
 _LARGEST_READ = 4 * MAX_REQUEST  # what is longer than a request is refused with a reason, up to here
 _MALFORMED = (Code.BAD_JSON, Code.BAD_PROTO, Code.TOO_LARGE)
-_KEEP_S = 60.0
+_KEEP_S, _OVERHEAD = 60.0, 500  # of a reply that is kept: seconds; bytes beside itself and its request
 _MOST_BAD_PER_S, _MOST_PEERS = 20, 256
 _LOCAL = Client(name="", role="operator")
 
 AnswerSink: TypeAlias = Callable[[bytes, bytes, Client], None]
 """Gets every request, its reply as it was sent, and who asked; called in the control thread, returns at once."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Outcome:
-    """What became of a command; `result` is plain JSON."""
-
-    code: Code = Code.OK
-    message: str = ""
-    result: dict[str, object] | None = None
 
 
 CommandHandler: TypeAlias = Callable[[Command, Role], Outcome]
@@ -55,9 +45,9 @@ ms at most. The role may use the verb, that is checked; `time` never comes here,
 class ControlServer:
     """Answers requests until closed. Use it as a context manager.
 
-    state: the node's lifecycle state, for every reply. on_event: gets AUTH_DENIED, TOO_LARGE and CONTROL_FLOOD, each
-    with its fields. on_answer: see AnswerSink. All are called from threads of this server. ignore_s: for how long a
-    client that sends too much nonsense is ignored.
+    state: the node's lifecycle state, for every reply. on_event: gets AUTH_DENIED, TOO_LARGE and CONTROL_FLOOD.
+    on_answer: see AnswerSink. All are called from threads of this server. ignore_s: for how long a client that sends
+    too much nonsense is ignored.
 
     Raises:
         EndpointError: the endpoint is in use or cannot be bound.
@@ -75,36 +65,29 @@ class ControlServer:
         security: ServerSecurity | None = None,
         ignore_s: float = 5.0,
     ) -> None:
-        self._on_event, self._on_answer, self._ignore_s = on_event, on_answer, ignore_s
-        self._handle, self._state, self._flood = handle, state, FloodGuard(ignore_s)
+        self._handle, self._state, self._on_event, self._on_answer = handle, state, on_event, on_answer
+        self._ignore_s, self._flood = ignore_s, FloodGuard(ignore_s)
         self._kept: dict[Role, ReplyCache] = {  # apart, so that who only looks cannot push out an operator's
-            "operator": ReplyCache(_KEEP_S, most=4096, most_bytes=16 * 1024 * 1024),
-            "viewer": ReplyCache(_KEEP_S, most=1024, most_bytes=4 * 1024 * 1024),
+            "operator": ReplyCache(_KEEP_S, most_bytes=16 * 1024 * 1024),
+            "viewer": ReplyCache(_KEEP_S, most_bytes=4 * 1024 * 1024),
         }
         self._closing, self._wake_fd = threading.Event(), os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._context: Context = zmq.Context()
-        self._guard = SocketGuard(self._context, security, on_event)
+        self._guard = SocketGuard(security, on_event)
         try:
-            self._socket = self._context.socket(zmq.ROUTER)
+            self._socket = self._guard.context.socket(zmq.ROUTER)
             self._socket.set(zmq.ROUTER_HANDOVER, 0)
             self._socket.set(zmq.MAXMSGSIZE, _LARGEST_READ)  # of each part; who sends more is disconnected
             for limit in (zmq.RCVHWM, zmq.SNDHWM):
                 self._socket.set(limit, _QUEUED)
             self._socket.set(zmq.LINGER, 0)
-            self.endpoint = self._guard.bind(self._socket, own_endpoint(endpoint, "control"), "control")
+            self.endpoint = self._guard.bind(self._socket, endpoint, "control")
         except BaseException:
             self._guard.close()
-            self._context.destroy(linger=0)
             os.close(self._wake_fd)
             raise
         self._security = security if self.endpoint.startswith("tcp://") else None
-        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
-        self._thread.start()
-
-    def dead_threads(self) -> list[str]:
-        """Threads of this server that have died."""
-        alive = {"control": self._thread.is_alive(), "control authentication": self._guard.alive}
-        return [] if self._closing.is_set() else [name for name, lives in alive.items() if not lives]
+        self.thread = threading.Thread(target=self._serve, name="control", daemon=True)
+        self.thread.start()
 
     def close(self) -> None:
         """Stop answering; replies on their way get half a second to leave. A second call does nothing."""
@@ -112,9 +95,8 @@ class ControlServer:
             return
         self._closing.set()
         os.eventfd_write(self._wake_fd, 1)
-        self._thread.join()
+        self.thread.join()
         self._guard.close()
-        self._context.term()
         os.close(self._wake_fd)
 
     def __enter__(self) -> "ControlServer":
@@ -153,9 +135,9 @@ class ControlServer:
             return
         reply, refusal = self._answer([part.bytes for part in parts], client, received_ns)
         if refusal is Code.TOO_LARGE:
-            self._on_event("TOO_LARGE", {"level": 1, "channel": "control"})
+            self._on_event("TOO_LARGE", Level.WARN, {"channel": "control"})
         if refusal in _MALFORMED and self._flood.bad(peer.bytes, time.monotonic()):
-            self._on_event("CONTROL_FLOOD", {"level": 1, "client": client.name, "ignored_s": self._ignore_s})
+            self._on_event("CONTROL_FLOOD", Level.WARN, {"client": client.name, "ignored_s": self._ignore_s})
             return
         self._socket.send_multipart((peer.bytes, reply), zmq.NOBLOCK)  # to a peer that left: thrown away
         if self._on_answer is not None:
@@ -173,27 +155,22 @@ class ControlServer:
             if len(parts) != 1:
                 raise RequestError(f"a request is one part, got {len(parts)}; use a DEALER socket", Code.BAD_JSON)
             command = parse_command(parts[0])
-            request_id = command.id
-            return self._reply(command, parts[0], client, received_ns), None
+            request_id, needed = command.id, VERBS[command.verb].role
+            if needed == "operator" and client.role != "operator":
+                message = f"{command.verb} needs the operator role, {client.name or 'this client'} is a {client.role}"
+                raise RequestError(message, Code.FORBIDDEN)
+            cache, key = self._kept[needed], (client.name, command.id)
+            try:
+                reply = cache.find(key, parts[0], time.monotonic())
+            except KeyError as error:
+                message = f"the id {command.id} was used for another request; take a new one for each"
+                raise RequestError(message, Code.BAD_ARG) from error
+            if reply is None:
+                reply = self._carried_out(command, client.role, received_ns)
+                cache.keep(key, parts[0], reply, time.monotonic())
+            return reply, None
         except RequestError as error:
             return self._encoded(error.request_id or request_id, _refusal(error)), error.reason
-
-    def _reply(self, command: Command, part: bytes, client: Client, received_ns: int) -> bytes:
-        """Raises RequestError."""
-        needed = VERBS[command.verb].role
-        if needed == "operator" and client.role != "operator":
-            message = f"{command.verb} needs the operator role, {client.name or 'this client'} is a {client.role}"
-            raise RequestError(message, Code.FORBIDDEN)
-        cache, key = self._kept[needed], (client.name, command.id)
-        try:
-            kept = cache.find(key, part, time.monotonic())
-        except KeyError as error:
-            message = f"the id {command.id} was used for another request; take a new one for each"
-            raise RequestError(message, Code.BAD_ARG) from error
-        if kept is None:
-            kept = self._carried_out(command, client.role, received_ns)
-            cache.keep(key, part, kept, time.monotonic())
-        return kept
 
     def _carried_out(self, command: Command, role: Role, received_ns: int) -> bytes:
         try:
@@ -232,9 +209,9 @@ class ReplyCache:
     The key says who asked and under which id; the same id for another request is no repeat.
     """
 
-    def __init__(self, seconds: float, most: int, most_bytes: int) -> None:
-        self._seconds, self._most, self._most_bytes = seconds, most, most_bytes
-        self._kept: OrderedDict[Hashable, tuple[bytes, bytes, float]] = OrderedDict()  # digest, reply, until
+    def __init__(self, seconds: float, most_bytes: int) -> None:
+        self._seconds, self._most_bytes = seconds, most_bytes
+        self._kept: OrderedDict[Hashable, tuple[bytes, bytes, float]] = OrderedDict()  # request, reply, until
         self._bytes = 0
 
     def find(self, key: Hashable, request: bytes, now_s: float) -> bytes | None:
@@ -245,23 +222,23 @@ class ReplyCache:
         """
         while self._kept and next(iter(self._kept.values()))[2] <= now_s:
             self._drop_oldest()
-        digest, reply, _ = self._kept.get(key, (None, None, 0.0))
-        if digest is not None and digest != hashlib.sha256(request).digest():
+        if key not in self._kept:
+            return None
+        before, reply, _ = self._kept[key]
+        if before != request:
             raise KeyError(key)
         return reply
 
     def keep(self, key: Hashable, request: bytes, reply: bytes, now_s: float) -> None:
         """Remember a reply; the oldest make way when it gets too much."""
-        self._kept[key] = hashlib.sha256(request).digest(), reply, now_s + self._seconds
-        self._bytes += len(reply)
-        while len(self._kept) > self._most or self._bytes > self._most_bytes:
+        self._kept[key] = request, reply, now_s + self._seconds
+        self._bytes += len(request) + len(reply) + _OVERHEAD
+        while self._bytes > self._most_bytes:
             self._drop_oldest()
 
-    def __len__(self) -> int:
-        return len(self._kept)
-
     def _drop_oldest(self) -> None:
-        self._bytes -= len(self._kept.popitem(last=False)[1][1])
+        _, (request, reply, _) = self._kept.popitem(last=False)
+        self._bytes -= len(request) + len(reply) + _OVERHEAD
 
 
 class FloodGuard:
@@ -269,27 +246,21 @@ class FloodGuard:
 
     def __init__(self, ignore_s: float) -> None:
         self._ignore_s = ignore_s
-        self._bad_s: OrderedDict[bytes, deque[float]] = OrderedDict()  # the peers that were bad last are at the end
-        self._ignored_until_s: dict[bytes, float] = {}
-
-    def __len__(self) -> int:
-        """Peers remembered."""
-        return len(self._bad_s)
+        self._bad: OrderedDict[bytes, tuple[float, int]] = OrderedDict()
+        """Since when each peer sent so many, or is ignored; those that were bad last are at the end."""
 
     def ignores(self, peer: bytes, now_s: float) -> bool:
         """Whether to throw away what this peer sends."""
-        return now_s < self._ignored_until_s.get(peer, now_s)
+        since_s, count = self._bad.get(peer, (now_s, 0))
+        return count > _MOST_BAD_PER_S and now_s - since_s < self._ignore_s
 
     def bad(self, peer: bytes, now_s: float) -> bool:
         """Count a malformed request; True if the peer is ignored from now on."""
-        times = self._bad_s.pop(peer, None) or deque[float](maxlen=_MOST_BAD_PER_S + 1)
-        self._bad_s[peer] = times
-        times.append(now_s)
-        if len(self._bad_s) > _MOST_PEERS:
-            self._bad_s.popitem(last=False)
-        if len(times) <= _MOST_BAD_PER_S or now_s - times[0] > 1.0:
-            return False
-        del self._bad_s[peer]
-        self._ignored_until_s = {each: until for each, until in self._ignored_until_s.items() if until > now_s}
-        self._ignored_until_s[peer] = now_s + self._ignore_s
-        return True
+        since_s, count = self._bad.pop(peer, (now_s, 0))
+        if now_s - since_s > 1.0:
+            since_s, count = now_s, 0
+        is_flood = count == _MOST_BAD_PER_S
+        self._bad[peer] = (now_s if is_flood else since_s, count + 1)
+        if len(self._bad) > _MOST_PEERS:
+            self._bad.popitem(last=False)
+        return is_flood

@@ -7,7 +7,7 @@ import enum
 import math
 import threading
 import time
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, TypeAlias, get_args
@@ -69,75 +69,51 @@ class RecordHealth:
         return {"state": self.state} if self.file is None else {**asdict(self), "dropped": dict(self.dropped)}
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Snapshot:
-    """A node's health at one moment.
-
-    status: the fields of a status message (wire protocol, section 4) but its heartbeat; what is unknown is left out.
-    findings: every reason with its level, the worst first (docs/deploy.md explains each).
-    frames: arrived whole since the start. stages_s: how long each stage has taken since the start, in all.
-    """
-
-    status: dict[str, Any]
-    findings: dict[str, Level]
-    frames: int
-    stages_s: dict[str, float]
-
-
 class Health:
-    """Collects what the node's threads report; every method may be called from any thread and returns at once.
+    """Collects what the node's threads report: each attribute may be set, and each method called, from any thread.
 
-    clock: monotonic nanoseconds, the clock that arrivals are stamped with.
+    state: the lifecycle's, lower case (lifecycle.State.label). model: the model's. recording: how it does.
+    counts: by the names of Count, and "frames" that arrived whole, "corrupt" ones, "reconnects" and windows "built".
+    faults: what spoilt how many windows. gpu_mem_mb: the device's memory in use. ood_score: how unlike the training the
+    last window looked to the model. None: unknown.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        """clock: monotonic nanoseconds, the clock that arrivals are stamped with."""
+        self.state = "unconfigured"
+        self.model: ModelState = "absent"
+        self.recording = RecordHealth()
+        self.counts: defaultdict[str, int] = defaultdict(int)
+        self.faults: Mapping[str, int] = {}
+        self.gpu_mem_mb: float | None = None
+        self.ood_score: float | None = None
         self._clock, self._lock = clock, threading.Lock()
-        self._state, self._lost = "unconfigured", False
         self._source: SourceState = "closed"
-        self._model: ModelState = "absent"
-        self._counts: Counter[str] = Counter()
+        self._lost = False
         self._stages: dict[Stage, StageTimes] = {name: StageTimes() for name in get_args(Stage)}
         self._stamps: deque[int] = deque(maxlen=_RATE_FRAMES)
-        self._arrival_ns: int | None = None
         self._arrivals: deque[tuple[int, bool]] = deque(maxlen=1024)  # when, and whether whole
-        self._faults: dict[str, int] = {}
-        self._measures: dict[str, float | None] = {}
-        self._rec = RecordHealth()
+        self._arrival_ns: int | None = None
         self._raised: dict[str, Level] = {}
         self._views: dict[str, int | None] = {}  # when each was published last
         self._window_s: float | None = None
         self._due_from_ns = self._heartbeat = 0
         self._reported: object = None
 
-    def state(self, name: str) -> None:
-        """The lifecycle's state, lower case (lifecycle.State.label)."""
-        with self._lock:
-            if name != self._state:
-                self._due_from_ns = self._clock()
-            self._state = name
-
     def source(self, state: SourceState) -> None:
         """The source's state. "lost" is remembered until it streams again; streaming after that is a reconnect."""
         with self._lock:
             if state != self._source and state != "stalled":
                 self._stamps.clear()  # no rate across a break
-            if state == "streaming" and self._source != "streaming":
-                self._due_from_ns = self._clock()
-                self._counts["reconnects"] += self._lost
+            if state == "streaming":
+                self.counts["reconnects"] += self._lost
             self._lost = state == "lost" or (self._lost and state not in ("streaming", "closed", "ended"))
             self._source = state
-
-    def model(self, state: ModelState) -> None:
-        """The model's state."""
-        with self._lock:
-            if state in _WORKING and self._model not in _WORKING:
-                self._due_from_ns = self._clock()
-            self._model = state
 
     def frame(self, stamp_ns: int, arrival_ns: int) -> None:
         """A frame arrived whole. stamp_ns: on the source's clock; arrival_ns: on this object's clock."""
         with self._lock:
-            self._counts["frames"] += 1
+            self.counts["frames"] += 1
             self._arrival_ns = arrival_ns
             self._arrivals.append((arrival_ns, True))
             gap_ns = stamp_ns - self._stamps[-1] if self._stamps else 0
@@ -149,11 +125,11 @@ class Health:
             if gap_ns > 0:
                 self._stages["capture_gap"].add(arrival_ns, gap_ns / 1e9)
 
-    def corrupt(self, count: int = 1) -> None:
-        """So many more frames arrived damaged."""
+    def corrupt(self, total: int) -> None:
+        """So many frames have arrived damaged since the source was opened first."""
         with self._lock:
-            self._counts["corrupt"] += count
-            self._arrivals.extend(min(count, 1024) * [(self._clock(), False)])
+            new, self.counts["corrupt"] = total - self.counts["corrupt"], total
+            self._arrivals.extend(min(new, 1024) * [(self._clock(), False)])
 
     def stage(self, name: Stage, seconds: float) -> None:
         """How long a stage took once."""
@@ -163,19 +139,7 @@ class Health:
     def count(self, name: Count) -> None:
         """One more."""
         with self._lock:
-            self._counts[name] += 1
-
-    def totals(self, **totals: int) -> None:
-        """So many in total, by the names of Count, from whoever counts for himself."""
-        with self._lock:
-            for name, total in totals.items():
-                self._counts[name] = total
-
-    def windows(self, built: int, faults: Mapping[str, int]) -> None:
-        """What the window builder counts: windows built, and what spoilt how many; sets the hop "window"."""
-        with self._lock:
-            self._counts["built"], self._faults = built, dict(faults)
-            self._counts["window"] = sum(faults.values())
+            self.counts[name] += 1
 
     def expect(self, views: Iterable[str], window_s: float | None) -> None:
         """Which views are rendered, and how often a window begins, seconds; None if nobody waits for the clock
@@ -192,98 +156,102 @@ class Health:
             if view_id in self._views:
                 self._views[view_id] = now_ns
 
-    def recording(self, now: RecordHealth) -> None:
-        """How the recording does."""
+    def raise_reason(self, code: str, level: Level) -> bool:
+        """Something lasting that the rules do not know, such as "fps" out of the trained set or MODEL_HUNG; whether
+        that is new."""
         with self._lock:
-            self._rec = now
-
-    def measure(self, name: Literal["ood_score", "gpu_mem_mb"], value: float | None) -> None:
-        """How unlike the training the last window looked to the model; the device's memory in use. None: unknown."""
-        with self._lock:
-            self._measures[name] = value
-
-    def raise_reason(self, code: str, level: Level) -> None:
-        """Something lasting that the rules do not know, such as "fps" out of the trained set or MODEL_HUNG."""
-        with self._lock:
+            is_new = code not in self._raised
             self._raised[code] = level
+            return is_new
 
     def clear_reason(self, code: str) -> None:
         """It is over; nothing happens if it never was."""
         with self._lock:
-            if self._raised.pop(code, None) is not None and code == IDLE:
-                self._due_from_ns = self._clock()
+            self._raised.pop(code, None)
 
-    def snapshot(self) -> Snapshot:
-        """Everything as it stands now."""
+    def forget_reasons(self) -> None:
+        """Clear what the last activation raised: all but a dead thread."""
         with self._lock:
-            return self._snapshot(self._clock())
+            self._raised = {code: level for code, level in self._raised.items() if code == THREAD_DIED}
 
-    def report(self) -> dict[str, object]:
-        """The fields of a status message; `heartbeat_seq` rises with each call, so only who publishes it calls it."""
+    def findings(self) -> dict[str, Level]:
+        """Every reason there is now with its level, the worst first (docs/deploy.md explains each)."""
         with self._lock:
-            now_ns = self._clock()
-            self._heartbeat += 1
-            self._reported = self._essence(now_ns)
-            return {**self._snapshot(now_ns).status, "heartbeat_seq": self._heartbeat}
+            return self._judged(self._clock())[0]
+
+    def stages_s(self) -> dict[str, float]:
+        """How long each stage has taken since the start, in all."""
+        with self._lock:
+            return {str(name): times.total_s for name, times in self._stages.items()}
 
     def changed(self) -> bool:
         """Whether level, reasons, readiness or a state differ from the last `report`; ready and busy are the same."""
         with self._lock:
             return self._essence(self._clock()) != self._reported
 
-    # What follows is called with the lock held.
+    def report(self) -> dict[str, object]:
+        """status() for who publishes it: `heartbeat_seq` rises with each call."""
+        with self._lock:
+            self._heartbeat += 1
+            self._reported = self._essence(self._clock())
+        return {**self.status(), "heartbeat_seq": self._heartbeat}
 
-    def _snapshot(self, now_ns: int) -> Snapshot:
-        findings, missing, counts = self._findings(now_ns), self._missing(now_ns), self._counts
-        stages = {str(name): times.summary(now_ns) for name, times in self._stages.items() if times.count}
-        render, memory_mb, ood = stages.get("render", {}), *map(self._measures.get, ("gpu_mem_mb", "ood_score"))
-        views = {view_id: None if at is None else round((now_ns - at) / 1e6) for view_id, at in self._views.items()}
-        age_ns = None if self._arrival_ns is None else max(0, now_ns - self._arrival_ns)
-        status: dict[str, Any] = {
-            "state": self._state,
-            "level": int(max(findings.values(), default=Level.OK)),
-            "reasons": list(findings),
-            "ready": not missing,
-            "not_ready": list(missing),
-            "source": _known(
-                state=self._source,
-                fps=self._fps(),
-                last_frame_age_ms=None if age_ns is None else round(age_ns / 1e6, 1),
-                dropped=counts["source"],
-                reconnects=counts["reconnects"],
-                corrupt=counts["corrupt"],
-            ),
-            "window": {
-                "built": counts["built"],
-                "rejected": counts["window"],
-                "reason_counts": dict(self._faults),
-                "skipped": counts["slot"],
-            },
-            "model": _known(
-                state=self._model,
-                ms_p50=render.get("p50_ms"),
-                ms_p99=render.get("p99_ms"),
-                gpu_mem_mb=None if memory_mb is None else round(memory_mb, 1),
-                oom_count=counts["oom_count"],
-                backoff_s=0.0,  # of protocol 1.0: no model is tried again later
-                nan_windows=counts["nan_windows"],
-                bad_depths=counts["bad_depths"] or None,
-                ood_score=None if ood is None else round(ood, 3),
-            ),
-            "publish": {"dropped": counts["queue"], **{name: counts[name] for name in ("sent", "subs", "bytes")}},
-            "drops": {hop: counts[hop] for hop in get_args(Hop)},
-            "stages": stages,
-            "views": {view_id: _known(last_ms=age_ms) for view_id, age_ms in views.items()},
-            "rec": self._rec.to_status(),
-        }
-        stages_s = {str(name): times.total_s for name, times in self._stages.items()}
-        return Snapshot(status=status, findings=findings, frames=counts["frames"], stages_s=stages_s)
+    def status(self) -> dict[str, Any]:
+        """The fields of a status message (wire protocol, section 4); what is unknown is left out."""
+        with self._lock:
+            now_ns = self._clock()
+            findings, missing = self._judged(now_ns)
+            counts = self.counts | {"window": sum(self.faults.values())}
+            stages = {str(name): times.summary(now_ns) for name, times in self._stages.items() if times.count}
+            render, memory_mb, ood = stages.get("render", {}), self.gpu_mem_mb, self.ood_score
+            age_ns = None if self._arrival_ns is None else max(0, now_ns - self._arrival_ns)
+            return {
+                "state": self.state,
+                "level": int(max(findings.values(), default=Level.OK)),
+                "reasons": list(findings),
+                "ready": not missing,
+                "not_ready": missing,
+                "source": _known(
+                    state=self._source,
+                    fps=self._fps(),
+                    last_frame_age_ms=None if age_ns is None else round(age_ns / 1e6, 1),
+                    dropped=counts["source"],
+                    reconnects=counts["reconnects"],
+                    corrupt=counts["corrupt"],
+                ),
+                "window": {
+                    "built": counts["built"],
+                    "rejected": counts["window"],
+                    "reason_counts": dict(self.faults),
+                    "skipped": counts["slot"],
+                },
+                "model": _known(
+                    state=self.model,
+                    ms_p50=render.get("p50_ms"),
+                    ms_p99=render.get("p99_ms"),
+                    gpu_mem_mb=None if memory_mb is None else round(memory_mb, 1),
+                    oom_count=counts["oom_count"],
+                    backoff_s=0.0,  # of protocol 1.0: no model is tried again later
+                    nan_windows=counts["nan_windows"],
+                    bad_depths=counts["bad_depths"] or None,
+                    ood_score=None if ood is None else round(ood, 3),
+                ),
+                "publish": {"dropped": counts["queue"], **{name: counts[name] for name in ("sent", "subs", "bytes")}},
+                "drops": {hop: counts[hop] for hop in get_args(Hop)},
+                "stages": stages,
+                "views": {
+                    view_id: {} if at is None else {"last_ms": round((now_ns - at) / 1e6)}
+                    for view_id, at in self._views.items()
+                },
+                "rec": self.recording.to_status(),
+            }
+
+    # What follows is called with the lock held.
 
     def _essence(self, now_ns: int) -> object:
         """What is worth a status message at once."""
-        model = "ready" if self._model == "busy" else self._model
-        states = self._state, self._source, model, self._rec.state
-        return states, self._findings(now_ns), self._missing(now_ns)
+        model = "ready" if self.model == "busy" else self.model
+        return self.state, self._source, model, self.recording.state, self._judged(now_ns)
 
     def _fps(self) -> float | None:
         """By the latest stamps; None if there are too few."""
@@ -293,50 +261,40 @@ class Health:
             return None
         return round((len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0]), 2)
 
-    def _findings(self, now_ns: int) -> dict[str, Level]:
+    def _judged(self, now_ns: int) -> tuple[dict[str, Level], list[str]]:
+        """Every reason with its level, the worst first; and what the node lacks to be ready."""
+        is_active, is_streaming, works = self.state == "active", self._source == "streaming", self.model in _WORKING
+        is_idle, window_s, render = IDLE in self._raised, self._window_s or 0.0, self._stages["render"]
+        slowest_s = render.summary(now_ns)["p99_ms"] / 1000 if render.count else 0.0
+        patience_ns = 1e9 * max(_LEAST_PATIENCE_S, 2 * slowest_s, 2 * window_s)
+        if not (is_active and is_streaming and works) or is_idle:
+            self._due_from_ns = now_ns  # no view can come
+        waited_ns = max((now_ns - max(at or 0, self._due_from_ns) for at in self._views.values()), default=0)
+        oldest_ns = -math.inf if self._window_s is None else now_ns - patience_ns
+        is_fresh = bool(self._views) and all(at is not None and at >= oldest_ns for at in self._views.values())
+        recent = [whole for at_ns, whole in self._arrivals if now_ns - at_ns <= _RECENT_NS]
+        is_corrupt = len(recent) >= _LEAST_ARRIVALS and recent.count(False) > _CORRUPT_LIMIT * len(recent)
+        is_overdue = self._window_s is not None and waited_ns > patience_ns + 1e9 * window_s
         rules = (
-            (self._state == "errorprocessing", "NODE_ERROR", Level.ERROR),
+            (self.state == "errorprocessing", "NODE_ERROR", Level.ERROR),
             (self._lost, "SRC_LOST", Level.ERROR),
             (self._source == "stalled" and not self._lost, "SRC_STALLED", Level.WARN),
-            (self._is_corrupt(now_ns), "SRC_CORRUPT", Level.WARN),
-            (self._model == "failed", "MODEL_FAILED", Level.ERROR),
-            (self._model == "degraded", "MODEL_DEGRADED", Level.WARN),
-            (self._overdue(now_ns), "VIEWS_OVERDUE", Level.WARN),
-            (self._rec.state == "failed", "REC_FAILED", Level.WARN),
+            (is_corrupt, "SRC_CORRUPT", Level.WARN),
+            (self.model == "failed", "MODEL_FAILED", Level.ERROR),
+            (self.model == "degraded", "MODEL_DEGRADED", Level.WARN),
+            (is_overdue, "VIEWS_OVERDUE", Level.WARN),
+            (self.recording.state == "failed", "REC_FAILED", Level.WARN),
         )
-        found = self._raised | {code: level for holds, code, level in rules if holds}
-        return dict(sorted(found.items(), key=lambda each: (-each[1], each[0])))
-
-    def _is_corrupt(self, now_ns: int) -> bool:
-        recent = [whole for at_ns, whole in self._arrivals if now_ns - at_ns <= _RECENT_NS]
-        return len(recent) >= _LEAST_ARRIVALS and recent.count(False) > _CORRUPT_LIMIT * len(recent)
-
-    def _missing(self, now_ns: int) -> tuple[str, ...]:
-        oldest_ns = -math.inf if self._window_s is None else now_ns - self._patience_ns(now_ns)
-        fresh = bool(self._views) and all(at is not None and at >= oldest_ns for at in self._views.values())
-        rules = (
-            (self._state == "active", "NOT_ACTIVE"),
-            (self._source == "streaming", "SRC_NOT_STREAMING"),
-            (self._model in _WORKING, "MODEL_NOT_READY"),
-            (fresh or IDLE in self._raised, "VIEWS_NOT_FRESH"),
+        needs = (
+            (is_active, "NOT_ACTIVE"),
+            (is_streaming, "SRC_NOT_STREAMING"),
+            (works, "MODEL_NOT_READY"),
+            (is_fresh or is_idle, "VIEWS_NOT_FRESH"),
             (THREAD_DIED not in self._raised, THREAD_DIED),
         )
-        return tuple(code for holds, code in rules if not holds)
-
-    def _overdue(self, now_ns: int) -> bool:
-        """Whether views should have come by now: frames do, the model works, and one window more than patience passed
-        since the last view, or since whatever had to happen first."""
-        works = self._state == "active" and self._source == "streaming" and self._model in _WORKING
-        if self._window_s is None or not works or not self._views or IDLE in self._raised:
-            return False
-        allowed_ns = self._patience_ns(now_ns) + self._window_s * 1e9
-        return any(now_ns - max(at or 0, self._due_from_ns) > allowed_ns for at in self._views.values())
-
-    def _patience_ns(self, now_ns: int) -> float:
-        """How old the last view may be: two windows, or two renderings if those take longer, and at least a second."""
-        render = self._stages["render"]
-        slowest_s = render.summary(now_ns)["p99_ms"] / 1000 if render.count else 0.0
-        return 1e9 * max(_LEAST_PATIENCE_S, 2 * slowest_s, 2 * (self._window_s or 0.0))
+        found = self._raised | {code: level for holds, code, level in rules if holds}
+        worst_first = sorted(found.items(), key=lambda each: (-each[1], each[0]))
+        return dict(worst_first), [code for holds, code in needs if not holds]
 
 
 class StageTimes:

@@ -45,8 +45,7 @@ _LOG = logging.getLogger(__name__)
 _KEPT = 1000  # a node runs for weeks
 _HOLD_S = 1.0
 _OTHER_WORLD = "this is another world than the model learned from: depth and classes are guesses"
-WORK_REASONS = ("DEPTH_BAD", "ODOMETRY_BAD", "MOTION_LOST", "world")
-"""What a model thread raises of the node's health by what its windows show."""
+_WORK_REASONS = ("DEPTH_BAD", "ODOMETRY_BAD", "MOTION_LOST", "world")
 
 
 @dataclass(slots=True)
@@ -123,7 +122,7 @@ class Renderer:
         self._memory = 0
         hold_s = _HOLD_S if model.streams else 0.0
         self._bad_depth, self._bad_odometry, self._lost_motion, self._other_world = (
-            Condition(code, announcer, hold_s=hold_s) for code in WORK_REASONS
+            Condition(code, announcer, hold_s=hold_s) for code in _WORK_REASONS
         )
         self._epoch = -1
         self._latest: tuple[StreamContext, StreamContext] | None = None
@@ -375,7 +374,7 @@ class Renderer:
     def _tell_source(self, context: StreamContext, view: View) -> None:
         """Whether the model knows such a source, and how it moved; the same for all views of a window."""
         self._lost_motion.update({"message": view.lost[0], "frames": len(view.lost)} if view.lost else None)
-        self._health.measure("ood_score", view.ood)
+        self._health.ood_score = view.ood
         is_foreign = bool(world_flags(context.traits, view))
         self._other_world.update({"message": _OTHER_WORLD, "ood_score": view.ood} if is_foreign else None)
 
@@ -386,6 +385,6 @@ class Renderer:
         self.counts.render_s.append(seconds)
         self.counts.age_ms.append(age_ms)
         if self._model.traits.device.startswith("cuda"):
-            self._health.measure("gpu_mem_mb", torch.cuda.memory_allocated() / 1e6)
+            self._health.gpu_mem_mb = torch.cuda.memory_allocated() / 1e6
         if self._on_window is not None:
             self._on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))

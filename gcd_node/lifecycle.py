@@ -20,16 +20,14 @@ from typing import Literal, TypeAlias
 
 from msgspec.structs import replace
 
-from gcd_client.control import ControlError
 from gcd_model import Traits
 from gcd_node.frame import FrameSource, SourceInfo
 from gcd_node.inference import WindowReport
 from gcd_node.model import LoadModel, ModelSlot
-from gcd_node.pipeline import Stream, Summary
+from gcd_node.pipeline import MODEL_FAILED, Stream, Summary
 from gcd_node.recorder import Recorder
 from gcd_node.sources import LIVE_KINDS, OakSource, SourceConfig
 from gcd_node.status import Announcer
-from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.views import LiveConfig, VirtualViews
 
 _LOG = logging.getLogger(__name__)
@@ -97,17 +95,13 @@ class Lifecycle:
         already = " already" if state in (passing, goal) else ""
         return f"{verb} is for a node that is {expected}, this one is {state.label}{already}{busy}"
 
-    def begin(self, verb: Verb) -> None:
-        """Enter the state between.
-
-        Raises:
-            ControlError: WRONG_STATE; nothing has changed.
-        """
+    def begin(self, verb: Verb) -> str | None:
+        """Enter the state between; or say why that cannot be, and change nothing."""
         with self._order:
             refusal = self.refusal(verb)
-            if refusal is not None:
-                raise ControlError(refusal, "WRONG_STATE")
-            self._from, self._verb, self.state = self.state, verb, PATHS[verb][1]
+            if refusal is None:
+                self._from, self._verb, self.state = self.state, verb, PATHS[verb][1]
+            return refusal
 
     def succeed(self) -> None:
         """The work was done: go where the transition leads."""
@@ -138,8 +132,8 @@ class Parts:
 
 
 class Transitions:
-    """The parts that work. `configure`, `activate`, `deactivate` and `cleanup` may take long; each either succeeds or
-    raises and leaves nothing half done.
+    """The parts that work. `configure`, `activate`, `deactivate` and `cleanup` may take long; each
+    either succeeds or raises and leaves nothing half done.
 
     stream: the activation under way. summary: of the last one. failure: what it ended with, None if it ended well.
     model_failed: the model has to be loaded anew.
@@ -151,29 +145,20 @@ class Transitions:
         announcer: Announcer,
         parts: Parts,
         recorder: Recorder,
-        on_over: Callable[[], None],
         on_window: Callable[[WindowReport], None] | None,
     ) -> None:
-        """on_over: called when a stream has ended."""
         self._live, self._announcer, self._health = live, announcer, announcer.health
-        self._parts, self._recorder, self._on_over, self._on_window = parts, recorder, on_over, on_window
+        self._parts, self._recorder, self._on_window = parts, recorder, on_window
         self._model: ModelSlot | None = None
         self._source: FrameSource | None = None
         self._info: SourceInfo | None = None
-        self._context: StreamContext | None = None
         self._first = (0, 0)
         self._interrupted = False
-        self._raised: tuple[str, ...] = ()
         self._stuck: list[Stream] = []
         self.stream: Stream | None = None
         self.summary = Summary()
         self.failure: Exception | None = None
         self.model_failed = False
-
-    @property
-    def is_live(self) -> bool:
-        """Whether the source is a camera, rather than a recording."""
-        return self._live.config.source.kind in LIVE_KINDS
 
     @property
     def traits(self) -> Traits | None:
@@ -192,30 +177,22 @@ class Transitions:
         self._stuck = [stream for stream in self._stuck if not stream.join(0.0)]
         return bool(self._stuck)
 
-    @property
-    def has_ended(self) -> bool:
-        """Whether there is a stream, and it has ended by itself."""
-        stream = self.stream
-        return stream is not None and stream.over
-
     def configure(self) -> None:
-        """Check the configuration and load the model. A recording is opened, so that a bad one is known at once.
+        """Load the model, and check the views. A recording is opened, so that a bad one is known at once.
 
         Raises:
             SourceError, CheckpointError, ConfigError, OptionError, PoseError: see there.
         """
-        if not self.is_live:
+        if self._live.config.source.kind not in LIVE_KINDS:
             self._source = self._open()
         try:
-            self._health.model("loading")
+            self._health.model = "loading"
             self._model = ModelSlot(self._live.config.model, self._parts.load_model)
-            self._context = None if self._source is None else self._prepare(self._model, self._source)
-            mount = None if self._context is None else self._context.mount
-            VirtualViews(self._model.traits).sync(self._live.settings(), mount)
+            VirtualViews(self._model.traits).sync(self._live.settings())
         except BaseException:
             self.cleanup()
             raise
-        self._health.model("ready")
+        self._health.model = "ready"
 
     def activate(self) -> None:
         """Open the source, and let views come once the model is warm.
@@ -223,24 +200,19 @@ class Transitions:
         Raises:
             SourceAbsentError: there is no such camera. SourceError, ConfigError, OptionError, PoseError: see there.
         """
-        model = self._model
-        assert model is not None, "the lifecycle configures before it activates"
-        for code in self._raised:
-            self._health.clear_reason(code)
+        assert self._model is not None, "the lifecycle configures before it activates"
+        self._health.forget_reasons()
         self._health.source("connecting")
         source, self._source, self.failure = self._source, None, None
-        context, self._context = self._context, None
         try:
             source = self._open() if source is None else source
             stream = Stream(
                 self._live,
                 self._announcer,
-                model,
+                self._model,
                 source,
-                context or self._prepare(model, source),
                 reopen=lambda before: self._parts.open_source(same_camera(self._live.config.source, before)),
                 first=self._first,
-                on_over=self._on_over,
                 on_window=self._on_window,
                 recorder=self._recorder,
             )
@@ -266,9 +238,9 @@ class Transitions:
             _LOG.error("a thread of the stream does not end; it is left behind")
             self._stuck.append(stream)
         self.stream = None
-        self._info, self.summary, self.failure = stream.context.source, stream.summary(), stream.failure
-        self._first, self._raised, self.model_failed = stream.next, stream.reasons, stream.model_failed
-        stream.announce_end()
+        self._info, self._first = stream.context.source, stream.next
+        self.summary, self.failure = stream.summary(), stream.failure
+        self.model_failed = stream.announce_end() == MODEL_FAILED
         del stream
         gc.collect()  # its pixels hang on objects that refer to each other
 
@@ -276,7 +248,7 @@ class Transitions:
         """Let go of the model."""
         self._release()
         gc.collect()
-        self._health.model("absent")
+        self._health.model = "absent"
 
     def interrupt(self) -> None:
         """End what is under way soon, for good; from another thread than the transitions'."""
@@ -303,8 +275,7 @@ class Transitions:
         return True
 
     def _release(self) -> None:
-        source, self._source, self._model, self._context = self._source, None, None, None
-        self.model_failed = False
+        source, self._source, self._model, self.model_failed = self._source, None, None, False
         if source is not None:
             source.close()
 
@@ -312,9 +283,6 @@ class Transitions:
         source = self._parts.open_source(self._live.config.source)
         self._info = source.info
         return source
-
-    def _prepare(self, model: ModelSlot, source: FrameSource) -> StreamContext:
-        return prepare_stream(self._live.config, model.traits, source.info, boot_id=self._announcer.boot_id)
 
 
 def same_camera(config: SourceConfig, before: SourceInfo) -> SourceConfig:

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from http import HTTPStatus
@@ -15,7 +14,7 @@ from prometheus_client import CollectorRegistry, ProcessCollector, make_wsgi_app
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric, SummaryMetricFamily
 from prometheus_client.registry import Collector
 
-from gcd_node.health import Health, ModelState, Snapshot, SourceState
+from gcd_node.health import Health, ModelState, SourceState
 from gcd_node.lifecycle import State
 from gcd_node.service import listen
 
@@ -25,7 +24,8 @@ _CALLER_TIMEOUT_S = 5.0
 
 Respond: TypeAlias = Callable[[str, list[tuple[str, str]]], object]
 App: TypeAlias = Callable[[dict[str, Any], Respond], Iterable[bytes]]
-Kind: TypeAlias = type[GaugeMetricFamily | CounterMetricFamily]
+Row: TypeAlias = tuple[type[GaugeMetricFamily | CounterMetricFamily], str, str, str, Mapping[str, float | None]]
+"""Kind, name, text, label and the value for each of its values; without a label, that of ""."""
 
 
 class _Handler(WSGIRequestHandler):
@@ -83,9 +83,8 @@ class MetricsServer(ThreadingMixIn, WSGIServer):
             self._room.release()
 
     def handle_error(self, request: socket | tuple[bytes, socket], client_address: Any) -> None:
-        """A caller that hangs up in the middle is no news; anything else is a mistake of ours."""
-        gone = isinstance(sys.exception(), OSError)
-        _LOG.log(logging.DEBUG if gone else logging.ERROR, "a call to the metrics server failed", exc_info=True)
+        """Such as a caller that hangs up in the middle."""
+        _LOG.debug("a call to the metrics server failed", exc_info=True)
 
 
 def make_app(health: Health) -> App:
@@ -102,7 +101,7 @@ def make_app(health: Health) -> App:
             case "/healthz":
                 code, fields = HTTPStatus.OK, {"live": True}
             case "/readyz":
-                status = health.snapshot().status
+                status = health.status()
                 code = HTTPStatus.OK if status["ready"] else HTTPStatus.SERVICE_UNAVAILABLE
                 fields = {key: status[key] for key in ("ready", "not_ready", "level", "reasons")}
             case _:
@@ -114,66 +113,56 @@ def make_app(health: Health) -> App:
 
 
 class _HealthCollector(Collector):
-    """Asks for a snapshot whenever somebody scrapes."""
+    """Asks how the node does whenever somebody scrapes."""
 
     def __init__(self, health: Health) -> None:
         self._health = health
 
     def collect(self) -> Iterator[Metric]:
-        snapshot = self._health.snapshot()
-        for kind, name, text, value in _numbers(snapshot):
-            if value is not None:  # unknown
-                yield kind(f"gcd_{name}", text, value)
-        for kind, name, text, label, values in _labelled(snapshot):
-            family = kind(f"gcd_{name}", text, labels=[label])
+        status = self._health.status()
+        for kind, name, text, label, values in _rows(self._health, status):
+            family = kind(f"gcd_{name}", text, labels=[label] if label else ())
             for each, number in values.items():
-                family.add_metric([each], number)
+                if number is not None:  # unknown
+                    family.add_metric([each] if label else [], number)
             yield family
         stages = SummaryMetricFamily("gcd_stage_seconds", "How long each stage takes.", labels=["stage"])
-        for name, stage in snapshot.status["stages"].items():  # quantiles of the last minute, count and sum of all
+        sums_s = self._health.stages_s()
+        for name, stage in status["stages"].items():  # quantiles of the last minute, count and sum of all
             for part, ms in (("0.5", stage["p50_ms"]), ("0.99", stage["p99_ms"])):
                 stages.add_sample("gcd_stage_seconds", {"stage": name, "quantile": part}, ms / 1000)
-            stages.add_metric([name], stage["count"], snapshot.stages_s[name])
+            stages.add_metric([name], stage["count"], sums_s[name])
         yield stages
 
 
-def _numbers(snapshot: Snapshot) -> Iterable[tuple[Kind, str, str, float | None]]:
-    """Kind, name, text and value; None while it is unknown."""
-    status, gauge, counter = snapshot.status, GaugeMetricFamily, CounterMetricFamily
-    source, model, publish = status["source"], status["model"], status["publish"]
+def _rows(health: Health, status: dict[str, Any]) -> Iterable[Row]:
+    gauge, counter = GaugeMetricFamily, CounterMetricFamily
+    source, window, model, publish = (status[name] for name in ("source", "window", "model", "publish"))
     age_ms, memory_mb = source.get("last_frame_age_ms"), model.get("gpu_mem_mb")
-    return (
-        (gauge, "level", "0 OK, 1 WARN, 2 ERROR; the worst of gcd_reason_level.", status["level"]),
-        (gauge, "ready", "1 if views come, or would if somebody subscribed.", int(status["ready"])),
-        (gauge, "source_fps", "Frames a second by the latest stamps.", source.get("fps")),
-        (gauge, "source_last_frame_age_seconds", "Since a frame arrived.", age_ms and age_ms / 1000),
-        (gauge, "model_gpu_memory_bytes", "Device memory in use.", memory_mb and memory_mb * 1e6),
-        (gauge, "subscriptions", "Subscriptions on the data socket.", publish["subs"]),
-        (counter, "source_frames", "Frames that arrived whole.", snapshot.frames),
-        (counter, "source_corrupt_frames", "Frames that arrived damaged.", source["corrupt"]),
-        (counter, "source_reconnects", "Times the source came back.", source["reconnects"]),
-        (counter, "model_out_of_memory", "Windows the model found no memory for.", model["oom_count"]),
-        (counter, "model_nan_windows", "Windows that came out with NaN.", model["nan_windows"]),
-        (counter, "windows_built", "Windows of frames.", status["window"]["built"]),
-        (counter, "messages_sent", "Messages that left on the data socket.", publish["sent"]),
-        (counter, "bytes_sent", "Bytes that left on the data socket.", publish["bytes"]),
-    )
-
-
-def _labelled(snapshot: Snapshot) -> Iterable[tuple[Kind, str, str, str, Mapping[str, float]]]:
-    """Kind, name, text, label and the value for each of its values."""
-    status, gauge, counter = snapshot.status, GaugeMetricFamily, CounterMetricFamily
+    ages_s = {view_id: view["last_ms"] / 1000 for view_id, view in status["views"].items() if view}
     states = (
         ("node", [state.label for state in State], status["state"]),
-        ("source", get_args(SourceState), status["source"]["state"]),
-        ("model", get_args(ModelState), status["model"]["state"]),
+        ("source", get_args(SourceState), source["state"]),
+        ("model", get_args(ModelState), model["state"]),
     )
     for name, known, now in states:
         text = f"1 for the state of the {name}, 0 for others."
         yield gauge, f"{name}_state", text, "state", {each: int(each == now) for each in known}
-    faults = status["window"]["reason_counts"]
-    ages_s = {view_id: view["last_ms"] / 1000 for view_id, view in status["views"].items() if view}
-    yield gauge, "reason_level", "Level of each reason there is now.", "code", snapshot.findings
-    yield counter, "window_faults", "What spoilt windows.", "reason", faults
+    yield gauge, "level", "0 OK, 1 WARN, 2 ERROR; the worst of gcd_reason_level.", "", {"": status["level"]}
+    yield gauge, "reason_level", "Level of each reason there is now.", "code", health.findings()
+    yield gauge, "ready", "1 if views come, or would if somebody subscribed.", "", {"": int(status["ready"])}
+    yield gauge, "source_fps", "Frames a second by the latest stamps.", "", {"": source.get("fps")}
+    yield gauge, "source_last_frame_age_seconds", "Since a frame arrived.", "", {"": age_ms and age_ms / 1000}
+    yield counter, "source_frames", "Frames that arrived whole.", "", {"": health.counts["frames"]}
+    yield counter, "source_corrupt_frames", "Frames that arrived damaged.", "", {"": source["corrupt"]}
+    yield counter, "source_reconnects", "Times the source came back.", "", {"": source["reconnects"]}
+    yield counter, "windows_built", "Windows of frames.", "", {"": window["built"]}
+    yield counter, "window_faults", "What spoilt windows.", "reason", window["reason_counts"]
     yield counter, "dropped", "Frames, windows or messages given up.", "hop", status["drops"]
+    yield gauge, "model_gpu_memory_bytes", "Device memory in use.", "", {"": memory_mb and memory_mb * 1e6}
+    yield counter, "model_out_of_memory", "Windows the model found no memory for.", "", {"": model["oom_count"]}
+    yield counter, "model_nan_windows", "Windows that came out with NaN.", "", {"": model["nan_windows"]}
     yield gauge, "view_last_published_seconds", "Since a view was published.", "view", ages_s
+    yield gauge, "subscriptions", "Subscriptions on the data socket.", "", {"": publish["subs"]}
+    yield counter, "messages_sent", "Messages that left on the data socket.", "", {"": publish["sent"]}
+    yield counter, "bytes_sent", "Bytes that left on the data socket.", "", {"": publish["bytes"]}

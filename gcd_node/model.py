@@ -178,12 +178,12 @@ class Pulse:
         with self._order:
             self._begun_s.pop(threading.get_ident(), None)
             if not self._begun_s:
-                self._health.model("degraded" if self._given_up else "ready")
+                self._health.model = "degraded" if self._given_up else "ready"
 
     def _begin(self, at_s: float, state: ModelState) -> None:
         with self._order:
             self._begun_s[threading.get_ident()] = at_s
-            self._health.model(state)
+            self._health.model = state
 
 
 class IdleTimer:

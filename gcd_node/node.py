@@ -7,14 +7,12 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from functools import partial
 
-from gcd_client.control import Code, ControlError
+from gcd_client.control import Code
 from gcd_model import ModelError, Traits
 from gcd_node.auth import Role
 from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig
-from gcd_node.control import Outcome
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
@@ -23,9 +21,10 @@ from gcd_node.messages import MessageSink
 from gcd_node.pipeline import Summary
 from gcd_node.recorder import Recorder
 from gcd_node.service import ServiceManager, Watchdog
+from gcd_node.sources import LIVE_KINDS
 from gcd_node.sources.live import backoff_s
 from gcd_node.status import Announcer
-from gcd_node.verbs import Command
+from gcd_node.verbs import Command, Outcome
 from gcd_node.views import LiveConfig
 
 _LOG = logging.getLogger(__name__)
@@ -37,7 +36,7 @@ _LEAST_RECORD_S = 0.5
 
 class Node:
     """A camera, a model and the views between them. `run` blocks; `stop` and `handle` may be called from other threads,
-    `stop` from a signal handler too. Transitions are worked through in a thread of their own, so that status and
+    `stop` from a signal handler too. Each transition is worked through in a thread of its own, so that status and
     commands go on."""
 
     def __init__(
@@ -59,18 +58,16 @@ class Node:
         """
         self._config, self._once, self._on_configured = config, once, on_configured
         self.health, live, boot_id = Health(), LiveConfig(config), uuid.uuid4().hex
-        self.recorder = Recorder(config, boot_id, lambda: live.config, self._emit, sink)
+        self.recorder = Recorder(config, boot_id, lambda: live.config, self.event, sink)
         self._announcer = Announcer(config.node_id, boot_id, self.recorder, self.health)
-        self._inbox: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the life loop is to do
-        self._transitions = Transitions(
-            live, self._announcer, parts, self.recorder, lambda: self._inbox.put(self._after_stream), on_window
-        )
+        self._transitions = Transitions(live, self._announcer, parts, self.recorder, on_window)
         self._commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self.request)
         self._life = Lifecycle()
         self._work: threading.Thread | None = None
         self._service = service or ServiceManager({})
-        self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s)
+        self.watchdog = Watchdog(self.event, self.health, config.life.hang_s)
         self._waits = backoff_s(config.source.kind)
+        self._ends: queue.SimpleQueue[None] = queue.SimpleQueue()  # something in it: the life loop is to end
         self._stop_s: float | None = None
         self._retry_s: float | None = None
         self._on_its_own = config.life.autostart
@@ -86,26 +83,18 @@ class Node:
         """After `run`: whether a thread hangs that Python would wait for in vain."""
         return self._transitions.left_behind or (self._work is not None and self._work.is_alive())
 
-    def watch(self, dead_threads: Callable[[], list[str]]) -> None:
-        """Ask this for the names of dead threads as long as the node runs: without them it is not ready."""
-        self._watchdog.watch(dead_threads)
-
     def stop(self) -> None:
         """End in order, soon: no new window begins, the one in work is abandoned at its next layer."""
         self.recorder.stop_waiting()
-        self._inbox.put(self._prepare_stop)
+        self._ends.put(None)
 
     def handle(self, command: Command, role: Role) -> Outcome:
         """Carry a command out, or begin to; see CommandHandler."""
         return self._commands.handle(command, role)
 
-    def _emit(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
+    def event(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
+        """Publish what any part of the process has noticed; see EventSink."""
         self._announcer.event(code, level, fields)
-
-    def event(self, code: str, fields: dict[str, object]) -> None:
-        """Publish what another part of the process has noticed; a warning if it gives no `level`."""
-        level = fields.get("level")
-        self._announcer.event(code, Level(level) if isinstance(level, int) else Level.WARN, fields)
 
     def request(self, verb: Verb, dry_run: bool) -> Outcome:
         """Begin a transition; an event tells how it ends."""
@@ -113,18 +102,18 @@ class Node:
             return Outcome(code=Code.NOT_READY, message="the model has failed; cleanup and configure load it anew")
         if verb == "activate" and self._transitions.left_behind:
             return Outcome(code=Code.NOT_READY, message="a thread of the last activation hangs; restart the process")
-        refusal, is_busy = self._life.refusal(verb), not self.state.settled
-        if refusal is not None and not (verb == "shutdown" and is_busy):
+        is_busy = not self.state.settled
+        if verb == "shutdown":
+            refusal = None if is_busy else self._life.refusal(verb)
+        else:
+            refusal = self._life.refusal(verb) if dry_run else self._begin(verb, requested=True)
+        if refusal is not None:
             return Outcome(code=Code.BUSY if is_busy else Code.WRONG_STATE, message=refusal)
         if dry_run:
             return Outcome(message=f"{verb} would begin")
         if verb == "shutdown":
             self.stop()
             return Outcome(code=Code.ACCEPTED, message="ending in order")
-        try:
-            self._begin(verb, requested=True)
-        except ControlError as error:  # another one was faster
-            return Outcome(code=Code.BUSY, message=str(error))
         self._on_its_own &= verb not in ("deactivate", "cleanup")
         return Outcome(code=Code.ACCEPTED, message=f"{verb} has begun; an event tells how it ends")
 
@@ -145,11 +134,11 @@ class Node:
                 self._service.ready()
             while self.state is not State.FINALIZED and self._left_s(0.0) > 0:
                 with contextlib.suppress(queue.Empty):
-                    self._inbox.get(timeout=_TICK_S)()
-                if self._stop_s is not None:
-                    self._try("shutdown")
+                    self._ends.get(timeout=_TICK_S)
+                    self._prepare_stop()
                 self._tick()
         finally:
+            self._on_its_own = False
             self._transitions.interrupt()
             if self._work is not None:
                 self._work.join(self._left_s(_LEAST_PATIENCE_S))
@@ -161,20 +150,20 @@ class Node:
 
     # Life loop.
 
-    def _after_stream(self) -> None:
-        if self.state is State.ACTIVE and self._transitions.has_ended:
-            self._try("deactivate")
-
     def _tick(self) -> None:
-        stream = self._transitions.stream
+        state, stream = self.state, self._transitions.stream
         if stream is not None:
             stream.tick()
-        if self._watchdog.check(0.0 if stream is None else stream.renderer.pulse.silent_s):
+        if self.watchdog.check(0.0 if stream is None else stream.renderer.pulse.silent_s):
             self._service.alive()
-        self.health.recording(self.recorder.report())
-        if self._retry_s is not None and time.monotonic() >= self._retry_s and self.state is State.INACTIVE:
+        self.health.recording = self.recorder.report()
+        if self._stop_s is not None:
+            self._begin("shutdown")
+        elif state is State.ACTIVE and stream is not None and stream.over:
+            self._begin("deactivate")
+        elif self._retry_s is not None and time.monotonic() >= self._retry_s and state is State.INACTIVE:
             self._retry_s = None
-            self._try("activate")
+            self._begin("activate")
         self._announcer.status_if_due()
 
     def _prepare_stop(self) -> None:
@@ -189,41 +178,32 @@ class Node:
         return max(least_s, _PATIENCE_S - since_s)
 
     def _publish_state(self) -> None:
-        self.health.state(self.state.label)
+        self.health.state = self.state.label
         self._announcer.status()
 
     # Transitions.
 
-    def _begin(self, verb: Verb, *, requested: bool = False) -> None:
-        """Raises ControlError if it cannot be begun now."""
-        self._life.begin(verb)
-        self._publish_state()
-        if verb == "configure":
-            self._service.loading()
-        self._work = threading.Thread(target=self._perform, args=(verb, requested), name=verb, daemon=True)
-        self._work.start()
-
-    def _try(self, verb: Verb) -> None:
-        """Begin a transition, unless a command was faster or the life is elsewhere."""
-        if self._life.refusal(verb) is None:
-            with contextlib.suppress(ControlError):
-                self._begin(verb)
+    def _begin(self, verb: Verb, *, requested: bool = False) -> str | None:
+        """Begin a transition, or say why that cannot be. requested: by a command, rather than by the node itself."""
+        refusal = self._life.begin(verb)
+        if refusal is None:
+            self._publish_state()
+            self._work = threading.Thread(target=self._perform, args=(verb, requested), name=verb, daemon=True)
+            self._work.start()
+        return refusal
 
     def _perform(self, verb: Verb, requested: bool) -> None:
-        """Its work, in a thread of its own. requested: by a command, rather than by the node itself."""
-        work: dict[Verb, Callable[[], None]] = {
-            "configure": self._transitions.configure,
-            "activate": self._transitions.activate,
-            "deactivate": self._transitions.deactivate,
-            "cleanup": self._transitions.cleanup,
-            "shutdown": self._transitions.deactivate,
-        }
+        """A transition's work, in a thread of its own, and what follows."""
+        work = self._transitions.deactivate if verb == "shutdown" else getattr(self._transitions, verb)
         try:
-            work[verb]()
-        except Exception as error:  # the end of a thread: the life loop looks at it
-            self._inbox.put(partial(self._fail, verb, error))
-        else:
-            self._inbox.put(partial(self._succeed, verb, requested))
+            try:
+                work()
+            except Exception as error:
+                self._fail(verb, error)
+            else:
+                self._succeed(verb, requested)
+        except Exception as error:  # what happens cannot be announced any more
+            self._give_up(error)
 
     def _fail(self, verb: Verb, error: Exception) -> None:
         if verb in ("configure", "activate") and isinstance(error, NodeError | ModelError):
@@ -232,7 +212,7 @@ class Node:
             self._life.error()
             _LOG.error("%s broke", verb, exc_info=error)
             self._transitions.close(_PATIENCE_S)
-            self.health.model("absent")
+            self.health.model = "absent"
             self._life.recover()
         self._publish_state()
         self._announcer.event(_code(error).value, Level.ERROR, {"verb": verb, "message": str(error)})
@@ -249,29 +229,31 @@ class Node:
             if traits is not None and self._on_configured is not None:
                 self._on_configured(traits)
             if self._on_its_own and not requested:
-                self._try("activate")
+                self._begin("activate")
         elif verb == "activate":
             self._waits = backoff_s(self._config.source.kind)
             self._service.ready()
-            if self._transitions.has_ended:  # before the node was active
-                self._try("deactivate")
         elif verb == "deactivate" and not requested and self._stop_s is None:
             failure = self._transitions.failure  # the stream has ended by itself
             if failure is not None:
                 self._after_failure(failure, "activate")
             elif self._once:
-                self._prepare_stop()
+                self._ends.put(None)
 
     def _after_failure(self, error: Exception, verb: Verb) -> None:
         """Give up, try again later, or wait for a command."""
         self._service.ready()
+        is_live = self._config.source.kind in LIVE_KINDS
         if self._stop_s is not None and verb != "shutdown":
             return
         if self._once or isinstance(error, SourceLostError):
-            self._failure = error
-            self._prepare_stop()
-        elif verb == "activate" and self._on_its_own and self._transitions.is_live and isinstance(error, SourceError):
+            self._give_up(error)
+        elif verb == "activate" and self._on_its_own and is_live and isinstance(error, SourceError):
             self._retry_s = time.monotonic() + next(self._waits)
+
+    def _give_up(self, error: Exception) -> None:
+        self._failure = error
+        self._ends.put(None)
 
 
 def _code(error: Exception) -> Code:

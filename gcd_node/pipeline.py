@@ -17,7 +17,7 @@ from gcd_node.errors import (
 )
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import Level, SourceState
-from gcd_node.inference import WORK_REASONS, Renderer, WindowReport, WorkCounts
+from gcd_node.inference import Renderer, WindowReport, WorkCounts
 from gcd_node.model import ModelSlot
 from gcd_node.recorder import Recorder
 from gcd_node.sources.live import Opener, SourceWatch
@@ -29,6 +29,19 @@ from gcd_node.worker import ModelWorker
 
 _STOP_DELAY_MS = 100
 _KEPT_EPOCHS = 8  # windows of a former epoch may still be in work
+MODEL_FAILED = "MODEL_FAILED"
+_ENDINGS: tuple[tuple[type[Exception], str, SourceState], ...] = (
+    (TooShortError, "TOO_SHORT", "ended"),
+    (ReaderError, "SRC_FAILED", "closed"),
+    (SourceError, "SRC_LOST", "lost"),
+    (ConfigError, "SRC_REFUSED", "closed"),
+    (EndpointError, "NOT_DELIVERED", "closed"),
+    (PublisherError, "PUBLISH_FAILED", "closed"),
+    (ModelFailedError, MODEL_FAILED, "closed"),
+    (ModelError, MODEL_FAILED, "closed"),
+    (Exception, "INTERNAL", "closed"),
+)
+"""Event code, and the state of the source, by what an activation failed with; the first that fits holds."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -46,7 +59,7 @@ class Summary:
 class Stream:
     """Source, reader thread and model thread, started and stopped together. Implements WatchListener.
 
-    stopped: it was interrupted. over: the last window was dealt with. failure: what it ended with, if not well.
+    over: the last window was dealt with. failure: what it ended with, if not well.
     """
 
     def __init__(
@@ -55,27 +68,25 @@ class Stream:
         announcer: Announcer,
         model: ModelSlot,
         source: FrameSource,
-        context: StreamContext,
         *,
         reopen: Opener,
         first: tuple[int, int],
-        on_over: Callable[[], None],
         on_window: Callable[[WindowReport], None] | None,
         recorder: Recorder,
     ) -> None:
         """Check everything that can be checked without a frame.
 
         Args:
-            source: open. context: what prepare_stream() says of it. reopen: opens it again when it is lost.
+            source: open. reopen: opens it again when it is lost.
             first: window id and epoch to go on from: neither may come twice in one life of a node.
-            on_over: called when the last window was dealt with, whatever the reason, from the model thread.
             recorder: is shown every frame.
         Raises:
-            OptionError, PoseError: see VirtualView.
+            ConfigError: see prepare_stream(). OptionError, PoseError: see VirtualView.
         """
         self._live, self._health, self._announcer = live, announcer.health, announcer
-        self._model, self._on_over, self._recorder = model, on_over, recorder
+        self._model, self._recorder = model, recorder
         config, traits = live.config, model.traits
+        context = prepare_stream(config, traits, source.info, boot_id=announcer.boot_id)
         self._contexts = [(first[1], context)]  # of the source as it is now last; replaced in the reader thread
         self._builder = WindowBuilder(
             frames=traits.config.frames,
@@ -98,9 +109,8 @@ class Stream:
             threading.Thread(target=read, args=(self._watch, self._builder, self._newest), name="reader", daemon=True),
         ]
         self._reported: dict[str, int] = {}
-        self._corrupt = 0
         self._state: SourceState = "closed"
-        self.stopped = self.over = False
+        self._stopped = self.over = False
         self.failure: Exception | None = None
         self._order = threading.Lock()  # what is announced is announced in the order in which it came to be
 
@@ -119,21 +129,6 @@ class Stream:
         """Window id and epoch that the next activation goes on from."""
         return self._builder.next_id, self._builder.epoch + 1
 
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """What it raised of the node's health, to be cleared when another source is used."""
-        return (*self.context.ood, *WORK_REASONS, *LASTING)
-
-    @property
-    def model_failed(self) -> bool:
-        """Whether it ended because the model did."""
-        return ending(self.failure, stopped=self.stopped)[0] == MODEL_FAILED
-
-    @property
-    def _window_s(self) -> float:
-        """From one window to the next."""
-        return (self._live.config.window.stride or self._builder.frames) / self.context.fps
-
     def start(self) -> None:
         """Begin. Frames are read while the model warms up: its first window is a new one, and no camera's own buffers
         grow old."""
@@ -146,15 +141,16 @@ class Stream:
         """The live configuration has changed: other views are due, and the metadata says so."""
         with self._order:
             settings = self._live.settings()
-            is_realtime = settings.config.source.pace == "realtime"
-            self._health.expect(settings.revisions, self._window_s if is_realtime else None)
-            context = replace(self.context, config=settings.config, traits=self._model.traits)
+            config = settings.config
+            window_s = (config.window.stride or self._builder.frames) / self.context.fps
+            self._health.expect(settings.revisions, window_s if config.source.pace == "realtime" else None)
+            context = replace(self.context, config=config, traits=self._model.traits)
             self._announcer.meta(metadata(context, settings))
 
     def interrupt(self) -> None:
         """End soon: no new window begins, the one in work is abandoned at its next layer. May wait a second for a
         camera that does not answer."""
-        self.stopped = True
+        self._stopped = True
         self.renderer.cancel.set()
         self._newest.close()
         self._watch.close()
@@ -170,33 +166,32 @@ class Stream:
     def tick(self) -> None:
         """Pass on what the builder and the source count, with an event for every new kind of trouble."""
         with self._order:
-            builder = self._builder
-            reasons = {str(reason): count for reason, count in builder.reasons.items()}
-            self._health.windows(builder.built, reasons)
-            self._health.totals(source=builder.dropped + self._watch.skipped, slot=self._newest.dropped)
-            corrupt = self._watch.corrupt
-            if corrupt > self._corrupt:
-                self._health.corrupt(corrupt - self._corrupt)
-                self._corrupt = corrupt
-            for reason, count in reasons.items():
+            rejected = self._rejected
+            self._health.faults = rejected
+            self._health.corrupt(self._watch.corrupt)
+            dropped = self._builder.dropped + self._watch.skipped
+            self._health.counts.update(built=self._builder.built, source=dropped, slot=self._newest.dropped)
+            for reason, count in rejected.items():
                 if count > self._reported.get(reason, 0) and reason != "SRC_LOST":
                     self._announcer.event(reason, Level.WARN, {"count": count})
-                self._reported[reason] = count
+            self._reported = rejected
 
-    def announce_end(self) -> None:
-        """Say how it ended, and the end of every view. After `join`."""
+    def announce_end(self) -> str:
+        """Say how it ended, and the end of every view; gives the code. After `join`."""
         self.tick()
-        code, source = ending(self.failure, stopped=self.stopped)
-        has_failed = self.failure is not None
+        code, source = ending(self.failure, stopped=self._stopped)
         self._health.source(source)
-        self._health.model("failed" if code == MODEL_FAILED else "ready")
-        if code in LASTING:
-            self._health.raise_reason(code, Level.ERROR)
-        fields = {"message": str(self.failure)} if has_failed else {}
-        self._announcer.event(code, Level.ERROR if has_failed else Level.OK, fields)
-        delay_ms = _STOP_DELAY_MS if self.stopped else None
+        self._health.model = "failed" if code == MODEL_FAILED else "ready"
+        if self.failure is None:
+            self._announcer.event(code, Level.OK)
+        else:
+            if code not in ("SRC_LOST", MODEL_FAILED):  # these two last by themselves, longer than to the next start
+                self._health.raise_reason(code, Level.ERROR)
+            self._announcer.event(code, Level.ERROR, {"message": str(self.failure)})
+        delay_ms = _STOP_DELAY_MS if self._stopped else None
         self.renderer.announce_end(delay_ms=delay_ms)
         self._preview.announce_end(delay_ms=delay_ms)
+        return code
 
     def summary(self) -> Summary:
         """What it came to so far."""
@@ -205,8 +200,12 @@ class Stream:
             fps=self.context.fps,
             dropped=self._newest.dropped,
             frames=self._builder.pushed,
-            rejected={str(reason): count for reason, count in self._builder.reasons.items()},
+            rejected=self._rejected,
         )
+
+    @property
+    def _rejected(self) -> dict[str, int]:
+        return {str(reason): count for reason, count in self._builder.reasons.items()}
 
     # WatchListener: called in the reader thread.
 
@@ -277,25 +276,6 @@ class Stream:
             self._newest.close()
             self._watch.close()
             self.over = True
-            self._on_over()
-
-
-MODEL_FAILED = "MODEL_FAILED"
-_ENDINGS: tuple[tuple[type[Exception], str, SourceState], ...] = (
-    (TooShortError, "TOO_SHORT", "ended"),
-    (ReaderError, "SRC_FAILED", "closed"),
-    (SourceError, "SRC_LOST", "lost"),
-    (ConfigError, "SRC_REFUSED", "closed"),
-    (EndpointError, "NOT_DELIVERED", "closed"),
-    (PublisherError, "PUBLISH_FAILED", "closed"),
-    (ModelFailedError, MODEL_FAILED, "closed"),
-    (ModelError, MODEL_FAILED, "closed"),
-    (Exception, "INTERNAL", "closed"),
-)
-"""Event code, and the state of the source, by what an activation failed with; the first that fits holds."""
-
-LASTING = tuple(code for _, code, _ in _ENDINGS if code not in ("SRC_LOST", MODEL_FAILED))
-"""Reasons that stay in the node's health until the next activation; those left out last longer, by themselves."""
 
 
 def ending(failure: Exception | None, *, stopped: bool) -> tuple[str, SourceState]:

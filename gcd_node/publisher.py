@@ -33,7 +33,7 @@ from gcd_client.protocol import (
     encode,
     topic_key,
 )
-from gcd_node.auth import Context, EventSink, ServerSecurity, Socket, SocketGuard, own_endpoint, unbind
+from gcd_node.auth import Context, EventSink, ServerSecurity, Socket, SocketGuard, unbind
 from gcd_node.config import PublishConfig
 from gcd_node.errors import EndpointError, NodeError, PublisherError
 from gcd_node.messages import PublisherStats
@@ -90,16 +90,14 @@ class Publisher:
         self._readers = (0, 0, 0)  # all, of views, of previews; never changed, only replaced
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         weakref.finalize(self, os.close, self._wake_fd)  # no sooner: then it may mean another file to who wakes late
-        self._context: Context = zmq.Context()
-        self._guard = SocketGuard(self._context, security, on_event)
+        self._guard = SocketGuard(security, on_event)
         try:
-            self._data = _xpub(self._context, _DATA_HWM, no_drop=lockstep)
-            self.endpoint = self._guard.bind(self._data, own_endpoint(config.data, "data"), "data")
-            self._status = _xpub(self._context, _STATUS_HWM, no_drop=False)
-            self.status_endpoint = self._guard.bind(self._status, own_endpoint(config.status, "status"), "status")
+            self._data = _xpub(self._guard.context, _DATA_HWM, no_drop=lockstep)
+            self.endpoint = self._guard.bind(self._data, config.data, "data")
+            self._status = _xpub(self._guard.context, _STATUS_HWM, no_drop=False)
+            self.status_endpoint = self._guard.bind(self._status, config.status, "status")
         except BaseException:
             self._guard.close()
-            self._context.destroy(linger=0)
             raise
         self._poller = zmq.Poller()
         for source in (self._wake_fd, self._data, self._status, *self._guard.monitors):
@@ -159,10 +157,6 @@ class Publisher:
         """Stop waiting for readers, for a node that is stopping: what does not leave in `linger_ms` is lost."""
         self._is_hurried = True
 
-    def dead_threads(self) -> list[str]:
-        """Threads that have died, of those whose end shows nowhere else."""
-        return [] if self._guard.alive else ["authentication"]
-
     def check(self) -> None:
         """Raises what stopped the thread, or NodeError if the publisher is closed."""
         if isinstance(self._failure, NodeError):
@@ -201,7 +195,6 @@ class Publisher:
             return
         self._thread.join()
         self._guard.close()
-        self._context.term()
         if self._failure is not None:
             self.check()
 

@@ -11,19 +11,17 @@ import socket
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Generator, Mapping
 from datetime import UTC, datetime
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
-from gcd_node.auth import is_loopback
+from gcd_node.auth import EventSink, is_loopback
 from gcd_node.errors import ConfigError, EndpointError
 from gcd_node.health import THREAD_DIED, Health, Level
 
 _LOG = logging.getLogger(__name__)
 _SEND_TIMEOUT_S = 0.5
-_LOADING_S = 300.0
 _CLOCK_STEP_NS = 100_000_000
 _WAITING_LINES = 1000
 _LAST_LINES_S = 1.0
@@ -36,21 +34,14 @@ class ServiceManager:
     def __init__(self, environment: Mapping[str, str], clock: Callable[[], float] = time.monotonic) -> None:
         """environment: normally os.environ. clock: monotonic seconds."""
         self._address = environment.get("NOTIFY_SOCKET", "")
-        self._clock, self._fed_s = clock, -math.inf
-        self._was_ready = self._failed = False
+        self._clock, self._fed_s, self._failed = clock, -math.inf, False
         period, process = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
         watched = period.isdecimal() and process in ("", str(os.getpid()))
         self._period_s = int(period) / 1e6 if watched else 0.0
 
-    def loading(self) -> None:
-        """The model is about to be loaded, which may take long: starting and stopping get more time."""
-        self._notify(f"EXTEND_TIMEOUT_USEC={round(_LOADING_S * 1e6)}")
-
     def ready(self) -> None:
         """The start is over: views come, or the node waits for something that is not its to bring about."""
-        if not self._was_ready:
-            self._notify("READY=1")
-        self._was_ready = True
+        self._notify("READY=1")
 
     def alive(self) -> None:
         """Feed the watchdog: call it often, and only while nothing hangs; it is sent four times in each period."""
@@ -84,35 +75,28 @@ class Watchdog:
     """Looks after a running node: a model that hangs, a thread that died, a clock that was set. Called by the node's
     life loop alone."""
 
-    def __init__(
-        self, report: Callable[[str, Level, Mapping[str, object]], None], health: Health, hang_s: float
-    ) -> None:
-        """report: takes an event. hang_s: how long a step of the model may take."""
+    def __init__(self, report: EventSink, health: Health, hang_s: float) -> None:
+        """hang_s: how long a step of the model may take."""
         self._report, self._health, self._hang_s = report, health, hang_s
-        self._watched: list[Callable[[], list[str]]] = []
-        self._hung = False
+        self.threads: list[threading.Thread] = []
+        """threads: what the node is not ready without."""
         self._dead: set[str] = set()
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
-    def watch(self, dead_threads: Callable[[], list[str]]) -> None:
-        """Ask this for the names of threads that have died, from now on."""
-        self._watched.append(dead_threads)
-
     def check(self, silent_s: float) -> bool:
         """Whether all is well; call it often. silent_s: how long the model has been at one step."""
-        was_hung, self._hung = self._hung, silent_s > self._hang_s
-        if self._hung and not was_hung:
-            self._health.raise_reason("MODEL_HUNG", Level.ERROR)
-            self._report("MODEL_HUNG", Level.ERROR, {"silent_s": round(silent_s, 1)})
-        elif was_hung and not self._hung:
+        is_hung = silent_s > self._hang_s
+        if not is_hung:
             self._health.clear_reason("MODEL_HUNG")
-        was_dead, self._dead = self._dead, {name for names in self._watched for name in names()}
+        elif self._health.raise_reason("MODEL_HUNG", Level.ERROR):
+            self._report("MODEL_HUNG", Level.ERROR, {"silent_s": round(silent_s, 1)})
+        was_dead, self._dead = self._dead, {each.name for each in self.threads if not each.is_alive()}
         for name in self._dead - was_dead:
             self._report(THREAD_DIED, Level.ERROR, {"thread": name, "message": "restart the node"})
             self._health.raise_reason(THREAD_DIED, Level.ERROR)
         if abs(step_ns := self._clock_step_ns()) >= _CLOCK_STEP_NS:
             self._report("CLOCK_STEP", Level.WARN, {"clock": "utc", "step_ms": round(step_ns / 1e6)})
-        return not self._hung and not self._dead
+        return not is_hung and not self._dead
 
     def _clock_step_ns(self) -> int:
         """How far UTC has moved against the monotonic clock since the last check, forwards positive (docs/node.md,
@@ -178,24 +162,15 @@ def background_logging(*, as_json: bool) -> Generator[None]:
 
 
 class _Waiting(QueueHandler):
-    """Leaves records for the thread that writes them; what finds no room is lost."""
+    """Leaves records for the thread that writes them."""
 
-    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Write out the arguments now, before they change; keep the error, for its traceback."""
-        record.msg, record.args = _message(record), None
-        return record
-
-    def enqueue(self, record: logging.LogRecord) -> None:
-        with contextlib.suppress(queue.Full):
-            self.queue.put_nowait(record)
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's name
+        """What finds no room is lost: a word about it would have to wait for stderr."""
 
 
 class JsonLines(logging.Formatter):
-    """A log record as one line of JSON.
-
-    Always there: `time` (UTC, RFC 3339, microseconds), `level`, `logger`, `message`, `thread`, `pid`. `exception`: with
-    its traceback, if there is one. `event`: the node's event that the line tells of. Long texts are cut.
-    """
+    """A log record as one line of JSON: `time` (UTC, RFC 3339, microseconds), `level`, `logger`, `message` (with the
+    traceback of an error; the end of a long one), `thread`, `pid`; `event`: the node's event that the line tells of."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, without a line break."""
@@ -203,25 +178,15 @@ class JsonLines(logging.Formatter):
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="microseconds")[:-6] + "Z",
             "level": record.levelname,
             "logger": record.name,
-            "message": _message(record)[:_LONGEST],
+            "message": super().format(record)[-_LONGEST:],
             "thread": record.threadName,
             "pid": record.process,
         }
-        if (event := vars(record).get("event")) is not None:
-            line["event"] = event
-        if record.exc_info and record.exc_info[0] is not None:
-            line["exception"] = "".join(traceback.format_exception(*record.exc_info)).rstrip()[-_LONGEST:]
-        return json.dumps(line, default=str)
+        event = vars(record).get("event")
+        return json.dumps(line if event is None else line | {"event": event}, default=str)
 
 
 def _log_uncaught(where: str, error: Any) -> None:
     """error: type, value and traceback."""
     if not issubclass(error[0], SystemExit):
         logging.getLogger("gcd_node").critical("uncaught %s%s", error[0].__name__, where, exc_info=error)
-
-
-def _message(record: logging.LogRecord) -> str:
-    try:
-        return record.getMessage()
-    except Exception:  # arguments that do not fit the text: better this than no line
-        return f"{record.msg} {record.args}"

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -15,11 +15,11 @@ import torch
 
 from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, Traits, ViewSynthesizer, load_synthesizer
-from gcd_node.auth import EventSink, ServerSecurity, load_server_security
+from gcd_node.auth import EventSink, ServerSecurity, load_server_security, log_event
 from gcd_node.config import ModelSection, NodeConfig, ViewerConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
-from gcd_node.health import Health
+from gcd_node.health import Health, Level
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.node import Node
@@ -85,13 +85,10 @@ def open_session(
         EndpointError, ConfigError: see Publisher, ControlServer, metrics_server(), Recorder, ViewerConfig. Nothing
             stays open.
     """
-    nodes: list[Node] = []  # none yet: what publishes the node's events is made before it
+    node: Node | None = None  # what publishes its events is made before it
 
-    def emit(code: str, fields: dict[str, object]) -> None:
-        for node in nodes:
-            node.event(code, fields)
-        if not nodes:
-            _LOG.warning("%s: %s", code, fields)
+    def emit(code: str, level: Level, fields: Mapping[str, object]) -> None:
+        (log_event if node is None else node.event)(code, level, fields)
 
     security = load_server_security(config.security, emit)
     with ExitStack() as stack:
@@ -106,12 +103,10 @@ def open_session(
             on_window=on_window,
             service=service,
         )
-        nodes.append(node)
-        node.watch(publisher.dead_threads)
         control: ControlServer | None = None
         if config.control.endpoint is not None:
             control = stack.enter_context(_control_server(config.control.endpoint, node, emit, security))
-            node.watch(control.dead_threads)
+            node.watchdog.threads.append(control.thread)
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:

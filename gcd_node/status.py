@@ -1,6 +1,7 @@
 """What the node tells of itself: status, events, lasting conditions and metadata (wire protocol, section 4)."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -56,7 +57,7 @@ class Announcer:
         with self._order:
             self._next_s = self._clock() + _PERIOD_S
             sent = self.sink.stats
-            self.health.totals(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
+            self.health.counts.update(sent=sent.sent, subs=sent.subscribers, bytes=sent.bytes, queue=sent.dropped)
             self.sink.note("status", self._origin(), self.health.report())
 
     def status_if_due(self) -> None:
@@ -84,19 +85,18 @@ class Condition:
 
     def __init__(self, code: str, announcer: Announcer, *, hold_s: float) -> None:
         self._code, self._announcer, self._hold_s = code, announcer, hold_s
-        self._wrong_s: float | None = None
+        self._wrong_s = -math.inf
 
     def update(self, problem: Mapping[str, object] | None) -> None:
         """Of the newest input. problem: fields of the event that announces its begin; None if all is right."""
         now_s = time.monotonic()
-        if problem is not None:
-            if self._wrong_s is None:
-                self._announcer.health.raise_reason(self._code, Level.WARN)
-                self._announcer.event(self._code, Level.WARN, problem)
-            self._wrong_s = now_s
-        elif self._wrong_s is not None and now_s - self._wrong_s >= self._hold_s:
-            self._announcer.health.clear_reason(self._code)
-            self._wrong_s = None
+        if problem is None:
+            if now_s - self._wrong_s >= self._hold_s:
+                self._announcer.health.clear_reason(self._code)
+            return
+        self._wrong_s = now_s
+        if self._announcer.health.raise_reason(self._code, Level.WARN):
+            self._announcer.event(self._code, Level.WARN, problem)
 
 
 def metadata(context: StreamContext, settings: Settings) -> dict[str, object]:

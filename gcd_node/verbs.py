@@ -4,6 +4,7 @@ Pure: bytes in, types out. Whatever a peer sends becomes a `Command` or a `Reque
 (wire protocol, section 5).
 """
 
+import contextlib
 import difflib
 import functools
 import re
@@ -44,9 +45,6 @@ class SetView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     amplitude_deg: Positive | UnsetType = UNSET
 
     def __post_init__(self) -> None:
-        goal = {self.azimuth_deg, self.elevation_deg, self.radius, self.position_m}
-        if self.source_from_view is not UNSET and goal != {UNSET}:
-            raise ValueError("a goal is T_src_dst, or azimuth_deg, elevation_deg and radius: state one of the two")
         self.to_config()
 
     def to_config(self) -> ViewConfig:
@@ -115,14 +113,12 @@ class Verb:
 
 def _without_arguments(role: Role, **verbs: str) -> dict[str, Verb]:
     """verbs: names and what they do."""
-    options: dict[str, Any] = {"frozen": True, "forbid_unknown_fields": True}
-    return {
-        name: Verb(
-            arguments=msgspec.defstruct(name.title().replace("_", ""), [], namespace={"__doc__": about}, **options),
-            role=role,
-        )
-        for name, about in verbs.items()
-    }
+    found: dict[str, Verb] = {}
+    for name, about in verbs.items():
+        title, doc = name.title().replace("_", ""), {"__doc__": about}
+        arguments = msgspec.defstruct(title, [], namespace=doc, frozen=True, forbid_unknown_fields=True)
+        found[name] = Verb(arguments=arguments, role=role)
+    return found
 
 
 VERBS: Mapping[str, Verb] = types.MappingProxyType(
@@ -176,6 +172,15 @@ def text_arguments(verb: str) -> frozenset[str]:
     return frozenset(name for name, kind in known.items() if "enum" in kind or kind.get("type") == "string")
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Outcome:
+    """What became of a command; `result` is plain JSON."""
+
+    code: Code = Code.OK
+    message: str = ""
+    result: dict[str, object] | None = None
+
+
 class RequestError(ControlError):
     """A request that cannot be taken. request_id: "" if it could not be read. result: what would be allowed."""
 
@@ -199,6 +204,13 @@ class Command:
     if_view_rev: int | None = None
 
 
+class _Head(msgspec.Struct):
+    """What is looked at before the rest of a request."""
+
+    proto: Any = None
+    id: Any = None
+
+
 _MALFORMED = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 _RANGE = re.compile(r"Expected `(?:int|float)` (?:>=|<=|>|<) \S+ - at `\$\.([^`\[]+)")
 _UNKNOWN = re.compile(r"contains unknown field `([^`]*)`")
@@ -214,10 +226,19 @@ def parse_command(part: bytes) -> Command:
     if len(part) > MAX_REQUEST:
         raise RequestError(f"a request has at most {MAX_REQUEST} bytes, got {len(part)}", Code.TOO_LARGE)
     try:
+        head = msgspec.json.decode(part, type=_Head)
+    except _MALFORMED as error:
+        raise RequestError(f"a request is one JSON object in UTF-8: {error!s:.200}", Code.BAD_JSON) from error
+    request_id = ""
+    with contextlib.suppress(msgspec.ValidationError):
+        request_id = msgspec.convert(head.id, RequestId)
+    try:
+        check_version(head.proto)
         request = msgspec.json.decode(part, type=Request)
-        check_version(request.proto)
-    except (*_MALFORMED, MessageError) as error:
-        raise _unreadable(part, error) from error
+    except MessageError as error:
+        raise RequestError(str(error), Code.BAD_PROTO, request_id) from error
+    except _MALFORMED as error:
+        raise RequestError(_explained(error, Request), Code.BAD_ARG, request_id) from error
     verb = VERBS.get(request.verb)
     if verb is None:
         known = _nearest(request.verb, tuple(VERBS))
@@ -237,28 +258,6 @@ def parse_command(part: bytes) -> Command:
     )
 
 
-def _unreadable(part: bytes, error: Exception) -> RequestError:
-    """Why a request cannot be read, with as much of it as can be: its version is looked at first, then the rest."""
-    try:
-        fields = msgspec.json.decode(part, type=dict[str, msgspec.Raw])
-    except _MALFORMED as worse:
-        return RequestError(f"a request is one JSON object in UTF-8: {worse!s:.200}", Code.BAD_JSON)
-    request_id = _text(fields.get("id"), RequestId)
-    try:
-        check_version(_text(fields.get("proto"), str))
-    except MessageError as other:
-        return RequestError(str(other), Code.BAD_PROTO, request_id)
-    return RequestError(_explained(error, Request), Code.BAD_ARG, request_id)
-
-
-def _text(raw: msgspec.Raw | None, kind: Any) -> str:
-    """The text that `raw` holds, "" if it holds none of this kind."""
-    try:
-        return str(msgspec.json.decode(raw or b"", type=kind))
-    except _MALFORMED:
-        return ""
-
-
 def _explained(error: Exception, kind: type[msgspec.Struct]) -> str:
     """What is wrong, with the nearest known key where an unknown one is named."""
     unknown = _UNKNOWN.search(str(error))
@@ -276,7 +275,5 @@ def _nearest(name: str, known: tuple[str, ...]) -> str:
 def _interval(schema: dict[str, Any]) -> list[float | None]:
     """Lowest and highest value of an argument, None where there is no limit."""
     number = next(iter(schema.get("prefixItems", ())), schema)
-    return [
-        number.get("minimum", number.get("exclusiveMinimum")),
-        number.get("maximum", number.get("exclusiveMaximum")),
-    ]
+    least, most = ("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum")
+    return [next((number[name] for name in names if name in number), None) for names in (least, most)]

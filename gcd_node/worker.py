@@ -153,7 +153,7 @@ class ModelWorker:
     def _warm_up(self) -> None:
         """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
         self._pulse.beat()
-        self._health.model("warming")
+        self._health.model = "warming"
         try:
             with model_errors():
                 self._renderer.warm_up()

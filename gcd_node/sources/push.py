@@ -11,7 +11,7 @@ import zmq
 
 from gcd_client.frames import PushedFrame, decode_frame
 from gcd_client.protocol import MAX_HEADER, MAX_PAYLOAD, PREFIX, ClientError, MessageError
-from gcd_node.auth import Context, EventSink, ServerSecurity, SocketGuard, own_endpoint, unbind
+from gcd_node.auth import EventSink, ServerSecurity, SocketGuard, unbind
 from gcd_node.errors import DepthError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.sources import PushSource
@@ -55,16 +55,14 @@ class _PushDriver:
         self.fps, self.corrupt = config.fps, 0
         self._pusher, self._heard_s = "", 0.0
         self._warned_s = -math.inf
-        context: Context = zmq.Context()
-        self._context, self._guard = context, SocketGuard(context, security, on_event)
+        self._guard = SocketGuard(security, on_event)
         try:
-            self._socket = context.socket(zmq.PULL)
+            self._socket = self._guard.context.socket(zmq.PULL)
             self._socket.set(zmq.RCVHWM, _QUEUED)
             self._socket.set(zmq.MAXMSGSIZE, PREFIX.size + MAX_HEADER + MAX_PAYLOAD)
-            self._endpoint = self._guard.bind(self._socket, own_endpoint(config.endpoint, "frames"), "frames")
+            self._endpoint = self._guard.bind(self._socket, config.endpoint, "frames")
         except BaseException:
             self._guard.close()
-            context.destroy(linger=0)
             raise
 
     def read(self) -> Frame | None:
@@ -97,7 +95,6 @@ class _PushDriver:
     def close(self) -> None:
         unbind(self._socket, self._endpoint, 0)
         self._guard.close()
-        self._context.destroy(linger=0)
 
     def _warn(self, text: str) -> None:
         """Of what may happen with every frame, only once in a while."""

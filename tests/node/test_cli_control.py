@@ -3,66 +3,54 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
-from control_fakes import Events, FakeCommands
+from control_fakes import FakeNode
 
 from gcd_client.endpoints import fingerprint, read_key_pair
-from gcd_node.auth import load_server_security, new_key_pair, write_key_pair
+from gcd_node.auth import load_server_security
 from gcd_node.cli.main import run_app
 from gcd_node.config import SecurityConfig
-from gcd_node.control import ControlServer
 
 pytestmark = pytest.mark.timeout(90)
 
-NODE = new_key_pair()
 LOOPBACK = "tcp://127.0.0.1:0"
 
 
 @pytest.fixture
-def commands() -> FakeCommands:
-    return FakeCommands()
+def node() -> FakeNode:
+    return FakeNode()
 
 
 @pytest.fixture
-def events() -> Events:
-    return Events()
-
-
-@pytest.fixture
-def server(tmp_path: Path, commands: FakeCommands, events: Events) -> Iterator[ControlServer]:
-    with ControlServer(f"ipc://{tmp_path}/c", commands.handle, lambda: "active", events) as made:
-        yield made
+def ctl(tmp_path: Path, node: FakeNode) -> Iterator[Callable[..., int]]:
+    """Runs `gcd-node ctl` on a node; gives its exit code."""
+    with node.serve(f"ipc://{tmp_path}/c") as server:
+        yield lambda *words: run_app(["ctl", *words, "--endpoint", server.endpoint, "--timeout", "20"])
 
 
 def test_ctl_sends_what_the_verb_wants_and_shows_the_result_as_json(
-    server: ControlServer, capsys: pytest.CaptureFixture[str]
+    ctl: Callable[..., int], node: FakeNode, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = ["ctl", "set_view", "view=top", "azimuth_deg=30", "--endpoint", server.endpoint, "--timeout", "20"]
-    assert run_app(line) == 0
+    assert ctl("set_view", "view=top", "azimuth_deg=30") == 0
     assert capsys.readouterr().out.startswith("OK (the node is active)\n")
-    assert run_app(["ctl", "hello", "--endpoint", server.endpoint, "--timeout", "20"]) == 0
+    assert ctl("hello") == 0
     headline, _, result = capsys.readouterr().out.partition("\n")
     assert (headline, json.loads(result)) == ("OK (the node is active)", {"role": "operator"})
+    assert ctl("remove_view", "view=1") == 0
+    assert msgspec.to_builtins(node.heard[-1].args) == {"view": "1"}  # a name is text
 
 
 def test_ctl_says_what_was_refused_and_what_is_allowed(
-    server: ControlServer, capsys: pytest.CaptureFixture[str]
+    ctl: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = ["ctl", "set_view", "view=top", "azimuth_deg=120", "--endpoint", server.endpoint, "--timeout", "20"]
-    assert run_app(line) == 70
+    assert ctl("set_view", "view=top", "azimuth_deg=120") == 70
     said = capsys.readouterr().err
     assert said.startswith("error: set_view: OUT_OF_RANGE")
     assert "[-90,90]" in said
-
-
-def test_ctl_keeps_a_views_name_text(server: ControlServer, commands: FakeCommands) -> None:
-    line = ["ctl", "remove_view", "view=1", "--endpoint", server.endpoint, "--timeout", "20"]
-    assert run_app(line) == 0
-    assert msgspec.to_builtins(commands.heard[0][0].args) == {"view": "1"}
 
 
 @pytest.mark.parametrize("settings", [["view"], ["=top"], ["view=a", "view=b"]])
@@ -72,31 +60,25 @@ def test_ctl_wants_key_value_once(settings: list[str], capsys: pytest.CaptureFix
 
 
 def test_keys_made_on_the_command_line_open_the_door(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], commands: FakeCommands, events: Events
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], node: FakeNode
 ) -> None:
     for name in ("node", "desk"):
         assert run_app(["keys", "new", str(tmp_path / name)]) == 0
-    shown = capsys.readouterr().out
-    assert read_key_pair(tmp_path / "desk").secret not in shown
+    shown, pair = capsys.readouterr().out, read_key_pair(tmp_path / "desk")
+    assert pair.secret not in shown
+    assert run_app(["keys", "show", str(tmp_path / "desk")]) == 0
+    assert capsys.readouterr().out in shown
+    assert fingerprint(pair.public) in shown
     stanza = shown[shown.rindex("[client.NAME]") :].replace("NAME", "desk")
     (tmp_path / "allow.toml").write_text(stanza)
     security = load_server_security(SecurityConfig(keys=str(tmp_path / "node"), allow=str(tmp_path / "allow.toml")))
-    with ControlServer(LOOPBACK, commands.handle, lambda: "active", events, security=security) as server:
+    with node.serve(LOOPBACK, security=security) as server:
         line = ["ctl", "hello", "--json", "--endpoint", server.endpoint, "--timeout", "20"]
         line += ["--keys", str(tmp_path / "desk"), "--node-key", str(tmp_path / "node" / "public.key")]
         assert run_app(line) == 0
         assert json.loads(capsys.readouterr().out)["result"] == {"role": "viewer"}
         assert run_app([*line[:1], "activate", *line[3:]]) == 70
         assert "FORBIDDEN" in capsys.readouterr().err
-
-
-def test_keys_show_prints_the_fingerprint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_key_pair(tmp_path, NODE)
-    assert run_app(["keys", "show", str(tmp_path)]) == 0
-    shown = capsys.readouterr().out
-    assert NODE.public in shown
-    assert fingerprint(NODE.public) in shown
-    assert NODE.secret not in shown
 
 
 def test_half_of_the_key_options_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,9 +56,9 @@ def samples(server: MetricsServer) -> dict[tuple[str, ...], float]:
 
 def make_ready(health: Health) -> None:
     now_ns = time.monotonic_ns()
-    health.state("active")
+    health.state = "active"
     health.source("streaming")
-    health.model("busy")
+    health.model = "busy"
     health.expect(("topdown",), window_s=3600.0)
     for i in range(11):
         health.frame(now_ns + i * S // 10, now_ns)
@@ -81,10 +81,10 @@ def test_metrics_hold_what_the_health_was_told(server: MetricsServer, health: He
     make_ready(health)
     for seconds in (0.1, 0.2, 0.3):
         health.stage("render", seconds)
-    health.windows(4, {"WIN_GAP": 2})
-    health.totals(slot=5, sent=31, subs=2, bytes=4130)
+    health.counts["built"], health.faults = 4, {"WIN_GAP": 2}
+    health.counts.update(slot=5, sent=31, subs=2, bytes=4130)
     health.corrupt(1)
-    health.measure("gpu_mem_mb", 812.5)
+    health.gpu_mem_mb = 812.5
     health.raise_reason("fps", Level.WARN)
     found = samples(server)
     expected = {
@@ -123,7 +123,7 @@ def test_every_metric_is_explained_in_the_docs(
     server: MetricsServer, health: Health, request: pytest.FixtureRequest
 ) -> None:
     make_ready(health)
-    health.measure("gpu_mem_mb", 1.0)
+    health.gpu_mem_mb = 1.0
     families = text_string_to_metric_families(get(server, "/metrics")[1])
     ours = {family.name for family in families if family.name.startswith("gcd_")}
     text = (request.config.rootpath / "docs" / "deploy.md").read_text()

@@ -77,7 +77,7 @@ def test_every_row_of_the_failure_table_is_there_once() -> None:
 
 def test_every_key_of_a_status_is_there() -> None:
     health = Health()
-    health.measure("gpu_mem_mb", 1.0)
+    health.gpu_mem_mb = 1.0
     health.stage("render", 0.1)
     for i in range(3):
         health.frame(i * 100_000_000, i * 100_000_000)

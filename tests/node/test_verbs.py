@@ -5,7 +5,7 @@ import json
 import pytest
 
 from gcd_client.protocol import PROTO
-from gcd_node.verbs import VERBS, Command, RequestError, parse_command
+from gcd_node.verbs import VERBS, RequestError, parse_command
 
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 EXAMPLES: dict[str, dict[str, object]] = {
@@ -20,29 +20,17 @@ def wire(verb: str, args: object = None, **more: object) -> bytes:
     return json.dumps({"proto": PROTO, "id": "a1", "verb": verb, "args": args or {}, **more}).encode()
 
 
-def read(part: bytes) -> Command:
-    return parse_command(part)
-
-
 def refused(part: bytes) -> RequestError:
     with pytest.raises(RequestError) as caught:
-        read(part)
+        parse_command(part)
     return caught.value
-
-
-# Laws
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS))
 def test_every_verb_is_read_as_its_own_struct(verb: str) -> None:
-    command = read(wire(verb, EXAMPLES.get(verb)))
+    command = parse_command(wire(verb, EXAMPLES.get(verb)))
     assert command.verb == verb
     assert type(command.args) is VERBS[verb].arguments
-
-
-def test_every_looking_verb_is_a_viewers_and_every_other_an_operators() -> None:
-    looking = {"hello", "describe", "state", "stats", "time", "views", "get_config", "get_calib"}
-    assert {name for name, verb in VERBS.items() if verb.role == "viewer"} == looking
 
 
 # What is refused, and how it is said
@@ -76,7 +64,7 @@ def test_f14_an_unknown_verb_names_the_nearest() -> None:
         ({"view": "top", "azimuth_deg": None}, "azimuth_deg"),
         ({"view": "top", "kind": "spiral"}, "kind"),
         ({"view": "top", "T_src_dst": IDENTITY[:15]}, "T_src_dst"),
-        ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "T_src_dst"),
+        ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "radius, or"),
         ({"view": "top", "source_from_view": IDENTITY}, "source_from_view"),
         ({"view": "top", "kind": "orbit"}, "rate_deg_s"),
         ({"view": "top", "rate_deg_s": 3}, "rate_deg_s"),
@@ -84,8 +72,7 @@ def test_f14_an_unknown_verb_names_the_nearest() -> None:
     ],
 )
 def test_f14_a_wrong_argument_is_bad_arg_and_named(args: object, says: str) -> None:
-    part = json.dumps({"proto": PROTO, "id": "a1", "verb": "set_view", "args": args}).encode()
-    error = refused(part)
+    error = refused(json.dumps({"proto": PROTO, "id": "a1", "verb": "set_view", "args": args}).encode())
     assert error.code == "BAD_ARG"
     assert says in str(error)
 
@@ -107,5 +94,5 @@ def test_f14_out_of_range_gives_the_allowed_interval(args: dict[str, object], ar
 
 
 def test_if_view_rev_goes_with_a_view_alone() -> None:
-    assert read(wire("remove_view", {"view": "a"}, if_view_rev=2)).if_view_rev == 2
+    assert parse_command(wire("remove_view", {"view": "a"}, if_view_rev=2)).if_view_rev == 2
     assert refused(wire("activate", if_view_rev=2)).code == "BAD_ARG"

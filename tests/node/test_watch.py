@@ -183,17 +183,17 @@ def board_of(*notes: StatusMessage) -> StatusBoard:
 def working() -> dict[str, object]:
     """The status of a node at work."""
     health = Health()
-    health.state("active")
+    health.state = "active"
     health.source("streaming")
-    health.model("busy")
+    health.model = "busy"
     health.expect(("topdown", "a_long_view_name"), 3600.0)
     for i in range(11):
         health.frame(i * 100_000_000, time.monotonic_ns())
     for view_id in ("topdown", "a_long_view_name"):
         health.published(view_id, 0.25)
     health.stage("render", 0.125)
-    health.windows(5, {"WIN_GAP": 2})
-    health.totals(slot=3, sent=5, subs=1, bytes=4130)
+    health.counts["built"], health.faults = 5, {"WIN_GAP": 2}
+    health.counts.update(slot=3, sent=5, subs=1, bytes=4130)
     return health.report()
 
 
