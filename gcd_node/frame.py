@@ -232,8 +232,8 @@ def depthai_lens(
     Raises:
         ConfigError: another model, or numbers that no camera has.
     """
-    if model not in _DEPTHAI_MODELS or len(matrix) != 3:
-        raise ConfigError(f"a lens of model {model} with {len(matrix)} rows of intrinsics is not known here")
+    if model not in _DEPTHAI_MODELS or len(matrix) != 3 or (model == "Fisheye" and len(coefficients) < 4):
+        raise ConfigError(f"a lens of model {model} with {len(coefficients)} coefficients is not known here")
     count = 4 if model == "Fisheye" else 14 if any(coefficients[8:14]) else 8  # without prism and tilt
     kind, d = _distortion(_DEPTHAI_MODELS[model], (*coefficients, *[0.0] * count)[:count])
     (fx, _, cx), (_, fy, cy), _ = matrix
@@ -316,8 +316,8 @@ class SourceInfo:
 
 
 class FrameSource(Protocol):
-    """Where frames come from. It is open once it is made; what cannot be opened raises SourceError there, within its
-    open time-out.
+    """Where frames come from. A recording is open once it is made, or raises SourceError; a live source opens beside
+    the caller, and `info` waits for it.
 
     A live source that falls silent only blocks in `frames`: whoever watches it (stall timer) closes it and makes a new
     one. Its stamps may repeat or step back if the device does; the window builder sorts that out.
@@ -330,7 +330,7 @@ class FrameSource(Protocol):
 
     @property
     def info(self) -> SourceInfo:
-        """What is known of the source; does not change."""
+        """What is known of the source; does not change. Of a live one: SourceError if it does not open in time."""
         ...
 
     def frames(self) -> Iterator[Frame]:

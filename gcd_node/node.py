@@ -70,7 +70,7 @@ class Node:
         self._work: threading.Thread | None = None
         self._service = service or ServiceManager({})
         self._watchdog = Watchdog(self._emit, self.health, config.life.hang_s)
-        self._waits = backoff_s(config.source.kind)
+        self._failures = 0  # of attempts to activate, in a row
         self._stop_s: float | None = None
         self._retry_s: float | None = None
         self._on_its_own = config.life.autostart
@@ -251,7 +251,7 @@ class Node:
             if self._on_its_own and not requested:
                 self._try("activate")
         elif verb == "activate":
-            self._waits = backoff_s(self._config.source.kind)
+            self._failures = 0
             self._service.ready()
             if self._transitions.has_ended:  # before the node was active
                 self._try("deactivate")
@@ -271,7 +271,8 @@ class Node:
             self._failure = error
             self._prepare_stop()
         elif verb == "activate" and self._on_its_own and self._transitions.is_live and isinstance(error, SourceError):
-            self._retry_s = time.monotonic() + next(self._waits)
+            self._retry_s = time.monotonic() + backoff_s(self._config.source.kind, self._failures)
+            self._failures += 1
 
 
 def _code(error: Exception) -> Code:

@@ -54,7 +54,7 @@ class LogSource(Recording):
             SourceError: no log; no such topic; no pictures, or on several topics; none of them can be decoded, or none
                 was found in 15 s of reading. TooShortError: one picture.
         """
-        super().__init__(str(path), fps=None, pace=pace, loop=loop)
+        super().__init__(str(path), pace=pace, loop=loop)
         self._path = path.absolute()
         self._found = _Survey(self._path, topic, depth_topic, odometry_topic)
         self.info, self.topic = self._found.info, self._found.topic

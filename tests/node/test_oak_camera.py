@@ -30,7 +30,9 @@ Layout = dai.ImgFrame.Type
 
 
 def opened(script: pipelines.Script) -> LiveCamera:
-    return open_pipeline(pipelines.Scripted(script), open_timeout_s=PATIENT_S)
+    camera = open_pipeline(pipelines.Scripted(script), open_timeout_s=PATIENT_S)
+    assert camera.info.id == pipelines.NAME  # it is open
+    return camera
 
 
 def take(camera: LiveCamera, count: int) -> list[Frame]:

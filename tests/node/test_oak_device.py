@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from functools import partial
 from threading import Event
 from unittest.mock import create_autospec
 
@@ -56,7 +57,7 @@ def test_no_device_is_said_within_three_seconds() -> None:
         pytest.skip("needs a machine without an OAK, found one")
     begin = time.monotonic()
     with pytest.raises(SourceAbsentError) as caught:
-        open_oak(OakSource(open_timeout_s=PATIENT_S))
+        _ = open_oak(OakSource(open_timeout_s=PATIENT_S)).info
     assert caught.value.exit_code == 69
     assert time.monotonic() - begin < 6  # 1.1 s on a machine that is not busy
 
@@ -64,7 +65,7 @@ def test_no_device_is_said_within_three_seconds() -> None:
 def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
     with pytest.raises(SourceAbsentError):
-        open_oak(OakSource(device="127.0.0.1", open_timeout_s=PATIENT_S))
+        _ = open_oak(OakSource(device="127.0.0.1", open_timeout_s=PATIENT_S)).info
 
 
 def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,11 +116,12 @@ def test_an_attempt_that_was_given_up_ends_before_the_next_one_begins() -> None:
         return second()
 
     with pytest.raises(SourceAbsentError):
-        open_pipeline(slow, open_timeout_s=0.2)
+        _ = open_pipeline(slow, open_timeout_s=0.2).info
     with pytest.raises(SourceAbsentError):
-        open_pipeline(next_one, open_timeout_s=0.2)
+        _ = open_pipeline(next_one, open_timeout_s=0.2).info
     answer.set()
-    open_pipeline(next_one, open_timeout_s=PATIENT_S).close()
+    with closing(open_pipeline(next_one, open_timeout_s=PATIENT_S)) as camera:
+        assert camera.info.id == pipelines.NAME
     assert running == [False]
 
 
@@ -151,7 +153,6 @@ RATIONAL = [0.5, -0.25, 0.125, 0.0625, 2.0, 0.75, -0.5, 1.5]
 def test_the_lens_in_memory_is_scaled_and_cut_to_the_picture() -> None:
     lens = lens_in_memory(memory(coefficients=RATIONAL + [0.0] * 6, model="Perspective"), SOCKET, 1280, 720)
     scale = 1280 / 4056  # the width is kept, rows are cut off above and below
-    assert lens is not None
     assert (lens.width, lens.height) == (1280, 720)
     assert lens.fx == pytest.approx(3100 * scale, rel=1e-5)
     assert lens.fy == pytest.approx(3101 * scale, rel=1e-5)
@@ -172,7 +173,6 @@ def test_the_lens_in_memory_is_scaled_and_cut_to_the_picture() -> None:
 )
 def test_distortion_has_our_names(coefficients: list[float], model: str, wanted: tuple[str, tuple[float, ...]]) -> None:
     lens = lens_in_memory(memory(coefficients=coefficients, model=model), SOCKET, 4056, 3040)
-    assert lens is not None
     assert (lens.distortion, lens.coefficients) == wanted
 
 
@@ -184,7 +184,9 @@ def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
         memory(coefficients=[], model="Fisheye"),  # DepthAI ends the process if it is asked for them
         memory(coefficients=[0.1, 0.0, 0.0], model="Fisheye"),
     ):
-        assert lens_in_memory(stored, SOCKET, 500, 500) is None
+        factory = pipelines.Scripted(pipelines.steady(), lens=partial(lens_in_memory, stored, SOCKET))
+        with closing(open_pipeline(factory, open_timeout_s=PATIENT_S)) as camera:
+            assert camera.info.lens is None
 
 
 def test_the_lens_of_the_picture_itself_comes_before_the_memory() -> None:
@@ -219,6 +221,7 @@ def ours():
 before = ours()
 import oak_pipelines as pipelines
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 with closing(oak.open_pipeline(pipelines.Scripted(pipelines.steady()), open_timeout_s=30)) as camera:
     next(camera.frames())
