@@ -280,13 +280,11 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 def _read(path: Path, flags: int) -> NDArray[Any]:
     """A picture as OpenCV decodes it."""
-    if path.exists() and (not path.is_file() or path.stat().st_size > _MAX_BYTES):
-        raise SourceError(f"{path} is not a regular file, or has more than {_MAX_BYTES} bytes; give a picture")
     try:
+        if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+            raise SourceError(f"is missing, no regular file, or has more than {_MAX_BYTES} bytes")
         return decode_picture(path.read_bytes(), flags)
-    except OSError as error:
-        raise SourceError(f"cannot read the picture {path}: {error.strerror}; check the path") from error
-    except SourceError as error:
+    except (OSError, SourceError) as error:
         raise SourceError(f"{path} {error}; remove or replace it") from error
 
 

@@ -263,6 +263,8 @@ def lens_in_memory(
     """
     matrix, model = memory.getCameraIntrinsics(socket, width, height), memory.getDistortionModel(socket).name
     stored = dict(memory.eepromToJson()["cameraData"])[socket.value]["distortionCoeff"]
+    if model == "Fisheye" and len(stored) < 4:  # which is no fish-eye without distortion, but one never calibrated
+        raise ConfigError(f"the memory has no coefficients for the fish-eye lens of {socket.name}")
     return depthai_lens(matrix, stored, model, (width, height))
 
 
