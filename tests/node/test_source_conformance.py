@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import count, islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -39,9 +39,6 @@ from gcd_node.sources import (
 )
 from gcd_node.sources.files import MovingPattern
 from gcd_node.sources.opencv import open_v4l2
-
-if TYPE_CHECKING:
-    from gcd_node.sources.oak import PipelineFactory
 
 COUNT = 12
 COLOUR = (200, 60, 20)
@@ -132,35 +129,16 @@ def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
 @contextmanager
 def open_oak(folder: Path, slow: bool) -> Generator[Opened]:
     """DepthAI on this host alone: a scripted node stands in for the camera."""
+    import oak_pipelines as pipelines
+
     from gcd_node.sources.oak import open_pipeline
 
     awake = threading.Event()
     awake.set()
-    with closing(open_pipeline(scripted_pipeline(awake), open_timeout_s=OPEN_S), awake.clear) as opened:
+    script = pipelines.steady(lambda seq: pipelines.picture(seq, RED), fps=25.0, awake=awake)
+    source = open_pipeline(pipelines.Scripted(script, fps=25.0), open_timeout_s=OPEN_S)
+    with closing(source, awake.clear) as opened:
         yield opened
-
-
-def scripted_pipeline(awake: threading.Event) -> "PipelineFactory":
-    import depthai as dai
-    from oak_pipelines import HostCamera, picture
-
-    from gcd_node.sources.oak import OakStream
-
-    def shoot(camera: HostCamera) -> None:
-        for seq in count():
-            time.sleep(0.04)
-            if not camera.isRunning():
-                return
-            if awake.is_set():
-                camera.out.send(picture(seq, RED))
-
-    def build() -> OakStream:
-        pipeline = dai.Pipeline(createImplicitDevice=False)
-        camera = pipeline.create(HostCamera)
-        camera.body = lambda: shoot(camera)
-        return OakStream(pipeline=pipeline, output=camera.out, id="scripted", fps=25.0)
-
-    return build
 
 
 @contextmanager
