@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal, Protocol, TypeAlias
 
-import msgspec
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -43,9 +42,9 @@ _NAMES: dict[str, Distortion] = {
     "": "none",
     "none": "none",
     "plumb_bob": "plumb_bob",
-    "pinhole": "plumb_bob",  # older camera_info files name the projection instead
     "rational_polynomial": "rational_polynomial",
     "equidistant": "equidistant",
+    "pinhole": "plumb_bob",  # older camera_info files name the projection instead
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
@@ -79,17 +78,11 @@ class LensModel:
     coefficients: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ConfigError(f"a calibration must be for pictures of some size, got {self.width} x {self.height}")
-        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.coefficients))):
-            raise ConfigError(f"a calibration must hold finite numbers, got {self}; calibrate the camera again")
-        if self.fx <= 0 or self.fy <= 0:
-            raise ConfigError(f"focal lengths must be positive pixels, got fx {self.fx:g}, fy {self.fy:g}")
+        is_finite = all(map(math.isfinite, (self.fx, self.fy, *self.coefficients)))
+        if not is_finite or min(self.width, self.height, self.fx, self.fy) <= 0:
+            raise ConfigError(f"sizes and focal lengths must be positive, and all numbers finite, got {self}")
         if not (0 <= self.cx < self.width and 0 <= self.cy < self.height):
-            raise ConfigError(
-                f"the optical axis must lie in the {self.width} x {self.height} picture, got cx {self.cx:g}, "
-                f"cy {self.cy:g}"
-            )
+            raise ConfigError(f"the optical axis must lie in the picture, got {self}; calibrate the camera again")
         if len(self.coefficients) not in _COUNTS[self.distortion]:
             wanted = " or ".join(map(str, _COUNTS[self.distortion]))
             raise ConfigError(f"{self.distortion} distortion has {wanted} coefficients, got {len(self.coefficients)}")
@@ -176,21 +169,6 @@ def _distortion(model: str, d: tuple[float, ...]) -> tuple[Distortion, tuple[flo
     return kind, d
 
 
-class _Matrix(msgspec.Struct, frozen=True, kw_only=True):
-    data: tuple[float, ...]
-
-
-class _File(msgspec.Struct, frozen=True, kw_only=True):
-    """A camera_info file as ROS calibrators write it; other keys of it are of no interest here."""
-
-    image_width: int
-    image_height: int
-    camera_matrix: _Matrix
-    distortion_coefficients: _Matrix = _Matrix(data=())
-    distortion_model: str | None = None
-    camera_model: str | None = None
-
-
 def load_lens(path: Path) -> LensModel:
     """Read a ROS camera_info YAML file, as `cameracalibrator` and camera drivers write it.
 
@@ -198,21 +176,24 @@ def load_lens(path: Path) -> LensModel:
         ConfigError: missing, not YAML, something in it is missing or no camera has it.
     """
     try:
-        content = yaml.safe_load(
-            read_small(path, _LARGEST_FILE)
-        )  # the loader in C would end the process on deep nesting
-        stated = msgspec.convert(content, _File, strict=False)  # YAML takes 1e-05 for a word
-        info = SimpleNamespace(
-            width=stated.image_width,
-            height=stated.image_height,
-            distortion_model=stated.distortion_model or stated.camera_model or "plumb_bob",
-            d=stated.distortion_coefficients.data,
-            k=stated.camera_matrix.data,
-        )
-        lens = lens_of_message(info)
+        # the loader in C would end the process on deep nesting
+        content: Any = yaml.safe_load(read_small(path, _LARGEST_FILE))
+        model = content.get("distortion_model") or content.get("camera_model") or "plumb_bob"
+        bent = content.get("distortion_coefficients") or {"data": ()}
+        info = {"distortion_model": str(model), "d": bent["data"], "k": content["camera_matrix"]["data"]}
+        size = {"width": int(content["image_width"]), "height": int(content["image_height"])}
+        lens = lens_of_message(SimpleNamespace(**info, **size))
     except (FileError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}; give a ROS camera_info YAML file") from error
-    except (msgspec.ValidationError, yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
+    except (
+        yaml.YAMLError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
         reason = " ".join(str(error).split())[:200]
         raise ConfigError(f"{path} is not a ROS camera_info YAML file: {reason}") from error
     if lens is None:
@@ -263,21 +244,17 @@ class Frame:
     odometry: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
-        if self.image.dtype != np.uint8 or self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.size == 0:
-            raise SourceError(
-                f"frame {self.seq} must be u8 [H, W, 3], got {self.image.dtype} {list(self.image.shape)}: "
-                "convert it in the source"
-            )
-        self._require(self.depth, "depth", np.float32, self.image.shape[:2])
-        self._require(self.odometry, "odometry", np.float64, (4, 4))
+        size = self.image.shape[:2]
+        wanted: list[tuple[NDArray[Any] | None, type, tuple[int, ...]]] = [
+            (self.image, np.uint8, (*size, 3)), (self.depth, np.float32, size), (self.odometry, np.float64, (4, 4))
+        ]  # fmt: skip
+        for array, kind, shape in wanted:
+            if array is not None and (array.dtype != kind or array.shape != shape or array.size == 0):
+                raise SourceError(
+                    f"frame {self.seq} must have {kind.__name__} {list(shape)}, got {array.dtype} {list(array.shape)}: "
+                    "convert it in the source"
+                )
         self.image.setflags(write=False)
-
-    def _require(self, array: NDArray[Any] | None, name: str, kind: type, shape: tuple[int, ...]) -> None:
-        if array is not None and (array.dtype != kind or array.shape != shape):
-            raise SourceError(
-                f"{name} of frame {self.seq} must be {kind.__name__} {list(shape)}, got {array.dtype} "
-                f"{list(array.shape)}: convert it in the source"
-            )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -316,8 +293,8 @@ class SourceInfo:
 
 
 class FrameSource(Protocol):
-    """Where frames come from. It is open once it is made; what cannot be opened raises SourceError there, within its
-    open time-out.
+    """Where frames come from. A recording is open once it is made, or raises SourceError; a live source opens beside
+    the caller, and `info` waits for it.
 
     A live source that falls silent only blocks in `frames`: whoever watches it (stall timer) closes it and makes a new
     one. Its stamps may repeat or step back if the device does; the window builder sorts that out.
@@ -330,7 +307,7 @@ class FrameSource(Protocol):
 
     @property
     def info(self) -> SourceInfo:
-        """What is known of the source; does not change."""
+        """What is known of the source; does not change. Of a live one: SourceError if it does not open in time."""
         ...
 
     def frames(self) -> Iterator[Frame]:

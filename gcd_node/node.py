@@ -66,7 +66,7 @@ class Node:
         self._work: threading.Thread | None = None
         self._service = service or ServiceManager({})
         self.watchdog = Watchdog(self.event, self.health, config.life.hang_s)
-        self._waits = backoff_s(config.source.kind)
+        self._failures = 0  # of attempts to activate, in a row
         self._ends: queue.SimpleQueue[None] = queue.SimpleQueue()  # something in it: the life loop is to end
         self._stop_s: float | None = None
         self._retry_s: float | None = None
@@ -231,7 +231,7 @@ class Node:
             if self._on_its_own and not requested:
                 self._begin("activate")
         elif verb == "activate":
-            self._waits = backoff_s(self._config.source.kind)
+            self._failures = 0
             self._service.ready()
         elif verb == "deactivate" and not requested and self._stop_s is None:
             failure = self._transitions.failure  # the stream has ended by itself
@@ -249,7 +249,8 @@ class Node:
         if self._once or isinstance(error, SourceLostError):
             self._give_up(error)
         elif verb == "activate" and self._on_its_own and is_live and isinstance(error, SourceError):
-            self._retry_s = time.monotonic() + next(self._waits)
+            self._retry_s = time.monotonic() + backoff_s(self._config.source.kind, self._failures)
+            self._failures += 1
 
     def _give_up(self, error: Exception) -> None:
         self._failure = error

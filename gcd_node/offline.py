@@ -55,7 +55,7 @@ class ClipRequest:
     start, stride: in frames of the input. fps: what the network is told; else worked out.
     height, width: else the trained size.
     pose: of the source camera, if stated.
-    hfov_deg: horizontal field of view of the input's pictures, if known; of a stereo pair, of the rectified ones.
+    hfov_deg: horizontal field of view of the input's pictures, if known; not of a stereo pair.
     depth: of the input's frames: a folder of 16-bit pictures in millimetres, one such picture of a still, .npy of
         [T, H, W] metres, a network as .onnx, or with a calibration the right video of a stereo pair.
     calibration: of the pair, as DepthAI writes it. rectified: the device has rectified both.
@@ -84,6 +84,8 @@ class ClipRequest:
             raise UsageError(f"--unit-m must be a positive number of metres, got {self.unit_m:g}")
         if self.calibration is not None and self.depth is None:
             raise UsageError("--calibration is of a stereo pair; give its right video as --depth, or leave it out")
+        if self.calibration is not None and self.hfov_deg is not None:
+            raise UsageError("--calibration says how wide a stereo pair's pictures are; leave --hfov-deg out")
         if self.rectified and self.calibration is None:
             raise UsageError("--rectified is about a stereo pair; give --depth and --calibration, or leave it out")
 
@@ -180,8 +182,6 @@ def _from_pair(path: Path, request: ClipRequest, traits: Traits) -> OfflineClip:
         calibration,
         size=size,
         rectified=request.rectified,
-        hfov_deg=request.hfov_deg,
-        match_scale=2 if left[0].shape[1] >= 2 * size[0] else 1,
     )
     pairs = [stereo(*pair) for pair in zip(left, other, strict=True)]
     pictures = np.stack([picture for picture, _ in pairs])

@@ -121,19 +121,18 @@ class Rectifier:
         lens: LensModel,
         camera: Intrinsics,
         *,
-        turn: NDArray[np.float64] | None = None,
         allow_upscale: bool = False,
     ) -> None:
         """Make the maps for pictures of the size the lens is calibrated for.
 
         Args:
-            camera: of the fitted picture: square pixels, no distortion; see widest_camera(). turn: see seen_pixels().
+            camera: of the fitted picture: square pixels, no distortion; see widest_camera().
             allow_upscale: enlarge pictures that are too coarse instead of refusing them.
         Raises:
             ConfigError: the picture would have to be enlarged.
         """
         self.camera = camera
-        self._lens, self._turn, self._allow_upscale = lens, turn, allow_upscale
+        self._lens, self._allow_upscale = lens, allow_upscale
         self._prepare(lens.width, lens.height)
 
     def image(self, image: Image) -> Image:
@@ -181,23 +180,19 @@ class Rectifier:
 
     def _maps_to(self, camera: Intrinsics, kind: int) -> tuple[NDArray[Any], NDArray[Any]]:
         """For `cv2.remap`, from the shrunk picture."""
-        small, turn = self._lens.resized(*self._shrunk), np.eye(3) if self._turn is None else self._turn
+        small = self._lens.resized(*self._shrunk)
         centre = (camera.cx - HALF_PIXEL, camera.cy - HALF_PIXEL)
         target = np.array([[camera.fx, 0.0, centre[0]], [0.0, camera.fy, centre[1]], [0.0, 0.0, 1.0]])
         equidistant = self._lens.distortion == "equidistant"
         undistort = cv2.fisheye.initUndistortRectifyMap if equidistant else cv2.initUndistortRectifyMap
         size = (camera.width, camera.height)
-        return undistort(small.matrix, np.array(small.coefficients), turn, target, size, kind)
+        return undistort(small.matrix, np.array(small.coefficients), np.eye(3), target, size, kind)
 
 
-def widest_camera(
-    lens: LensModel, width: int, height: int, hfov_deg: float | None, turn: NDArray[np.float64] | None = None
-) -> Intrinsics:
+def widest_camera(lens: LensModel, width: int, height: int, hfov_deg: float | None) -> Intrinsics:
     """The camera of `width` x `height` with a field of view of up to `hfov_deg` across, at most 120 degrees, of which
     the lens sees every pixel.
 
-    Args:
-        turn: see seen_pixels().
     Raises:
         ConfigError: not even one degree of it.
     """
@@ -205,7 +200,12 @@ def widest_camera(
 
     def sees_all(hfov_deg: float) -> bool:
         camera = Intrinsics.from_hfov(hfov_deg, width, height)
-        return bool(seen_pixels(lens, camera, u, v, turn)[1].all())
+        x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+        rays = np.stack([x, y], axis=-1).reshape(-1, 2)
+        pixels = project(lens, rays)
+        low, high = -HALF_PIXEL - _SLACK_PX, np.array([lens.width, lens.height]) - HALF_PIXEL + _SLACK_PX
+        inside = (pixels >= low) & (pixels <= high)
+        return bool(inside.all() and (np.hypot(*rays.T) < _reach(lens)).all())
 
     least, most = _NARROWEST_DEG, _WIDEST_DEG if hfov_deg is None else hfov_deg
     if sees_all(most):
@@ -218,30 +218,6 @@ def widest_camera(
         middle = (least + most) / 2
         least, most = (middle, most) if sees_all(middle) else (least, middle)
     return Intrinsics.from_hfov(least, width, height)
-
-
-def seen_pixels(
-    lens: LensModel,
-    camera: Intrinsics,
-    u: NDArray[Any],
-    v: NDArray[Any],
-    turn: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Where an ideal camera's columns u and rows v lie in the lens's picture, and which of them it sees.
-
-    Args:
-        turn: [3, 3], from the lens's axes to the ideal camera's; None: they are the same.
-    Returns: [V, U, 2] pixels from the first pixel's centre, and [V, U].
-    """
-    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-    rays = np.stack([x, y], axis=-1)
-    if turn is not None:
-        ahead = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1) @ turn  # each row is turn.T @ ray
-        rays = (ahead[..., :2] / np.maximum(ahead[..., 2:], 1 / _STEEPEST)).clip(-_STEEPEST, _STEEPEST)
-    pixels = project(lens, rays.reshape(-1, 2)).reshape(rays.shape)
-    low, high = -HALF_PIXEL - _SLACK_PX, np.array([lens.width, lens.height]) - HALF_PIXEL + _SLACK_PX
-    inside = ((pixels >= low) & (pixels <= high)).all(axis=-1)
-    return pixels, inside & (np.hypot(rays[..., 0], rays[..., 1]) < _reach(lens))
 
 
 @lru_cache(maxsize=8)

@@ -4,7 +4,7 @@ and its source, open. One contract, `gcd_node.frame`. What a kind needs is impor
 
 import difflib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import msgspec
 from msgspec import Meta
@@ -135,16 +135,11 @@ class LiveSource(_Source, frozen=True, kw_only=True, forbid_unknown_fields=True)
         instead of what is measured.
     """
 
-    pace: Literal["realtime", "lockstep"] = "realtime"
-    loop: bool = False
+    pace: ClassVar[Literal["realtime"]] = "realtime"
     open_timeout_s: Positive = 5.0
     stall_ms: Positive | None = None
     max_reconnects: Annotated[int, Meta(ge=0)] | None = None
     fps: Rate | None = None
-
-    def __post_init__(self) -> None:
-        if self.pace == "lockstep" or self.loop:
-            raise ValueError("a camera does not wait and cannot be played again: leave pace and loop out")
 
 
 class V4l2Source(LiveSource, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="v4l2"):
@@ -185,7 +180,6 @@ class OakSource(LiveSource, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     height: Count = 720
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if (self.exposure_us is None) != (self.iso is None):
             raise ValueError("a fixed exposure is exposure_us and iso: state both, or neither")
 
@@ -208,7 +202,7 @@ def prepare_source(table: dict[str, Any], name: str) -> None:
     """Make a [source] without a kind a file, before it is read.
 
     Raises:
-        ConfigError: no such kind; a key that its kind has not, with those that have it; one that it needs is missing.
+        ConfigError: no such kind; a key that its kind has not.
     """
     section = table.get("source")
     if not isinstance(section, dict):
@@ -217,40 +211,29 @@ def prepare_source(table: dict[str, Any], name: str) -> None:
     if kind not in _KINDS:
         raise ConfigError(f"{name}: [source] kind must be one of {', '.join(_KINDS)}, got {kind!r}")
     known = _KINDS[kind].__struct_fields__
-    for key in section:
-        if key in ("kind", *known):
-            continue
-        having = [other for other, struct in _KINDS.items() if key in struct.__struct_fields__]
-        if having:
-            fitting = ", ".join(having)
-            raise ConfigError(f"{name}: source kind {kind!r} takes no {key}, it is for {fitting}: leave it out")
+    for key in section.keys() - {"kind", *known}:
         near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
         hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
-        raise ConfigError(f"{name}: unknown key `{key}` in [source]; {hint}")
-    for field in msgspec.structs.fields(_KINDS[kind]):
-        if field.required and field.name not in section:
-            raise ConfigError(f"{name}: source kind {kind!r} needs a {field.name}: give {field.name} in [source]")
+        raise ConfigError(f"{name}: unknown key `{key}` in [source] of kind {kind!r}; {hint}")
 
 
 def open_source(
     config: SourceConfig, security: "ServerSecurity | None" = None, on_event: "EventSink | None" = None
 ) -> "FrameSource":
-    """The source a launch file asks for, open. security, on_event: for one that listens, see open_push().
+    """The source a launch file asks for; see FrameSource. security, on_event: for one that listens, see open_push().
 
     Raises:
-        SourceAbsentError: there is no such camera, or it does not answer in time.
         SourceError: it cannot be opened, or the package it needs is not installed; the message says which.
         ConfigError: a setting is wrong.
     """
     match config:
-        case FileSource():
-            from gcd_node.sources.files import VideoFile
+        case FileSource() | FolderSource():
+            from gcd_node.sources import files
 
-            return VideoFile(resolve_path(config.path), pace=config.pace, loop=config.loop, fps=config.fps)
-        case FolderSource():
-            from gcd_node.sources.files import ImageFolder
-
-            return ImageFolder(resolve_path(config.path), fps=config.fps, pace=config.pace, loop=config.loop)
+            path, pace, loop = resolve_path(config.path), config.pace, config.loop
+            if isinstance(config, FileSource):
+                return files.VideoFile(path, fps=config.fps, pace=pace, loop=loop)
+            return files.ImageFolder(path, fps=config.fps, pace=pace, loop=loop)
         case McapSource():
             from gcd_node.sources.logs import LogSource
 
@@ -266,14 +249,10 @@ def open_source(
             from gcd_node.sources.files import MovingPattern
 
             return MovingPattern(fps=config.fps, frames=config.frames, pace=config.pace, loop=config.loop)
-        case V4l2Source():
-            from gcd_node.sources.opencv import open_v4l2
+        case V4l2Source() | RtspSource():
+            from gcd_node.sources import opencv
 
-            return open_v4l2(config)
-        case RtspSource():
-            from gcd_node.sources.opencv import open_stream
-
-            return open_stream(config)
+            return opencv.open_v4l2(config) if isinstance(config, V4l2Source) else opencv.open_stream(config)
         case OakSource():
             from gcd_node.sources.oak import open_oak
 

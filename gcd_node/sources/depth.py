@@ -85,7 +85,7 @@ class OnnxDepth:
         """
         if kind == "inverse" and scale is None:
             raise ConfigError(f"{path} gives relative depth: state the camera's mount")
-        self._path, self._kind, self._scale = path, kind, scale
+        self._path, self._scale = path, scale if kind == "inverse" else None
         self._session = _open_network(path)
         try:
             first = self._session.get_inputs()[0]
@@ -105,12 +105,16 @@ class OnnxDepth:
         Raises:
             DepthError: the network failed, or the ground that gives the scale is not in the picture.
         """
-        scaled = self._inverse(self._run(picture), (picture.shape[1], picture.shape[0]))
-        if self._kind == "inverse" and self._scale is not None:
-            scale, shift = fit_ground(scaled, self._scale)
-            scaled = scale * scaled + shift
-        known = np.isfinite(scaled) & (scaled > 1 / _FARTHEST_M)
-        return np.divide(1, scaled, out=np.zeros(scaled.shape, np.float32), where=known, casting="same_kind")
+        inverse = self._run(picture)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self._scale is None:
+                inverse = np.where(inverse > 0, 1 / inverse, np.float32(np.nan))
+            # between the network's pixels, inverse depth is what is linear: on a plane exactly; NaN spreads
+            inverse = np.asarray(cv2.resize(inverse, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+            if self._scale is not None:
+                scale, shift = fit_ground(inverse, self._scale)
+                inverse = scale * inverse + shift
+            return np.where(inverse > 1 / _FARTHEST_M, 1 / inverse, 0).astype(np.float32)
 
     def _run(self, picture: Image) -> NDArray[np.float32]:
         """The network's output, [h, w]."""
@@ -131,20 +135,6 @@ class OnnxDepth:
             raise DepthError(f"{self._path} must give [1, H, W] or [1, 1, H, W], gave {list(found.shape)}")
         return found.reshape(found.shape[-2:]).astype(np.float32)
 
-    def _inverse(self, output: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-        """Inverse depth up to a scale, [H, W]; NaN where the network says nothing. Between its pixels, inverse depth is
-        what is linear: on a plane exactly."""
-        known = np.isfinite(output)
-        if self._kind == "metric":
-            known &= output > 1 / _FARTHEST_M
-            output = np.divide(1, output, out=np.zeros_like(output), where=known, casting="same_kind")
-        filled = np.where(known, output, np.float32(0))
-        inverse = np.asarray(cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR), np.float32)
-        if known.all():
-            return inverse
-        whole = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-        return np.where(whole > 1 - 1e-3, inverse, np.float32(np.nan))
-
 
 def fit_ground(inverse: NDArray[np.float32], mount: CameraMount) -> tuple[float, float]:
     """Scale a and shift b for which a y + b is the inverse depth of the ground, 1 / m, where the ground is.
@@ -160,26 +150,25 @@ def fit_ground(inverse: NDArray[np.float32], mount: CameraMount) -> tuple[float,
     camera = Intrinsics.from_hfov(mount.hfov_deg, wide, high)
     tilt = math.radians(mount.tilt_deg)
     rows = ((np.arange(high) + 0.5 - camera.cy) / camera.fy * math.cos(tilt) + math.sin(tilt)) / mount.height_m
-    if rows.max() <= 0:
-        raise DepthError(f"a camera tilted by {mount.tilt_deg:g} degrees sees no ground: state its mount")
     ground = np.broadcast_to(rows[:, None], inverse.shape)
     where = np.flatnonzero((ground > _NEAR_GROUND * rows.max()) & np.isfinite(inverse))
-    if where.size > _MOST_POINTS:
-        where = np.random.default_rng(0).choice(where, _MOST_POINTS, replace=False)
+    where = where[:: 1 + where.size // _MOST_POINTS]
     y, wanted = inverse.ravel()[where].astype(np.float64), ground.ravel()[where]
-    if y.size > 1 and wanted.max() < _LEAST_SLANT * wanted.min():
-        raise DepthError("the ground is all about as far away, which fits any scale: use a network that gives metres")
-    i, j = np.random.default_rng(0).integers(max(1, y.size), size=(2, _TRIALS if y.size else 0))
+    if y.size < 2 or wanted.max() < _LEAST_SLANT * wanted.min():
+        raise DepthError(
+            "the mount's ground is not in the picture, or all about as far away, which fits any scale: check the "
+            "mount, or use a network that gives metres"
+        )
+    i, j = np.random.default_rng(0).integers(y.size, size=(2, _TRIALS))
     with np.errstate(all="ignore"):  # two points of one depth give no line
         a = (wanted[i] - wanted[j]) / (y[i] - y[j])
         off = np.abs(a[:, None] * y + (wanted[i] - a * y[i])[:, None] - wanted)
     fitting = (off < _GROUND_TOLERANCE * wanted) & (a > 0)[:, None]
-    best = max(fitting, key=np.count_nonzero, default=np.zeros(y.size, np.bool_))
-    if np.count_nonzero(best) < _LEAST_GROUND * max(1, y.size):
+    best = max(fitting, key=np.count_nonzero)
+    if (share := np.count_nonzero(best) / y.size) < _LEAST_GROUND:
         raise DepthError(
             f"the ground of a camera {mount.height_m:g} m up, tilted {mount.tilt_deg:g} degrees, must fit "
-            f"{_LEAST_GROUND:.0%} of the lower picture, it fits {np.count_nonzero(best) / max(1, y.size):.0%}: "
-            "check the mount"
+            f"{_LEAST_GROUND:.0%} of the lower picture, it fits {share:.0%}: check the mount"
         )
     scale = shift = 0.0
     for _ in range(_REFITS):

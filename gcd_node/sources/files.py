@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, MAX_PIXELS, Frame, Image, SourceInfo
-from gcd_node.sources.opencv import codec_name, quiet_opencv
+from gcd_node.sources.opencv import codec_name, silence_opencv
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ Pace: TypeAlias = Literal["realtime", "lockstep"]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 """File names that count as pictures; case does not matter."""
 
-_LOGS = (".mcap", ".db3", ".bag")
 _LOWEST_FPS = 0.1
 _LONGEST_STEP_NS = 10_000_000_000
 _SEAM_NS, _SEAM_PERIODS = 60_000_000_000, 30  # more than a window and any hole: a looped recording's next pass is new
@@ -73,27 +72,24 @@ class Recording:
     info: SourceInfo
     corrupt = 0
 
-    def __init__(self, name: str, *, fps: float | None, pace: Pace, loop: bool) -> None:
-        """name: for messages. fps: stated by the user, if at all. Raises SourceError for an impossible rate."""
-        if fps is not None and not 0 < fps <= MAX_FPS:
-            raise SourceError(f"fps of {name} must lie between 0 and {MAX_FPS:g}, got {fps:g}")
+    def __init__(self, name: str, *, pace: Pace, loop: bool) -> None:
+        """name: for messages."""
         self._name, self._realtime, self._loop = name, pace == "realtime", loop
         self._stopped = threading.Event()
 
     def frames(self) -> Iterator[Frame]:
-        """Every frame, from the first; late ones at once. See FrameSource.frames.
+        """Every frame, from the first; late ones at once, without its holes of more than 10 s. See FrameSource.frames.
 
         Raises:
             SourceError: the recording is damaged or gone.
         """
-        offset_ns, newest_ns = 0, None
         period_ns = round(1e9 / self.info.fps_nominal)
-        longest_ns = max(_LONGEST_STEP_NS, 2 * period_ns)
+        due_ns, newest_ns = time.monotonic_ns(), None
         for frame in self._played():
-            if newest_ns is None or not 0 <= frame.stamp_ns - newest_ns <= longest_ns:  # longer holes are skipped
-                offset_ns = time.monotonic_ns() - frame.stamp_ns + (0 if newest_ns is None else period_ns)
+            step_ns = 0 if newest_ns is None else frame.stamp_ns - newest_ns
+            due_ns += step_ns if 0 <= step_ns <= max(_LONGEST_STEP_NS, 2 * period_ns) else period_ns
             newest_ns = frame.stamp_ns
-            if self._realtime and (left_ns := newest_ns + offset_ns - time.monotonic_ns()) > 0:
+            if self._realtime and (left_ns := due_ns - time.monotonic_ns()) > 0:
                 self._stopped.wait(left_ns / 1e9)
             if self._stopped.is_set():
                 return
@@ -136,8 +132,7 @@ class VideoFile(Recording):
         Raises:
             SourceError: missing, empty, a folder, no video, truncated, or no frame of it can be decoded.
         """
-        super().__init__(str(path), fps=fps, pace=pace, loop=loop)
-        _check_file(path)
+        super().__init__(str(path), pace=pace, loop=loop)
         self._path, self._stated_fps = path.resolve(), fps
         with open_video(self._path) as capture:
             first, codec = capture.read()[1], codec_name(capture.get(cv2.CAP_PROP_FOURCC))
@@ -188,27 +183,18 @@ def rising_stamp_ns(position_ms: float, newest_ns: int | None, period_ns: int) -
     return stated_ns if 0 < stated_ns - newest_ns <= longest_ns else newest_ns + period_ns
 
 
-def _check_file(path: Path) -> None:
-    """Raise SourceError for what a decoder cannot be asked to open, or what belongs to another kind of source."""
-    if not path.exists():
-        raise SourceError(f"no such video: {path}; check the path")
-    if path.suffix.lower() in _LOGS or (path / "metadata.yaml").is_file():
-        raise SourceError(f'{path} is a log, not a video; say kind = "mcap"')
-    if path.is_dir() or path.suffix.lower() in PICTURES:
-        what = "folder" if path.is_dir() else "still picture"
-        raise SourceError(f'{path} is a {what}, not a video; for a folder of pictures say kind = "folder"')
-    if not path.is_file() or path.stat().st_size == 0:
-        raise SourceError(f"{path} is empty, or not a regular file; give a video file")
-
-
 @contextlib.contextmanager
 def open_video(path: Path) -> Generator[cv2.VideoCapture]:
     """FFmpeg on one file, quiet on stderr. Raises SourceError."""
-    with quiet_opencv():
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    silence_opencv()
+    is_video = path.is_file() and path.suffix.lower() not in PICTURES
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
     try:
         if not capture.isOpened() or codec_name(capture.get(cv2.CAP_PROP_FOURCC)) in _NO_VIDEO:
-            raise SourceError(f"cannot open {path} as a video: none, truncated or damaged; give a video file")
+            raise SourceError(
+                f"cannot open {path} as a video: missing, empty, damaged or another kind of file; give a video, or say "
+                'kind = "folder" for a folder of pictures, kind = "mcap" for a log'
+            )
         width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if width * height > MAX_PIXELS:
             raise SourceError(f"{path} states {width:g} x {height:g} pixels, over {MAX_PIXELS}; make it smaller first")
@@ -229,7 +215,7 @@ class ImageFolder(Recording):
         Raises:
             SourceError: no folder, no pictures in it, or the first is damaged or too large.
         """
-        super().__init__(str(path), fps=fps, pace=pace, loop=loop)
+        super().__init__(str(path), pace=pace, loop=loop)
         self._pictures = list_pictures(path)
         height, width = read_picture(self._pictures[0]).shape[:2]
         self.info = SourceInfo(
@@ -294,13 +280,11 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 def _read(path: Path, flags: int) -> NDArray[Any]:
     """A picture as OpenCV decodes it."""
-    if path.exists() and (not path.is_file() or path.stat().st_size > _MAX_BYTES):
-        raise SourceError(f"{path} is not a regular file, or has more than {_MAX_BYTES} bytes; give a picture")
     try:
+        if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+            raise SourceError(f"is missing, no regular file, or has more than {_MAX_BYTES} bytes")
         return decode_picture(path.read_bytes(), flags)
-    except OSError as error:
-        raise SourceError(f"cannot read the picture {path}: {error.strerror}; check the path") from error
-    except SourceError as error:
+    except (OSError, SourceError) as error:
         raise SourceError(f"{path} {error}; remove or replace it") from error
 
 
@@ -358,7 +342,7 @@ class MovingPattern(Recording):
         size: tuple[int, int] = (640, 480),
     ) -> None:
         """size: width and height. Raises SourceError for an impossible rate."""
-        super().__init__("a moving pattern", fps=fps, pace=pace, loop=loop)
+        super().__init__("a moving pattern", pace=pace, loop=loop)
         self._frames, (width, height) = frames, size
         self.info = SourceInfo(
             kind="synthetic", id="pattern", width=width, height=height, fps_nominal=fps, clock="replay", hfov_deg=85.0

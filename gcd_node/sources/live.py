@@ -11,9 +11,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import Future, wait
+from contextlib import closing
 from dataclasses import replace
-from itertools import count
 from statistics import median
 from typing import Protocol, TypeAlias
 
@@ -31,7 +30,7 @@ _STALL_PERIODS, _LEAST_STALL_S, _LOST_S = 3, 0.2, 1.8
 _LEAVE_AFTER_S, _LOOK_S = 0.5, 0.02
 
 Opener: TypeAlias = Callable[[SourceInfo], FrameSource]
-"""Opens again what was open before; raises SourceError if it cannot be, within its own time-out."""
+"""Begins to open again what was open before, at once; raises SourceError if it cannot be."""
 
 
 class Driver(Protocol):
@@ -62,7 +61,6 @@ class Driver(Protocol):
 class LiveCamera:
     """One opening of a camera, as a FrameSource. Its latest pictures wait to be taken."""
 
-    info: SourceInfo
     skipped = 0
     """Pictures replaced by newer ones before they were taken, since the first one was: nobody misses those before."""
 
@@ -73,19 +71,19 @@ class LiveCamera:
         *,
         open_timeout_s: float,
         hint: str,
-        on_end: Callable[[], None] = lambda: None,
+        alone: "threading.Lock | None" = None,
     ) -> None:
-        """Open a camera and wait for its first picture; its rate is as stated or, where that is nonsense, as measured.
+        """Begin to open a camera; its rate will be as stated or, where that is nonsense, as measured.
 
         Args:
             name: for messages; holds no password. hint: what to do if it does not answer.
-            open_driver: opens it; raises SourceError. May take for ever.
+            open_driver: opens it, in the camera's own thread; raises SourceError. May take for ever.
             open_timeout_s: until the first picture.
-            on_end: called in the camera's own thread once the driver has let go, or could not be opened.
-        Raises:
-            SourceAbsentError: no such camera, or no picture in time. SourceError: it is there, but cannot be used.
+            alone: held while it is open, for a device that two openings would fight for.
         """
-        self._name, self._hint, self._open_driver, self._on_end = name, hint, open_driver, on_end
+        self._name, self._hint, self._open_driver, self._open_timeout_s = name, hint, open_driver, open_timeout_s
+        self._alone = alone or threading.Lock()
+        self._until_s = time.monotonic() + open_timeout_s
         self._driver: Driver | None = None
         self._changed = threading.Condition()
         self._waiting: deque[Frame] = deque(maxlen=_WAITING)
@@ -94,7 +92,24 @@ class LiveCamera:
         self._described: SourceInfo | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
-        self.info = self._await_first(open_timeout_s)
+
+    @property
+    def info(self) -> SourceInfo:
+        """What is known of the camera. Waits for its first picture; without one in time it is closed.
+
+        Raises:
+            SourceAbsentError: no such camera, or no picture in time. SourceError: it is there, but cannot be used.
+        """
+        with self._changed:
+            left_s = max(0.0, self._until_s - time.monotonic())
+            self._changed.wait_for(lambda: self._described or self._over or self._closed, left_s)
+            if self._described is not None:
+                return self._described
+            self._closed = True
+        if self._error is not None and not isinstance(self._error, SourceLostError):
+            raise self._error
+        late = f"none within {self._open_timeout_s:g} s, {self.corrupt} damaged; {self._hint}"
+        raise SourceAbsentError(f"{self._name} gives no picture: {self._error or late}") from self._error
 
     @property
     def corrupt(self) -> int:
@@ -102,9 +117,10 @@ class LiveCamera:
         return 0 if self._driver is None else self._driver.corrupt
 
     def frames(self) -> Iterator[Frame]:
-        """See FrameSource.frames. Raises SourceLostError if the camera is gone."""
-        while (frame := self.take()) is not None:
-            yield frame
+        """See FrameSource.frames. Raises SourceLostError if the camera is gone; else as `info`."""
+        if self.info:
+            while (frame := self.take()) is not None:
+                yield frame
 
     def take(self, timeout_s: float | None = None) -> Frame | None:
         """The oldest picture that waits, once; None: none came in time, or the camera was closed here.
@@ -129,42 +145,29 @@ class LiveCamera:
         if self._thread.is_alive():
             _LOG.warning("%s does not let go; its thread is left behind", self._name)
 
-    def _await_first(self, timeout_s: float) -> SourceInfo:
-        with self._changed:
-            self._changed.wait_for(lambda: self._described is not None or self._over, timeout_s)
-            if self._described is not None:
-                return self._described
-            self._closed = True
-        if not self._over:
-            damaged = f" ({self.corrupt} damaged ones)" if self.corrupt else ""
-            raise SourceAbsentError(f"{self._name} gave no picture within {timeout_s:g} s{damaged}; {self._hint}")
-        if isinstance(self._error, SourceLostError):
-            raise SourceAbsentError(f"{self._name} opens, but gives no picture: {self._error}") from self._error
-        raise self._error or SourceAbsentError(f"{self._name} gave no picture; {self._hint}")
-
     # The camera's own thread.
 
     def _run(self) -> None:
         try:
-            driver = self._driver = self._open_driver()
+            if not self._alone.acquire(timeout=self._open_timeout_s):
+                raise SourceAbsentError(f"the attempt before is still busy with {self._name}; {self._hint}")
             try:
-                self._read(driver)
+                if not self._closed:
+                    with closing(self._open_driver()) as driver:
+                        self._driver = driver
+                        self._read(driver)
             finally:
-                driver.close()
+                self._alone.release()
         except Exception as error:  # the end of a thread: whoever opens, or takes frames, gets it
             self._error = error
-        finally:
-            self._on_end()
         with self._changed:
             self._over = True
             self._changed.notify_all()
 
     def _read(self, driver: Driver) -> None:
-        frame = self._next(driver)
-        if frame is None:
+        if (frame := self._next(driver)) is None:
             return
-        fps = driver.fps
-        if fps is None:
+        if (fps := driver.fps) is None:
             frame, fps = self._measured(driver, frame)
         self._described = driver.describe(frame, fps)
         while frame is not None:
@@ -198,13 +201,11 @@ def sane_fps(stated: float) -> float | None:
     return stated if _LOWEST_FPS <= stated <= _HIGHEST_FPS else None
 
 
-def backoff_s(kind: SourceKind) -> Iterator[float]:
-    """How long to wait before each attempt, seconds: doubling up to a limit, a fifth more or less, so that many nodes
-    do not knock together. A source that only listens knocks nowhere: it is hardly ever away."""
+def backoff_s(kind: SourceKind, failures: int) -> float:
+    """How long to wait before the next attempt, seconds, after so many that failed: doubling up to a limit, a fifth
+    more or less, so that many nodes do not knock together. A source that only listens knocks nowhere."""
     limit_s = 0.5 if kind == "push" else 10.0
-    for attempt in count():
-        even_s = min(limit_s, 0.5 * 2.0 ** min(attempt, 30))
-        yield min(limit_s, even_s * random.uniform(0.8, 1.2))  # noqa: S311
+    return min(limit_s, 0.5 * 2.0 ** min(failures, 30) * random.uniform(0.8, 1.2))  # noqa: S311
 
 
 def patience_s(config: LiveSource, fps: float) -> tuple[float, float]:
@@ -235,23 +236,10 @@ class WatchListener(Protocol):
 class SourceWatch:
     """A FrameSource that is opened again when it is lost, if it is a LiveCamera; a recording just passes."""
 
-    def __init__(
-        self,
-        first: FrameSource,
-        reopen: Opener,
-        listener: WatchListener,
-        config: SourceConfig,
-        backoff: Callable[[SourceKind], Iterator[float]] = backoff_s,
-    ) -> None:
-        """Watch a source that is already open.
-
-        Args:
-            reopen: opens it again; called in threads of their own, one at a time.
-            config: of the source; says how long a live one may be silent.
-        """
+    def __init__(self, first: FrameSource, reopen: Opener, listener: WatchListener, config: SourceConfig) -> None:
+        """Watch a source that is already open. config: of it; says how long a live one may be silent."""
         self._current, self.info = first, first.info  # of what is open now, or was open last
         self._reopen, self._listener, self._config = reopen, listener, config
-        self._backoff, self._waits = backoff, backoff(first.info.kind)
         self._closing = threading.Event()
         self._state: SourceState = "connecting"
         self._corrupt_before = self._skipped_before = 0
@@ -324,7 +312,6 @@ class SourceWatch:
         """Tell of a frame; whether it is wanted."""
         if self._state != "streaming":
             self._failed_in_a_row = 0
-            self._waits = self._backoff(self.info.kind)
             self._turn("streaming")
         if frame.size != (self.info.width, self.info.height):  # another camera, as far as windows go
             self.info = replace(self.info, width=frame.size[0], height=frame.size[1])
@@ -337,64 +324,33 @@ class SourceWatch:
     def _open_again(self, reason: str) -> None:
         """Try until it opens or the watch is closed. Raises SourceLostError."""
         limit = self._config.max_reconnects if isinstance(self._config, LiveSource) else None
-        while not self._closing.is_set():
-            if limit is not None and self._failed_in_a_row >= limit:
-                raise SourceLostError(
-                    f"{self.info.kind} {self.info.id} is gone and did not come back in {limit} attempts, at last: "
-                    f"{reason}. Look at its cable and power, or leave max_reconnects out to wait for ever"
-                )
-            if self._closing.wait(next(self._waits)):
+        while limit is None or self._failed_in_a_row < limit:
+            if self._closing.wait(backoff_s(self.info.kind, self._failed_in_a_row)):
                 return
             try:
-                source = self._attempt()
+                self._take_over(self._reopen(self.info))
             except SourceError as error:
                 self._failed_in_a_row += 1
                 reason = str(error)
                 _LOG.info("not back yet: %s", error)
-                continue
-            if source is not None:
-                self._take_over(source)
-            return
-
-    def _attempt(self) -> FrameSource | None:
-        """The source, open again; None if the watch was closed meanwhile. Raises SourceError."""
-        before = self.info
-        opening = _open_aside(lambda: self._reopen(before))
-        while not opening.done():
-            if self._closing.is_set() and opening.cancel():
-                return None
-            wait({opening}, timeout=_LOOK_S)
-        return opening.result()
+            else:
+                self._wanted = self._listener.source_opened(self.info)
+                return
+        if not self._closing.is_set():
+            raise SourceLostError(
+                f"{self.info.kind} {self.info.id} is gone and did not come back in {limit} attempts, at last: "
+                f"{reason}. Look at its cable and power, or leave max_reconnects out to wait for ever"
+            )
 
     def _take_over(self, source: FrameSource) -> None:
-        before, self._current, self.info = self._current, source, source.info
+        """Go on with this one once it is open. Raises SourceError."""
+        before, self._current = self._current, source
         self._corrupt_before += before.corrupt
         self._skipped_before += before.skipped if isinstance(before, LiveCamera) else 0
         if self._closing.is_set():
-            source.close()  # closed while it was being opened
-            return
-        self._wanted = self._listener.source_opened(self.info)
+            source.close()  # nobody else knew of it
+        self.info = source.info
 
     def _turn(self, state: SourceState, detail: str = "") -> None:
         self._state = state
         self._listener.source_state(state, detail)
-
-
-def _open_aside(open_source: Callable[[], FrameSource]) -> "Future[FrameSource]":
-    """Open a source in a thread of its own. If the future is cancelled, the source is closed as soon as it is open."""
-    opening: Future[FrameSource] = Future()
-
-    def run() -> None:
-        try:
-            source = open_source()
-        except Exception as error:  # the end of a thread: whoever waits gets it
-            if opening.set_running_or_notify_cancel():
-                opening.set_exception(error)
-            return
-        if opening.set_running_or_notify_cancel():
-            opening.set_result(source)
-        else:
-            source.close()
-
-    threading.Thread(target=run, name="camera open", daemon=True).start()
-    return opening

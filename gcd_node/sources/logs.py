@@ -65,7 +65,7 @@ class LogSource(Recording):
             SourceError: no log; no such topic; no pictures, or on several topics; none of them can be decoded, or none
                 was found in 15 s of reading. TooShortError: one picture.
         """
-        super().__init__(str(path), fps=None, pace=pace, loop=loop)
+        super().__init__(str(path), pace=pace, loop=loop)
         self._path, self._depth_topic, self._odometry_topic = path.absolute(), depth_topic, odometry_topic
         survey = _Survey(self._path, topic, {name for name in (depth_topic, odometry_topic) if name is not None})
         self.info, self.topic, self._header_stamps = survey.info, survey.topic, survey.header_stamps

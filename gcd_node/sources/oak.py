@@ -8,7 +8,8 @@ interpreter: the thread that stops a pipeline holds it until then.
 import logging
 import os
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, TypeAlias
@@ -55,36 +56,14 @@ PipelineFactory: TypeAlias = Callable[[], OakStream]
 """Wires a pipeline. Called once, on a thread of its own."""
 
 
-class _Loss:
-    """The reason a stream is gone, as any thread states it; the first one stays. It refers to nothing: a pipeline
-    that its own callback holds would never be dropped."""
-
-    def __init__(self) -> None:
-        self.is_set = threading.Event()
-        self._reason = ""
-
-    def set(self, reason: str) -> None:
-        """The stream is gone, because of this."""
-        self._reason = self._reason or reason
-        self.is_set.set()
-
-    def on_state(self, _: object, state: "dai.DeviceState") -> None:
-        """For DepthAI's state callback: what does not run is lost; to reconnect is the node's affair."""
-        if state.name != "RUNNING":
-            self.set(f"device {state.name.lower()}")
-
-    def error(self, name: str) -> SourceLostError:
-        """The reason as an error."""
-        return SourceLostError(f"OAK {name} is lost: {self._reason}; check its cable and power, then open it again")
-
-
 class _OakDriver:
     """A DepthAI pipeline as a Driver. Stamps are mid-exposure, on this host's monotonic clock."""
 
     def __init__(self, factory: PipelineFactory) -> None:
         """Wire and start a pipeline. Raises SourceAbsentError: there is no such camera, or it does not open."""
-        self.corrupt, self._loss = 0, _Loss()
-        opened = _open(factory, self._loss)
+        self.corrupt = 0
+        self._states: list[str] = []  # of the device, by name; refers to nothing, so that the pipeline can be dropped
+        opened = _open(factory, self._states)
         if isinstance(opened, Exception):
             raise opened
         self._stream, self._queue = opened
@@ -95,24 +74,26 @@ class _OakDriver:
         """See Driver. The newest picture each time."""
         import depthai as dai
 
-        loss = self._loss
-        if loss.is_set.is_set():
-            raise loss.error(self._stream.id)
+        if any(each != "RUNNING" for each in self._states):  # to reconnect is the node's affair
+            raise self._lost("")
         try:
             message = self._queue.get(_PATIENCE)
             later = self._queue.tryGetAll()
         except dai.MessageQueue.QueueException:  # pyright: ignore[reportGeneralTypeIssues] - the stub's own mistake
-            loss.is_set.wait(_EXPLAIN_S)  # the state callback may be a moment behind, and knows why
-            loss.set("its pipeline ended")
-            raise loss.error(self._stream.id) from None
+            time.sleep(_EXPLAIN_S)  # the state callback may be a moment behind, and knows why
+            raise self._lost("its pipeline ended") from None
         except RuntimeError as error:  # what DepthAI makes of a link that broke
-            loss.set(f"reading from it failed ({error})")
-            raise loss.error(self._stream.id) from error
+            raise self._lost(f"reading from it failed ({error})") from error
         newest = later[-1] if later else message
         if isinstance(newest, dai.ImgFrame):
             return self._frame(newest)
         self.corrupt += newest is not None  # pyright: ignore[reportUnnecessaryComparison] - after a time-out it is None
         return None
+
+    def _lost(self, reason: str) -> SourceLostError:
+        """The device's state says more than the reason, if it does not run."""
+        states = [f"device {each.lower()}" for each in self._states if each != "RUNNING"]
+        return SourceLostError(f"OAK {self._stream.id} is lost: {(*states, reason)[0]}; check its cable and power")
 
     def describe(self, first: Frame, fps: float) -> SourceInfo:
         message, stream, size = self._newest, self._stream, first.size
@@ -126,9 +107,21 @@ class _OakDriver:
             height=size[1],
             fps_nominal=fps,
             clock="realtime",
-            lens=_lens_of(message, size) or stream.lens(*size),  # it knows what the sensor's mode cuts off
+            lens=self._lens(message, size),
             stamp_uncertainty_us=_SYNCED_US if exposure_known else round(0.5e6 / fps),
         )
+
+    def _lens(self, message: "dai.ImgFrame", size: tuple[int, int]) -> LensModel | None:
+        """Of the picture itself, which knows what the sensor's mode cuts off; else of the device's memory."""
+        seen = message.getTransformation()
+        matrix = seen.getIntrinsicMatrix()
+        try:
+            if seen.isValid() and seen.getSize() == size and matrix[0][0] > 1:  # the identity: it does not know
+                return depthai_lens(matrix, seen.getDistortionCoefficients(), seen.getDistortionModel().name, size)
+            return self._stream.lens(*size)
+        except (ConfigError, RuntimeError) as error:  # DepthAI raises for what its memory lacks
+            _LOG.warning("an OAK's calibration is missing, or makes no sense: it counts as uncalibrated: %s", error)
+            return None
 
     def close(self) -> None:
         _stop(self._stream.pipeline)
@@ -151,26 +144,23 @@ class _OakDriver:
 
 
 def open_oak(config: OakSource) -> LiveCamera:
-    """The OAK camera a launch file asks for, open. Raises as open_pipeline()."""
+    """The OAK camera a launch file asks for. Raises as open_pipeline()."""
     return open_pipeline(lambda: camera_pipeline(config), open_timeout_s=config.open_timeout_s)
 
 
 def open_pipeline(factory: PipelineFactory, *, open_timeout_s: float) -> LiveCamera:
-    """A started pipeline that has given its first picture. An attempt that was given up is over before the next begins:
-    two that open one device reset it under each other for ever.
+    """A pipeline that is being started. An attempt that was given up is over before the next begins: two that open one
+    device reset it under each other for ever.
 
     Args:
         factory: of a real camera, calls camera_pipeline().
         open_timeout_s: for all of it. What DepthAI is still busy with then is left to a thread.
     Raises:
-        SourceAbsentError: there is no such camera, or it does not open, or gives no picture in time.
         SourceError: DepthAI is not installed.
     """
     load_depthai()
-    if not _IN_USE.acquire(timeout=open_timeout_s):
-        raise SourceAbsentError(f"DepthAI is still busy with the OAK after {open_timeout_s:g} s; {_HINT}")
     return LiveCamera(
-        "the OAK camera", lambda: _OakDriver(factory), open_timeout_s=open_timeout_s, hint=_HINT, on_end=_IN_USE.release
+        "the OAK camera", lambda: _OakDriver(factory), open_timeout_s=open_timeout_s, hint=_HINT, alone=_IN_USE
     )
 
 
@@ -179,19 +169,15 @@ def load_depthai() -> None:
 
     Without its crash handlers, which would take signals from Python; without its log, which goes to standard output;
     and with a search that gives up an address nobody answers at before the default open time-out does.
-    Raises SourceError if it is not installed, or older than what was tried.
+    Raises SourceError if it is not installed.
     """
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
     os.environ.setdefault("DEPTHAI_LEVEL", "off")
     os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", "2500")
     try:
-        import depthai as dai
+        import depthai  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
         raise SourceError(f"an OAK camera needs DepthAI ({error}): pip install 'gcd-node[oak]'") from error
-    if not hasattr(dai.Pipeline, "setDeviceStateCallback"):
-        raise SourceError(
-            f"an OAK camera needs DepthAI 3.12 or newer, found {dai.__version__}: pip install -U 'gcd-node[oak]'"
-        )
 
 
 def camera_pipeline(config: OakSource) -> OakStream:
@@ -248,19 +234,20 @@ def _open_device(wanted: str | None) -> "dai.Device":
     import depthai as dai
 
     free = dai.Device.getAllAvailableDevices()
-    reason = "there must be one"
-    is_id = wanted is not None and "." not in wanted  # neither an address nor a USB path
-    if is_id and wanted not in {each.deviceId for each in free}:
-        reason = "it is not there"
-    elif wanted is not None or len(free) == 1:
+    fitting = [each for each in free if wanted in (None, each.deviceId)]
+    if wanted is not None and "." in wanted:  # an address, or a USB path
+        fitting = [dai.DeviceInfo(wanted)]
+    reason = f"{len(fitting)} fit"
+    if len(fitting) == 1:
         try:
-            return dai.Device(free[0] if wanted is None else dai.DeviceInfo(wanted))
+            return dai.Device(fitting[0])
         except RuntimeError as error:
             reason = str(error)
     ids = {each.deviceId for each in free}
-    busy = [each for each in dai.Device.getAllConnectedDevices() if each.deviceId not in ids]
-    there = [f"{each.deviceId} (at {each.name})" for each in free]
-    there += [f"{each.deviceId} (at {each.name}) in use by another process" for each in busy]
+    there = [
+        f"{each.deviceId} (at {each.name}{'' if each.deviceId in ids else ', in use by another process'})"
+        for each in dai.Device.getAllConnectedDevices()
+    ]
     raise SourceAbsentError(
         f"OAK {wanted or 'camera'} cannot be opened, {reason}; found {', '.join(there) or 'none'}; "
         "plug it in, or correct device in [source]; on Linux its udev rule must be there too"
@@ -269,48 +256,24 @@ def _open_device(wanted: str | None) -> "dai.Device":
 
 def lens_in_memory(
     memory: "dai.CalibrationHandler", socket: "dai.CameraBoardSocket", width: int, height: int
-) -> LensModel | None:
+) -> LensModel:
     """Calibration of one sensor for pictures that were scaled to width x height, what is over cut off.
 
-    None if the memory holds none for it.
+    Raises RuntimeError, ConfigError: the memory holds none for it, or one that no camera has.
     """
-    try:
-        matrix, model = memory.getCameraIntrinsics(socket, width, height), memory.getDistortionModel(socket).name
-    except RuntimeError as error:
-        _LOG.warning("the OAK's memory has no calibration for %s: %s", socket.name, error)
-        return None
+    matrix, model = memory.getCameraIntrinsics(socket, width, height), memory.getDistortionModel(socket).name
     stored = dict(memory.eepromToJson()["cameraData"])[socket.value]["distortionCoeff"]
-    if model == "Fisheye" and len(stored) < 4:  # getDistortionCoefficients would read four, and end the process
-        _LOG.warning("the OAK's memory has no coefficients for the fish-eye lens of %s", socket.name)
-        return None
-    return _known_lens(matrix, stored, model, (width, height))
+    if model == "Fisheye" and len(stored) < 4:  # which is no fish-eye without distortion, but one never calibrated
+        raise ConfigError(f"the memory has no coefficients for the fish-eye lens of {socket.name}")
+    return depthai_lens(matrix, stored, model, (width, height))
 
 
-def _lens_of(picture: "dai.ImgFrame", size: tuple[int, int]) -> LensModel | None:
-    seen = picture.getTransformation()
-    matrix = seen.getIntrinsicMatrix()
-    if not seen.isValid() or seen.getSize() != size or matrix[0][0] <= 1:  # the identity: it does not know
-        return None
-    return _known_lens(matrix, seen.getDistortionCoefficients(), seen.getDistortionModel().name, size)
-
-
-def _known_lens(
-    matrix: Sequence[Sequence[float]], coefficients: Sequence[float], model: str, size: tuple[int, int]
-) -> LensModel | None:
-    """None, and the log says so, for a model that is not known here, or numbers that no camera has."""
-    try:
-        return depthai_lens(matrix, coefficients, model, size)
-    except ConfigError as error:
-        _LOG.warning("an OAK's calibration makes no sense, it counts as uncalibrated: %s", error)
-        return None
-
-
-def _open(factory: PipelineFactory, loss: _Loss) -> "tuple[OakStream, dai.MessageQueue] | Exception":
+def _open(factory: PipelineFactory, states: list[str]) -> "tuple[OakStream, dai.MessageQueue] | Exception":
     """A started pipeline and its queue, or why there is none: raised here, it would keep the device open."""
     stream: OakStream | None = None
     try:
         stream = factory()
-        stream.pipeline.setDeviceStateCallback(loss.on_state)
+        stream.pipeline.setDeviceStateCallback(lambda _, state: states.append(state.name))
         queue = stream.output.createOutputQueue(maxSize=4, blocking=False)
         stream.pipeline.start()
     except Exception as error:

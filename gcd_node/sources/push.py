@@ -35,9 +35,6 @@ def open_push(
 
     Args:
         security: keys and clients of a tcp endpoint; only operators may push. on_event: gets AUTH_DENIED.
-    Raises:
-        SourceAbsentError: nobody pushed a frame in time. EndpointError, ConfigError: see SocketGuard.bind().
-        SetupError: no endpoint.
     """
     return LiveCamera(
         f"the push source at {config.endpoint}",

@@ -18,6 +18,7 @@ class Camera(LiveCamera):
     """Gives what `feed` and `shoot` put in; silent otherwise. Open at once, without a thread."""
 
     corrupt = 0
+    info: SourceInfo = None
 
     def __init__(self, *, size: tuple[int, int] = (96, 64), fps: float = FPS) -> None:
         self.info = SourceInfo(

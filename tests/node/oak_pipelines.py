@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import timedelta
-from typing import cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,39 +42,30 @@ class HostCamera(dai.node.ThreadedHostNode):
 class WatchedPipeline(dai.Pipeline):
     """A host-only pipeline whose device states a test can make up."""
 
-    def __init__(self) -> None:
-        super().__init__(createImplicitDevice=False)
-        self.on_state: Callable[[dai.Device, dai.DeviceState], None] | None = None
-
-    def setDeviceStateCallback(self, callback: Callable[[dai.Device, dai.DeviceState], None]) -> None:  # noqa: N802
+    def setDeviceStateCallback(self, callback: Callable[[Any, dai.DeviceState], None]) -> None:  # noqa: N802
         super().setDeviceStateCallback(callback)
         self.on_state = callback
-
-
-def no_lens(width: int, height: int) -> LensModel | None:
-    """A memory without calibration, whatever the size."""
-    return None
 
 
 class Scripted:
     """A pipeline factory: a host-only pipeline with one camera that does what the script says."""
 
-    def __init__(self, script: Script, *, lens: Callable[[int, int], LensModel | None] | None = None) -> None:
-        self._script = script
-        self._lens = lens or no_lens
+    def __init__(
+        self, script: Script, *, fps: float = FPS, lens: Callable[[int, int], LensModel | None] | None = None
+    ) -> None:
+        self._script, self._fps, self._lens = script, fps, lens or (lambda width, height: None)
         self.pipeline: WatchedPipeline | None = None
 
     def __call__(self) -> OakStream:
-        self.pipeline = WatchedPipeline()
+        self.pipeline = WatchedPipeline(createImplicitDevice=False)
         camera = self.pipeline.create(HostCamera)
         camera.body = lambda: self._script(camera)
-        return OakStream(pipeline=self.pipeline, output=camera.out, id=NAME, fps=FPS, lens=self._lens)
+        return OakStream(pipeline=self.pipeline, output=camera.out, id=NAME, fps=self._fps, lens=self._lens)
 
     def device_turns(self, state: dai.DeviceState) -> None:
         """What DepthAI would call on a thread of its own."""
         assert self.pipeline is not None
-        assert self.pipeline.on_state is not None, "nobody asked for device states"
-        self.pipeline.on_state(cast("dai.Device", None), state)
+        self.pipeline.on_state(None, state)
 
 
 def picture(
@@ -97,15 +88,18 @@ def picture(
     return message
 
 
-def steady(make: Callable[[int], dai.ImgFrame] = picture, *, period_s: float = 1 / FPS) -> Script:
-    """Numbered pictures until the pipeline is stopped; make: the one of a number."""
+def steady(
+    make: Callable[[int], dai.ImgFrame] = picture, *, fps: float = FPS, awake: threading.Event | None = None
+) -> Script:
+    """Numbered pictures until the pipeline is stopped; make: the one of a number. awake: none are sent without."""
 
     def script(camera: HostCamera) -> None:
         seq = 0
         while camera.isRunning():
-            camera.out.send(make(seq))
+            if awake is None or awake.is_set():
+                camera.out.send(make(seq))
             seq += 1
-            time.sleep(period_s)
+            time.sleep(1 / fps)
 
     return script
 

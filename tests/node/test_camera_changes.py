@@ -12,8 +12,9 @@ from fakes import HEIGHT, WIDTH
 from rig import Rig, Seen
 
 from gcd_client.control import Code
-from gcd_node.errors import SourceAbsentError, SourceLostError
+from gcd_node.errors import SourceLostError
 from gcd_node.sources import OakSource, SourceConfig
+from gcd_node.sources.live import LiveCamera
 
 CALIBRATION = """
 image_width: 384
@@ -164,14 +165,13 @@ def test_a_camera_that_returns_too_slow_for_the_stated_rate_is_refused_and_the_n
 
 def test_a_node_can_be_stopped_and_started_while_its_camera_takes_for_ever_to_open(tmp_path: Path) -> None:
     first, late, answer = Steady(), Steady(), threading.Event()
-    asked: list[Steady] = []
+    asked: list[SourceConfig] = []
 
-    def open_source(_: SourceConfig) -> Steady:
-        asked.append(first if not asked else late)
+    def open_source(config: SourceConfig) -> LiveCamera:
+        asked.append(config)
         if len(asked) == 2:
-            answer.wait(60)
-            raise SourceAbsentError("nobody answered")
-        return asked[-1]
+            return LiveCamera("slow", lambda: answer.wait(60), open_timeout_s=60.0, hint="wait")
+        return first if len(asked) == 1 else late
 
     with Rig(tmp_path, open_source) as rig:
         rig.await_state("active")

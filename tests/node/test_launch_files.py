@@ -36,7 +36,8 @@ PATIENCE_S = 60
 def rehearsed(config: NodeConfig, folder: Path) -> NodeConfig:
     """As it is, but with frames of our own instead of a camera or a log, endpoints here, and random
     weights."""
-    common = {name: getattr(config.source, name) for name in RecordedSource.__struct_fields__}
+    stated = [name for name in RecordedSource.__struct_fields__ if hasattr(config.source, name)]
+    common = {name: getattr(config.source, name) for name in stated}
     source = SyntheticSource(**common | {"loop": False}, frames=1)
     here = {name: f"ipc://{folder}/{name}" for name in ("data", "status", "control")}
     model = config.model

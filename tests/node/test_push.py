@@ -62,6 +62,7 @@ def red(pusher: FramePusher, _: int) -> None:
 def opened(endpoint: str, security: ServerSecurity | None = None) -> Iterator[LiveCamera]:
     source = open_push(PushSource(endpoint=endpoint, fps=FPS, open_timeout_s=GUARD_S), security)
     try:
+        assert source.info.kind == "push"  # it is open
         yield source
     finally:
         source.close()

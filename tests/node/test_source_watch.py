@@ -1,8 +1,6 @@
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,7 @@ from gcd_node.errors import SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
 from gcd_node.sources import V4l2Source
-from gcd_node.sources.live import SourceWatch, backoff_s, patience_s
+from gcd_node.sources.live import LiveCamera, SourceWatch, backoff_s, patience_s
 from gcd_node.sources.opencv import open_v4l2
 from gcd_node.window import Reason
 
@@ -26,8 +24,10 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gcd_node.sources.live._LOST_S", 0.3)
 
 
-def quick(_: object) -> Iterator[float]:
-    return repeat(0.02)
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is tried again soon."""
+    monkeypatch.setattr("gcd_node.sources.live.backoff_s", lambda *_: 0.02)
 
 
 @dataclass
@@ -64,7 +64,7 @@ class Reader:
     def __init__(self, first: FrameSource, bench: Bench | None = None, **patience: Any) -> None:
         self.log = Log()
         plugged = bench or Bench()
-        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, V4l2Source(**patience), quick)
+        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, V4l2Source(**patience))
         self.frames: list[Frame] = []
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._read, daemon=True)
@@ -209,13 +209,16 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
     asked, answer = threading.Event(), threading.Event()
     asked_for: list[SourceInfo] = []
 
-    def open_slowly(before: SourceInfo) -> Camera:
-        asked_for.append(before)
+    def open_slowly() -> Camera:
         asked.set()
         answer.wait(60)
         return late
 
-    watch = SourceWatch(camera, open_slowly, Log(), V4l2Source(), quick)
+    def reopen(before: SourceInfo) -> LiveCamera:
+        asked_for.append(before)
+        return LiveCamera("slow", open_slowly, open_timeout_s=60.0, hint="wait")
+
+    watch = SourceWatch(camera, reopen, Log(), V4l2Source())
     left = threading.Thread(target=lambda: list(watch.frames()), daemon=True)
     left.start()
     camera.feed(None)
@@ -232,9 +235,9 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
 def test_waiting_doubles_up_to_its_limit_and_never_passes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for part in (0.8, 1.0, 1.2):
         monkeypatch.setattr("random.uniform", lambda *_, part=part: part)
-        even = [part * wait for wait in (0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0)]
-        assert list(islice(backoff_s("v4l2"), 7)) == pytest.approx([min(10.0, wait) for wait in even])
-        assert list(islice(backoff_s("push"), 3)) == pytest.approx([min(0.5, 0.5 * part)] * 3)
+        even = [part * wait for wait in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)]
+        assert [backoff_s("v4l2", i) for i in range(7)] == pytest.approx([min(10.0, wait) for wait in even])
+        assert [backoff_s("push", i) for i in range(3)] == pytest.approx([min(0.5, wait) for wait in even[:3]])
 
 
 def test_patience_follows_the_rate_and_two_seconds() -> None:

@@ -20,8 +20,8 @@ from gcd_node.offline import ClipRequest, read_clip
 from gcd_node.preprocess import project
 from gcd_node.sources.stereo import StereoDepth
 
-FX, BASELINE_M, DISPARITY = 300.0, 0.09, 10
-PAIR_SIZE = (384, 256)
+BASELINE_M, DISPARITY = 0.09, 10
+FILMED = LensModel(width=384, height=256, fx=300.0, fy=300.0, cx=191.5, cy=127.5)
 REAL = Path(__file__).parents[2].parent / "shared" / "real" / "oak-stereo"
 SIZE = (320, 192)
 IDEAL = LensModel(width=320, height=192, fx=260.0, fy=260.0, cx=159.5, cy=95.5)
@@ -82,13 +82,12 @@ def moved(x: float = 0.0, turn: Sequence[float] = (0.0, 0.0, 0.0), y: float = 0.
     return pose
 
 
-@pytest.mark.parametrize("size", [SIZE, (160, 96)])
-def test_a_rectified_pair_gives_its_depth_back_within_a_disparity_step(size: tuple[int, int]) -> None:
-    stereo = StereoDepth((IDEAL, IDEAL), moved(-0.1), size=size)
+def test_a_rectified_pair_gives_its_depth_back_within_a_disparity_step() -> None:
+    stereo = StereoDepth((IDEAL, IDEAL), moved(-0.1), size=SIZE)
     left, depth = stereo(taken_by(IDEAL, np.eye(4)), taken_by(IDEAL, moved(0.1)))
     errors = step_errors(stereo, depth, truth(stereo.lens, np.eye(4)))
-    assert left.shape == (size[1], size[0], 3)
-    assert (stereo.lens.width, stereo.lens.height) == size
+    assert left.shape == (192, 320, 3)
+    assert (stereo.lens.width, stereo.lens.height) == SIZE
     assert stereo.lens.hfov_deg == pytest.approx(math.degrees(2 * math.atan(160 / 260)), abs=0.5)  # a pixel beyond
     assert np.mean(depth > 0) > 0.75
     assert np.median(errors) < 0.2
@@ -155,23 +154,20 @@ def pair() -> tuple[Image, Image]:
     return taken_by(LEFT_LENS, WORLD_FROM_LEFT), taken_by(RIGHT_LENS, WORLD_FROM_RIGHT)
 
 
-@pytest.mark.parametrize(("shrink", "match_scale", "hfov_deg"), [(1, 2, None), (2, 1, None), (1, 1, 90.0)])
+@pytest.mark.parametrize("shrink", [1, 2])
 def test_an_unrectified_pair_gives_its_depth_through_its_calibration(
-    tmp_path: Path, pair: tuple[Image, Image], shrink: int, match_scale: Any, hfov_deg: float | None
+    tmp_path: Path, pair: tuple[Image, Image], shrink: int
 ) -> None:
     path = written(tmp_path / "calib.json", board())
-    stereo = StereoDepth.from_depthai(path, size=SIZE, match_scale=match_scale, hfov_deg=hfov_deg)
+    stereo = StereoDepth.from_depthai(path, size=SIZE)
     small = (640 // shrink, 400 // shrink)
     left, depth = stereo(*(cv2.resize(each, small, interpolation=cv2.INTER_AREA) for each in pair))
     exact = truth(stereo.lens, rectified_pose())
     errors = step_errors(stereo, depth, exact)
     assert stereo.baseline_m == pytest.approx(0.09003, abs=1e-4)
     assert left.shape == (192, 320, 3)
-    unseen = ~left.any(axis=2)
-    assert (unseen.mean() > 0.01) == (hfov_deg is not None)
-    assert not depth[cv2.erode(unseen.astype(np.uint8), np.ones((3, 3))) > 0].any()
-    assert np.mean(depth[~unseen] > 0) > 0.7
-    assert np.median(errors) < 0.25 / match_scale  # SGBM leans towards whole pixels
+    assert np.mean(depth > 0) > 0.7
+    assert np.median(errors) < 0.25 / shrink
     assert np.mean(errors < 1.0) > 0.95
 
 
@@ -245,28 +241,13 @@ def test_a_real_unrectified_pair_shows_a_floor_and_a_head_at_their_distance() ->
         read, picture = capture.read()
         assert read
         pictures.append(picture)
-    stereo = StereoDepth.from_depthai(REAL / "calib.json", size=(640, 400))
+    stereo = StereoDepth.from_depthai(REAL / "calib.json", size=(384, 256))
     _, depth = stereo(*pictures)
     assert stereo.baseline_m == pytest.approx(0.0738, abs=1e-4)
     assert np.mean(depth > 0) > 0.8
-    floor, head = depth[160:280, 60:240], depth[120:160, 310:350]
+    floor, head = depth[96:168, 36:144], depth[72:96, 186:210]
     assert np.median(floor[floor > 0]) == pytest.approx(2.7, abs=0.15)
     assert np.median(head[head > 0]) == pytest.approx(1.0, abs=0.1)
-
-
-def board_camera(step_cm: float, onward: int) -> dict[str, Any]:
-    return {
-        "width": PAIR_SIZE[0],
-        "height": PAIR_SIZE[1],
-        "cameraType": 0,
-        "intrinsicMatrix": [[FX, 0.0, 191.5], [0.0, FX, 127.5], [0.0, 0.0, 1.0]],
-        "distortionCoeff": [0.0] * 14,
-        "extrinsics": {
-            "rotationMatrix": np.eye(3).tolist(),
-            "translation": {"x": step_cm, "y": 0.0, "z": 0.0},
-            "toCameraSocket": onward,
-        },
-    }
 
 
 @pytest.fixture(scope="module")
@@ -277,8 +258,8 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wall = cv2.normalize(cv2.GaussianBlur(wall, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     write_video(folder / "left.mkv", [np.ascontiguousarray(wall[:, :384])] * 14, 10.0)
     write_video(folder / "right.mkv", [np.ascontiguousarray(wall[:, DISPARITY:])] * 14, 10.0)
-    left, right = board_camera(-100 * BASELINE_M, 2), board_camera(0.0, -1)
-    (folder / "calib.json").write_text(json.dumps({"boardName": "made up", "cameraData": [[1, left], [2, right]]}))
+    left, right = camera_data(FILMED, moved(-BASELINE_M), 2), camera_data(FILMED, moved(), -1)
+    written(folder / "calib.json", {"boardName": "made up", "cameraData": [[1, left], [2, right]]})
     return folder
 
 
@@ -293,4 +274,4 @@ def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(film
     assert source.hfov_deg == lens.hfov_deg
     known = depth[depth > 0]
     assert len(known) > 0.6 * depth.numel()
-    assert float(known.median()) == pytest.approx(FX * BASELINE_M / DISPARITY, rel=0.06)
+    assert float(known.median()) == pytest.approx(FILMED.fx * BASELINE_M / DISPARITY, rel=0.06)
