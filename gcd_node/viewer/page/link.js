@@ -37,7 +37,7 @@ export class Link {
     this.attempts = 0;
     if (typeof data !== "string") {
       const size = new DataView(data).getUint32(0, true);
-      const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, HEAD_BYTES, size)));
+      const head = read(JSON.parse(new TextDecoder().decode(new Uint8Array(data, HEAD_BYTES, size))));
       this.on.picture(head, new Uint8Array(data, HEAD_BYTES + size), this.heard);
       return;
     }
@@ -103,6 +103,14 @@ export class Link {
     if (silentMs > NODE_SILENT_MS) return ["dead", `the node has been silent for ${seconds(silentMs)}: hung, or gone`];
     return ["alive", ""];
   }
+}
+
+// What the page needs of a header of the protocol, beside what the server says of the picture. Times are seconds.
+function read({ header, ...said }) {
+  const [frames, height, width] = header.shape;
+  const { fps_cond: fps, epoch } = header.src;
+  const captured_s = header.t_capture.map(([s, ns]) => s + ns / 1e9);
+  return { ...header, ...said, frames, height, width, fps, epoch, captured_s, rev: header.view_rev };
 }
 
 export function seconds(ms) {

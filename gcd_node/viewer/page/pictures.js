@@ -60,7 +60,7 @@ export class InputPicture {
     if (this.past.length && this.past.at(-1).head.boot_id !== head.boot_id) this.past = [];
     this.past.push({ head, coded: new Blob([bytes], { type: "image/jpeg" }), at });
     while (at - this.past[0].at > REMEMBERED_MS) this.past.shift();
-    element("input-facts").textContent = `${head.source.kind} ${head.source.id}, ${head.source.fps.toFixed(1)} FPS`;
+    element("input-facts").textContent = `${head.src.kind} ${head.src.id}, ${head.src.fps_in.toFixed(1)} FPS`;
   }
 
   // playing: the frame of the view that is on the screen, to find its moment; null if there is none.
