@@ -114,7 +114,8 @@ def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: 
 
     made = Table(title=title, show_header=bool(columns))
     for name in columns:
-        made.add_column(name.removeprefix(">"), justify="right" if name.startswith(">") else "left")
+        side = "right" if name.startswith(">") else "left"
+        made.add_column(name.removeprefix(">"), justify=side, overflow="fold")
     for row in rows:
         made.add_row(*map(str, row))
     return made
