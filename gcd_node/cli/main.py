@@ -114,10 +114,11 @@ def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: 
 
     made = Table(title=title, show_header=bool(columns))
     for name in columns:
-        side = "right" if name.startswith(">") else "left"
-        made.add_column(name.removeprefix(">"), justify=side, overflow="fold")
+        made.add_column(name.removeprefix(">"), justify="right" if name.startswith(">") else "left")
     for row in rows:
         made.add_row(*map(str, row))
+    for column in made.columns:
+        column.overflow = "fold"
     return made
 
 
