@@ -18,7 +18,7 @@ from gcd_model import Traits, hatched
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig, ViewerConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
-from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_animation, write_png, write_video
+from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_png, write_video
 from gcd_node.inference import WindowReport
 from gcd_node.messages import ontology
 from gcd_node.pipeline import Summary
@@ -35,7 +35,6 @@ HEADINGS = ("input: the packaged drive", "view from above", "the same: what is p
 _MOUNT = SourcePose(height_m=1.55, forward_m=1.6, left_m=0.0, tilt_deg=0.0)
 _RECEIVER_TIMEOUT_S = 60.0
 _ROWS = 4
-_PAGE_WIDTH = 1000
 Moment: TypeAlias = tuple[Image, Image, Image, Image]
 """One moment: the camera's picture, the view made of it, the same with what is painted hatched, and its class map."""
 
@@ -77,7 +76,7 @@ def run_open_demo() -> Summary:
 
 
 def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport:
-    """Run it all; writes side_by_side.mp4, .webp and .png into `out`.
+    """Run it all; writes side_by_side.mp4 and .png into `out`.
 
     Raises:
         NodeError: the second process did not come up, or nothing arrived in it.
@@ -105,10 +104,9 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
         seen = {int(path.stem): list(np.load(path)) for path in (received / VIEW_ID / "vis").glob("*.npy")}
     windows = moments(inputs, views, seen, maps)
     shown, classes = [moment for window in windows for moment in window], ontology(models[0])
-    files = video, moving, still = tuple(out / f"side_by_side.{kind}" for kind in ("mp4", "webp", "png"))
+    files = video, still = out / "side_by_side.mp4", out / "side_by_side.png"
     frames = [comparison([moment], classes) for moment in shown]
     write_video(video, frames, summary.fps)
-    write_animation(moving, frames, summary.fps, _PAGE_WIDTH)
     write_png(still, comparison([shown[i] for i in spread(len(shown), _ROWS)], classes))
     return DemoReport(summary=summary, traits=models[0], received=len(windows), files=files)
 
