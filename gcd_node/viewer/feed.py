@@ -1,8 +1,8 @@
 """What a page is sent of a node, and what it may ask: reads the node's sockets as any client, and carries commands.
 
 From the page: one JSON object in a text message, one of Hello, Watch, Ask, Got.
-To the page: JSON objects with a `type` in text messages, and pictures in binary ones: the length of a JSON header as
-a 32-bit little-endian number, that header, and what it describes.
+To the page: JSON objects with a `type` in text messages, and pictures in binary ones: how long it waited here in ms as
+a 32-bit little-endian float, the length of a JSON header as such an integer, that header, and what it describes.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ _KINDS = tuple(kind for kind in get_args(ViewKind) if kind != "frm")
 _QUALITY = 85
 _RETRY_S, _REPLY_S, _SETTLE_S = 2.0, 2.0, 0.05
 _EVENTS = 50
-_LENGTH = struct.Struct("<I")
+_WAITED, _LENGTH = struct.Struct("<f"), struct.Struct("<I")
 _LOG = logging.getLogger(__name__)
 
 
@@ -67,9 +67,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
 
 
 class Got(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag="got"):
-    """The picture of this number is on the screen; more may come."""
-
-    number: Annotated[int, Meta(ge=0, le=2**53)]
+    """The oldest picture on the way has been shown; more may come."""
 
 
 Request: TypeAlias = Hello | Watch | Ask | Got
@@ -92,48 +90,23 @@ def text_message(kind: str, fields: Mapping[str, Any]) -> str:
     return json.dumps({**fields, "type": kind}, allow_nan=False, separators=(",", ":"))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Picture:
-    """A picture message, the same for all browsers but for its number and its age.
+def picture(view: ReceivedView) -> bytes:
+    """What a browser is sent of a view, but for how long it waited: pictures as JPEG; class maps, visibility and
+    deviations packed without loss, depth as grey levels (zlib).
 
-    kind: of the topic, "src" for the input. head: `header` as in the protocol, and the `offsets` of JPEGs. age_ms,
-    left_ms: how old its newest frame was, and how long it could still be used, at `born_s` (monotonic).
+    The header has the topic's `kind` ("src" for the input), the protocol's `header`, the `offsets` of JPEGs, `age_ms`
+    of the newest frame, and `left_ms`, how long it can still be used. Raises MessageError: damaged pixels.
     """
-
-    view: str
-    kind: str
-    head: Mapping[str, Any]
-    payload: bytes
-    age_ms: float
-    left_ms: float
-    born_s: float = field(default_factory=time.monotonic)
-
-    def part(self, number: int, now_s: float) -> bytes:
-        """The binary message, as old as it is now."""
-        since_ms = 1000 * (now_s - self.born_s)
-        ages = {"age_ms": round(self.age_ms + since_ms, 1), "left_ms": round(self.left_ms - since_ms, 1)}
-        fields = {**self.head, "view": self.view, "kind": self.kind, "number": number, **ages}
-        head = text_message("picture", fields).encode()
-        return b"".join((_LENGTH.pack(len(head)), head, self.payload))
-
-
-def picture(view: ReceivedView) -> Picture:
-    """What a browser is sent of a view: pictures as JPEG; class maps, visibility and deviations packed without loss,
-    depth as grey levels (zlib). Raises MessageError: pixels that do not fit the header."""
     header, payload = view.header, view.message.payload
     offsets = header.offsets
     if header.encoding == "rgb8":
         payload, offsets = encode_jpegs(view.images, _QUALITY)
     elif header.encoding != "jpeg":
         payload = zlib.compress(view.colours[..., 0].tobytes() if header.encoding == "invdepth16" else payload, 1)
-    return Picture(
-        view=header.view_id,
-        kind="src" if header.view_id == PREVIEW_ID else kind_of(view.message.topic),
-        head={"header": to_json(header), "offsets": offsets},
-        payload=bytes(payload),
-        age_ms=view.age_ms,
-        left_ms=header.valid_for_ms - (view.age_ms - header.age_ms),
-    )
+    kind = "src" if header.view_id == PREVIEW_ID else kind_of(view.message.topic)
+    ages = {"age_ms": view.age_ms, "left_ms": header.valid_for_ms - (view.age_ms - header.age_ms)}
+    head = json.dumps({"kind": kind, "header": to_json(header), "offsets": offsets, **ages}, allow_nan=False).encode()
+    return b"".join((_LENGTH.pack(len(head)), head, payload))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -231,10 +204,10 @@ class NodeLink:
             while True:
                 if (received := await views.receive_async()) is None:  # the stream's end; another may begin
                     continue
-                shown = await asyncio.to_thread(picture, received)
+                part = await asyncio.to_thread(picture, received)
                 for browser in self.browsers:
                     if view in (browser.view, PREVIEW_ID):
-                        browser.put(f"picture/{view}/{kind}", shown)
+                        browser.put(f"picture/{view}/{kind}", part)
 
     async def _read_notes(self) -> None:
         endpoint = self._node.status
@@ -278,9 +251,9 @@ class Browser:
         self.view: str | None = None
         self._connection, self._link, self._token = connection, link, token
         self._role: Role = "viewer"
-        self._waiting: dict[str, str | Picture] = {}
+        self._waiting: dict[str, tuple[float, str | bytes]] = {}  # since when (monotonic), and what
         self._changed = asyncio.Event()
-        self._sent = self._shown = self._heard = 0
+        self._unseen = self._heard = 0
 
     async def serve(self) -> None:
         """Returns when the browser has gone or was sent away."""
@@ -308,27 +281,29 @@ class Browser:
         except TimeoutError:
             self._connection.transport.abort()
 
-    def put(self, slot: str, what: str | Picture) -> None:
-        """Leave a message; when it gets too much, the oldest is given up."""
-        self._waiting[slot] = what
+    def put(self, slot: str, what: str | bytes) -> None:
+        """Leave a text or a picture; when it gets too much, the oldest is given up."""
+        self._waiting[slot] = time.monotonic(), what
         if len(self._waiting) > MOST_WAITING:
             del self._waiting[next(iter(self._waiting))]
         self._changed.set()
 
-    def shown(self, number: int) -> None:
-        """The browser has shown the picture of this number, and so all before it."""
-        self._shown = max(self._shown, min(number, self._sent))
+    def shown(self) -> None:
+        """The browser has shown a picture."""
+        self._unseen = max(0, self._unseen - 1)
         self._changed.set()
 
     def next_message(self) -> str | bytes | None:
         """What to send now; None while nothing waits, or only pictures and the browser is behind."""
-        room = self._sent - self._shown < MOST_UNSEEN
-        slot = next((slot for slot, each in self._waiting.items() if room or isinstance(each, str)), None)
-        what = None if slot is None else self._waiting.pop(slot)
-        if not isinstance(what, Picture):
+        room = self._unseen < MOST_UNSEEN
+        slot = next((slot for slot, (_, what) in self._waiting.items() if room or isinstance(what, str)), None)
+        if slot is None:
+            return None
+        since_s, what = self._waiting.pop(slot)
+        if isinstance(what, str):
             return what
-        self._sent += 1
-        return what.part(self._sent, time.monotonic())
+        self._unseen += 1
+        return _WAITED.pack(1000 * (time.monotonic() - since_s)) + what
 
     async def _take(self, request: Request) -> None:
         match request:
@@ -342,8 +317,8 @@ class Browser:
                 self._link.read_what_is_watched()
             case Ask() as ask:
                 self.put(f"reply/{ask.id}", await self._link.ask(ask, self._role))
-            case Got(number=number):
-                self.shown(number)
+            case Got():
+                self.shown()
 
     async def _send(self) -> None:
         """Send what waits, and a beat twice a second; who takes nothing for 5 s is cut off."""

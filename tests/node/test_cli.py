@@ -232,6 +232,6 @@ def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_pa
     assert done.returncode == 0, done.stderr
     assert "noise" in done.stdout
     assert "Shown, from left to right: input" in " ".join(done.stdout.split())
-    assert "windows in the other process" in done.stdout
+    assert "pictures in the other process" in done.stdout
     for name in ("side_by_side.mp4", "side_by_side.png"):
         assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000

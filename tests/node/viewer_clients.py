@@ -67,9 +67,9 @@ def hear(feed: ClientConnection, kind: str, holds: Callable[[Any], bool] = lambd
     until_s = time.monotonic() + WAIT_S
     while time.monotonic() < until_s:
         told = feed.recv(WAIT_S)
-        head = json.loads(told) if isinstance(told, str) else taken_apart(told)[0]
+        head = json.loads(told) if isinstance(told, str) else {"type": "picture", **taken_apart(told)[0]}
         if head["type"] == "picture":
-            say(feed, "got", number=head["number"])
+            say(feed, "got")
         if head["type"] == kind and holds(head):
             return head
     raise AssertionError(f"no {kind} came")
@@ -98,8 +98,9 @@ def farewell(feed: ClientConnection) -> int:
 
 
 def taken_apart(part: bytes) -> tuple[Any, bytes]:
-    (size,) = struct.unpack_from("<I", part)
-    return json.loads(part[4 : 4 + size]), part[4 + size :]
+    """Header, with how long it waited, and payload."""
+    waited_ms, size = struct.unpack_from("<fI", part)
+    return {**json.loads(part[8 : 8 + size]), "waited_ms": waited_ms}, part[8 + size :]
 
 
 def raw_feed(viewer: ViewerServer) -> socket.socket:

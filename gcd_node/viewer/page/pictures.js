@@ -125,7 +125,7 @@ export class ViewPicture {
     if (head.kind in this.maps) return this.maps[head.kind].take(head, await unpacked(bytes));
     if (head.kind === "std") return this.std.take(head, await unpacked(bytes));
     const bitmaps = await frames(head, bytes);
-    if (head.view !== this.view) return bitmaps.forEach((each) => each.close());
+    if (head.view_id !== this.view) return bitmaps.forEach((each) => each.close());
     this.next?.bitmaps.forEach((each) => each.close());
     this.next = { head, bitmaps, at, decoded: performance.now() };
   }
