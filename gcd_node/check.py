@@ -12,33 +12,27 @@ import torch
 
 from gcd_client.protocol import ClientError
 from gcd_model import (
-    FAMILIES,
     CheckpointError,
-    ModelConfig,
     ModelError,
-    Schedule,
     Traits,
-    WeightsReport,
     default_precision,
     inspect_weights,
     is_export,
-    load_synthesizer,
     weights_path,
 )
 from gcd_node.auth import load_server_security
-from gcd_node.config import ModelSection, NodeConfig
+from gcd_node.config import NodeConfig
 from gcd_node.errors import ConfigError, NodeError, SourceError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import in_words
 from gcd_node.recorder import RoomError, check_room
-from gcd_node.session import load_model, model_threads, open_session
+from gcd_node.session import load_model, open_session
 from gcd_node.sources import open_source
-from gcd_node.stream_context import StreamContext, drawing_options, family_name, prepare_stream, sampler_in_use
+from gcd_node.stream_context import family_name, prepare_stream
 from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
-_MUCH_MEMORY = 0.7
 _BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 
 
@@ -57,8 +51,8 @@ class _DoubtfulError(Exception):
 
 
 def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator[Finding]:
-    """Look at endpoints, source, weights, memory, views and time, in this order, and where recordings go, if anywhere;
-    each as soon as it is known.
+    """Look at endpoints, source, weights, memory and views, in this order, and where recordings go, if anywhere; each
+    as soon as it is known.
 
     free_memory: bytes, on the model's device; measured if left out. What follows from something that failed is left
         out.
@@ -69,12 +63,10 @@ def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator
         yield _finding("record", look.record)
     yield _finding("source", look.source)
     yield _finding("weights", look.weights)
-    if look.traits is not None:
+    if look.traits is not None and look.weight_bytes:
         yield _finding("memory", partial(look.memory, look.traits))
     if look.traits is not None and look.info is not None:
         yield _finding("views", partial(look.views, look.traits, look.info))
-    if look.context is not None:
-        yield _finding("time", partial(look.time, look.context))
 
 
 def _finding(topic: str, look: Callable[[], str]) -> Finding:
@@ -89,7 +81,7 @@ def _finding(topic: str, look: Callable[[], str]) -> Finding:
 class _Look:
     """Each method looks at one thing and says in words what it is; some leave what others go on from.
 
-    weight_bytes: the weights in the precision they will be used in.
+    weight_bytes: the weights in the precision they will be used in; 0 if they had to be loaded to know.
     """
 
     def __init__(self, config: NodeConfig, free_memory: int | None) -> None:
@@ -97,7 +89,6 @@ class _Look:
         self.info: SourceInfo | None = None
         self.traits: Traits | None = None
         self.weight_bytes = 0
-        self.context: StreamContext | None = None
 
     def endpoints(self) -> str:
         with open_session(self._config) as (_, publisher, control):
@@ -134,21 +125,27 @@ class _Look:
 
     def weights(self) -> str:
         section = self._config.model
-        if section.weights.startswith("random:"):
-            self.traits = load_synthesizer(section.weights, device="cpu").traits.streaming()
+        is_random = section.weights.startswith("random:")
+        if is_random or section.adapter is not None or is_export(weights_path(section.weights)):
+            # Only loading says whether weights and adapter belong together, or onnxruntime takes an export here.
+            traits = load_model(section).traits
+        else:
+            report = inspect_weights(
+                weights_path(section.weights),
+                family=section.family,
+                head_width=section.head_width,
+                image_heads=section.image_heads,
+            )
+            device = section.device
+            if device == "auto":
+                device = "cuda" if torch.cuda.is_available() else "cpu"
+            precision = section.dtype or default_precision(torch.device(device), live=report.family == "live")
+            traits = Traits.of(report, sha256_12=report.sha256_12, precision=precision, device=device)
+            self.weight_bytes = report.parameters * _BYTES.get(precision, 4)
+        self.traits = traits.streaming()
+        if is_random:
             raise _DoubtfulError(f"{section.weights}: these weights are random, so every picture is noise")
-        path = weights_path(section.weights)
-        if is_export(path):  # only loading says whether onnxruntime takes it here
-            traits = self.traits = load_model(section).traits.streaming()
-            self.weight_bytes = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
-            return f"{traits.name}, {traits.precision}, an export of {self.weight_bytes / 1e6:.1f} MB"
-        report = inspect_weights(
-            path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
-        )
-        # Only loading says whether weights and adapter belong together.
-        traits = _traits(report, section) if section.adapter is None else load_model(section).traits
-        self.traits, self.weight_bytes = traits.streaming(), report.parameters * _BYTES.get(traits.precision, 4)
-        return f"{traits.name}, family {family_name(traits)}, {report.parameters / 1e6:.1f} M parameters"
+        return f"{traits.name}, family {family_name(traits)}, {traits.precision}"
 
     def memory(self, traits: Traits) -> str:
         needed, free = self.weight_bytes, self._free_memory
@@ -159,13 +156,11 @@ class _Look:
         line += f"{traits.device if on_gpu else 'cpu'}; what the model needs to compute comes on top and is not counted"
         if needed > free:
             raise CheckpointError(f"{line}. Free some, or use bfloat16 or a smaller model")
-        if needed > _MUCH_MEMORY * free:
-            raise _DoubtfulError(line)
         return line
 
     def views(self, traits: Traits, info: SourceInfo) -> str:
         config = self._config
-        context = self.context = prepare_stream(config, traits, info)
+        context = prepare_stream(config, traits, info)
         VirtualViews(traits).sync(LiveConfig(config).settings(), context.mount)
         frames, names = traits.config.frames, ", ".join(config.view)
         line = f"{names}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {context.fps:g} FPS"
@@ -174,36 +169,3 @@ class _Look:
         if context.ood:
             raise _DoubtfulError(f"{line}; outside what {traits.name} was trained with: {', '.join(context.ood)}")
         return line
-
-    def time(self, context: StreamContext) -> str:
-        config, traits, model = self._config, context.traits, self._config.model
-        frames = traits.config.frames
-        period_s = (config.window.stride or frames) / context.fps
-        if isinstance(traits.config, ModelConfig):
-            runs = Schedule.of(traits.config, drawing_options(model)).evaluations
-        else:
-            runs = sampler_in_use(model, traits).steps * frames
-        runs *= model.samples * len(config.view)
-        unit = "window" if frames > 1 else "frame"
-        return (
-            f"a {unit} every {period_s:.2f} s, {runs} network evaluations each, so {1000 * period_s / runs:.1f} ms for "
-            f"one if none is to be left out; {model_threads(model)} CPU threads"
-        )
-
-
-def _traits(report: WeightsReport, section: ModelSection) -> Traits:
-    """What loading would say of the weights, without loading them."""
-    device = section.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    return Traits(
-        name=report.name,
-        config=report.config,
-        family=None if report.family is None else FAMILIES[report.family],
-        move_time=report.move_time,
-        sha256_12=report.sha256_12,
-        precision=section.dtype or default_precision(torch.device(device), live=report.family == "live"),
-        device=device,
-        trained=report.trained,
-        uncertainty_scale=report.uncertainty_scale,
-    )

@@ -4,9 +4,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -18,7 +17,7 @@ from gcd_model import Traits, hatched
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig, ViewerConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
-from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_animation, write_png, write_video
+from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_png, write_video
 from gcd_node.inference import WindowReport
 from gcd_node.messages import ontology
 from gcd_node.pipeline import Summary
@@ -35,19 +34,8 @@ HEADINGS = ("input: the packaged drive", "view from above", "the same: what is p
 _MOUNT = SourcePose(height_m=1.55, forward_m=1.6, left_m=0.0, tilt_deg=0.0)
 _RECEIVER_TIMEOUT_S = 60.0
 _ROWS = 4
-_PAGE_WIDTH = 1000
 Moment: TypeAlias = tuple[Image, Image, Image, Image]
 """One moment: the camera's picture, the view made of it, the same with what is painted hatched, and its class map."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DemoReport:
-    """How the demo went. traits: of its model. received: windows that arrived in the other process. files: pictures."""
-
-    summary: Summary
-    traits: Traits
-    received: int
-    files: tuple[Path, ...]
 
 
 def demo_config(folder: Path) -> NodeConfig:
@@ -76,14 +64,16 @@ def run_open_demo() -> Summary:
             return run_until_signal(node, publisher)
 
 
-def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport:
-    """Run it all; writes side_by_side.mp4, .webp and .png into `out`.
+def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> tuple[Summary, Traits, int]:
+    """Run it all; writes side_by_side.mp4 and .png into `out`.
 
+    Returns:
+        How it went, the model, and how many pictures arrived in the other process.
     Raises:
         NodeError: the second process did not come up, or nothing arrived in it.
     """
     make_folder(out)  # to know at once
-    inputs: dict[int, list[Image]] = {}
+    inputs: dict[int, Sequence[Image]] = {}
     models: list[Traits] = []
 
     def remember(report: WindowReport) -> None:
@@ -101,16 +91,13 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> DemoReport
             except subprocess.TimeoutExpired as error:
                 hint = "try `gcd-node view` by hand to see why"
                 raise NodeError(f"the receiving process outlives the stream by {error.timeout:g} s; {hint}") from error
-        views, maps = (_pictures(received / VIEW_ID / kind) for kind in (".", "cls"))
-        seen = {int(path.stem): list(np.load(path)) for path in (received / VIEW_ID / "vis").glob("*.npy")}
-    windows = moments(inputs, views, seen, maps)
-    shown, classes = [moment for window in windows for moment in window], ontology(models[0])
-    files = video, moving, still = tuple(out / f"side_by_side.{kind}" for kind in ("mp4", "webp", "png"))
-    frames = [comparison([moment], classes) for moment in shown]
-    write_video(video, frames, summary.fps)
-    write_animation(moving, frames, summary.fps, _PAGE_WIDTH)
-    write_png(still, comparison([shown[i] for i in spread(len(shown), _ROWS)], classes))
-    return DemoReport(summary=summary, traits=models[0], received=len(windows), files=files)
+        shown = list(moments(inputs, received / VIEW_ID))
+    if not shown:
+        raise NodeError("nothing arrived in the receiving process; run `gcd-node -v demo` to see why")
+    classes = ontology(models[0])
+    write_video(out / "side_by_side.mp4", [comparison([moment], classes) for moment in shown], summary.fps)
+    write_png(out / "side_by_side.png", comparison([shown[i] for i in spread(len(shown), _ROWS)], classes))
+    return summary, models[0], len(shown)
 
 
 @contextmanager
@@ -131,37 +118,15 @@ def _receiver(publisher: Publisher, folder: Path) -> Generator[subprocess.Popen[
         process.wait()
 
 
-def _pictures(folder: Path) -> dict[int, list[Image]]:
-    """Frames by window, from the pictures the receiver saved as WINDOW_FRAME.png; empty if it saved none."""
-    windows: dict[int, list[Image]] = {}
-    for path in sorted(folder.glob("*_*.png")):
-        windows.setdefault(int(path.stem.split("_")[0]), []).append(read_picture(path))
-    return windows
-
-
-def moments(
-    inputs: Mapping[int, Sequence[Image]],
-    views: Mapping[int, Sequence[Image]],
-    seen: Mapping[int, Sequence[Image]],
-    maps: Mapping[int, Sequence[Image]],
-) -> list[list[Moment]]:
-    """Frames by window put together, in the order of the windows; those that did not arrive whole are left out.
-
-    seen: visibility u8 [H, W].
-    Raises:
-        NodeError: there is nothing to put together.
-    """
-    windows = [[each.get(window, ()) for each in (inputs, views, seen, maps)] for window in sorted(inputs)]
-    whole = [parts for parts in windows if len({len(part) for part in parts}) == 1]
-    if not whole:
-        raise NodeError("no whole window arrived in the receiving process; run `gcd-node -v demo` to see why")
-    return [
-        [
-            (source, view, hatched(view, visibility), painted)
-            for source, view, visibility, painted in zip(*parts, strict=True)
-        ]
-        for parts in whole
-    ]
+def moments(inputs: Mapping[int, Sequence[Image]], folder: Path) -> Iterator[Moment]:
+    """Input by window beside what `gcd-node view` saved of it; what did not arrive whole is left out."""
+    for window, images in sorted(inputs.items()):
+        for i, image in enumerate(images):
+            name, seen = f"{window:06d}_{i:02d}.png", folder / "vis" / f"{window:06d}.npy"
+            pictures = folder / name, folder / "cls" / name
+            if all(path.is_file() for path in (*pictures, seen)):
+                view, painted = map(read_picture, pictures)
+                yield image, view, hatched(view, np.load(seen)[i]), painted
 
 
 def comparison(shown: Sequence[Moment], classes: Sequence[ClassRecord]) -> Image:

@@ -17,7 +17,6 @@ from gcd_model import hatched
 from gcd_node.errors import OutputError, SourceError
 from gcd_node.frame import Image
 
-_ANIMATION_QUALITY = 60  # WebP's scale of 100
 _LEGEND_WIDTH = 384  # pixels, of saved class maps
 _MOST_BYTES = 2**30  # of all arrays in a file, unfolded
 _COLUMN_WIDTH = 320  # pixels; smaller pictures are enlarged by a whole factor to at least this
@@ -90,20 +89,6 @@ def write_video(path: Path, frames: Iterable[Image], fps: float) -> None:
     writer = VideoWriter(path, fps)
     writer.add(frames)
     writer.close()
-
-
-def write_animation(path: Path, frames: Sequence[Image], fps: float, width: int) -> None:
-    """Write a moving picture that plays for ever where pictures are shown (.webp): lossy, and scaled to `width`. Raises
-    OutputError."""
-    make_folder(path.parent)
-    size = (width, round(frames[0].shape[0] * width / frames[0].shape[1]))
-    animation = cv2.Animation()
-    animation.frames = [
-        cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR) for frame in frames
-    ]
-    animation.durations = [round(1000 / max(fps, 1.0))] * len(frames)
-    quality = [cv2.IMWRITE_WEBP_QUALITY, _ANIMATION_QUALITY]
-    _require_written(path, cv2.imwriteanimation(str(path), animation, quality))
 
 
 def _require_written(path: Path, done: bool) -> None:

@@ -10,11 +10,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, TypeAlias
 
 import msgspec
 import numpy as np
@@ -28,37 +29,14 @@ from gcd_node.cli.main import table
 from gcd_node.cli.run import Changes
 from gcd_node.config import ControlConfig, NodeConfig, ViewerConfig, load_config, parse_config, to_toml
 from gcd_node.errors import NodeError, OutputError, UsageError
-from gcd_node.sources import LIVE_KINDS, FileSource, FolderSource, McapSource, SyntheticSource
+from gcd_node.sources import LIVE_KINDS
 
 _RATES_HZ = (5.0, 10.0, 15.0)
 _FIRST_VIEW_S, _IDLE_S, _END_S, _POLL_S = 180.0, 2.0, 20.0, 0.05
-_CPU_INTERVAL_S = 1.0  # psutil's figure of a shorter interval is noise
 _FEWEST_VIEWS = 3  # jitter is a difference of differences
 _MEBIBYTE = 2**20
 
 Stream: TypeAlias = Annotated[bool, Option("--stream", help="One run alone, at the source's own rate.")]
-
-Pace: TypeAlias = Literal["realtime", "lockstep"]
-
-_ROWS: dict[str, tuple[str, int]] = {
-    "input frames": ("BasicPerformanceMetrics.NUM_FRAMES_SENT", 0),
-    "missed": ("BasicPerformanceMetrics.NUM_MISSED_FRAMES", 0),
-    "views": ("GcdNodeMetrics.NUM_VIEWS", 0),
-    "throughput, frames/s": ("BasicPerformanceMetrics.MEAN_FRAME_RATE", 1),
-    "age of a view on arrival, mean, ms": ("BasicPerformanceMetrics.MEAN_LATENCY", 0),
-    "p50": ("GcdNodeMetrics.P50_LATENCY", 0),
-    "p95": ("GcdNodeMetrics.P95_LATENCY", 0),
-    "p99": ("GcdNodeMetrics.P99_LATENCY", 0),
-    "max": ("BasicPerformanceMetrics.MAX_LATENCY", 0),
-    "jitter, mean, ms": ("BasicPerformanceMetrics.MEAN_JITTER", 0),
-    "jitter, max, ms": ("BasicPerformanceMetrics.MAX_JITTER", 0),
-    "process start to first view, s": ("GcdNodeMetrics.FIRST_VIEW", 1),
-    "CPU of the machine, idle, %": ("ResourceMetrics.BASELINE_OVERALL_CPU_UTILIZATION", 0),
-    "the same over idle while the node runs, %": ("GcdNodeMetrics.CPU_OVER_IDLE", 0),
-    "cores the node used": ("GcdNodeMetrics.CPU_CORES", 2),
-    "peak memory, MiB": ("GcdNodeMetrics.PEAK_MEMORY", 0),
-}
-"""What the table shows: the figure's name, and its decimals."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -87,6 +65,7 @@ def bench(
     """Measure a node in a process of its own: latency, throughput, missed frames, cost.
 
     First as fast as the node can take the input, then at 5, 10 and 15 Hz; or with --stream as the source plays.
+    Latency, jitter and durations are milliseconds, FIRST_VIEW seconds from the start of the process, memory MiB.
     """
     if json_file is not None and not json_file.parent.is_dir():
         raise OutputError(f"cannot write {json_file}: there is no folder {json_file.parent}; make it, or give another")
@@ -96,29 +75,43 @@ def bench(
         settings = parse_config(to_toml(demo_config(Path())).encode(), "the packaged drive", changes or ())
     else:
         settings = load_config(config, changes or ())
-    if not stream and settings.source.kind in (*LIVE_KINDS, "mcap"):
-        raise UsageError(f"the rate of a source of kind {settings.source.kind!r} cannot be chosen; use --stream")
-    with Console(stderr=True).status("idle") as status:
+    kind = settings.source.kind
+    if not stream and kind in (*LIVE_KINDS, "mcap"):
+        raise UsageError(f"the rate of a source of kind {kind!r} cannot be chosen; use --stream")
+    at_rates = {f"{rate:.1f}fps": ("realtime", f"source.fps={rate}") for rate in rates or _RATES_HZ}
+    planned = {"stream": ("realtime",)} if stream else {"as fast as it can": ("lockstep",), **at_rates}
+    runs: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory(prefix="gcd-bench-") as folder, Console(stderr=True).status("idle") as status:
+        launch = Path(folder) / "launch.toml"
+        launch.write_text(to_toml(_alone(settings, folder), secrets=True))
         psutil.cpu_percent()
         time.sleep(_IDLE_S)
-        idle, own_fps = psutil.cpu_percent(), getattr(settings.source, "fps", None)
-        first = "stream" if stream else "as fast as it can"
-        status.update(first)
-        figures = _run(settings, "realtime" if stream else "lockstep", own_fps, seconds, idle)
-        by_rate: dict[float, dict[str, float]] = {}
-        for rate in () if stream else rates or _RATES_HZ:
-            status.update(f"{rate:g} Hz")
-            by_rate[rate] = _run(settings, "realtime", rate, seconds, idle)
-    runs = (figures, *by_rate.values())
-    rows = ((label, *(f"{run[name]:.{decimals}f}" for run in runs)) for label, (name, decimals) in _ROWS.items())
-    Console().print(table(rows, ("", f">{first}", *(f">{rate:g} Hz" for rate in by_rate))))
+        idle = psutil.cpu_percent()
+        for name, (pace, *rate) in planned.items():
+            status.update(name)
+            endless = [] if kind in LIVE_KINDS else ["source.loop=true", f"source.pace={pace}", *rate]
+            runs[name] = _run(launch, endless, seconds, idle)
+    figures = next(iter(runs.values()))
+    rows = ((name.partition(".")[2], *(f"{run[name]:.4g}" for run in runs.values())) for name in figures)
+    Console().print(table(rows, ("", *(f">{name}" for name in runs))))
     if json_file is not None:
-        named = {f"{rate:.1f}fps": run for rate, run in by_rate.items()}
+        named = {name: run for name, run in runs.items() if run is not figures}
         text = msgspec.json.encode({**figures, **named, "metadata": _metadata(settings, idle)})
         try:
             json_file.write_bytes(msgspec.json.format(text, indent=2) + b"\n")
         except OSError as error:
             raise OutputError(f"cannot write {json_file}: {error.strerror}; give another path with --json") from error
+
+
+def _alone(config: NodeConfig, folder: str) -> NodeConfig:
+    """With sockets in a folder of its own and no other way in."""
+    return replace(
+        config,
+        publish=replace(config.publish, data=f"ipc://{folder}/data", status=f"ipc://{folder}/status"),
+        control=ControlConfig(endpoint=None),
+        health=replace(config.health, http=None),
+        viewer=ViewerConfig(),
+    )
 
 
 def view_figures(views: Mapping[str, Sequence[Arrival]]) -> dict[str, float]:
@@ -167,121 +160,74 @@ def _per_second(arrivals: Sequence[Arrival], count: int) -> float:
     return count / (arrivals[-1].at_ns - arrivals[0].at_ns) * 1e9
 
 
-def _run(config: NodeConfig, pace: Pace, fps: float | None, seconds: float, idle: float) -> dict[str, float]:
+def _run(launch: Path, changes: list[str], seconds: float, idle: float) -> dict[str, float]:
     """One process of a node, from its start until it has been watched for `seconds` after its first view."""
-    with tempfile.TemporaryDirectory(prefix="gcd-bench-") as folder:
-        node = _Node(_bench_config(config, folder, pace, fps), Path(folder))
+    config, closed, said = load_config(launch), threading.Event(), launch.with_name("stderr")
+    views: dict[str, list[Arrival]] = {view: [] for view in config.view}
+    command = [sys.executable, "-m", "gcd_node", "run", str(launch)]
+    command += [word for change in changes for word in ("--set", change)]
+    with ThreadPoolExecutor(len(views)) as pool, said.open("wb") as stderr:
+        readers = [pool.submit(_read, config.publish.data, view, found, closed) for view, found in views.items()]
+        started_s = time.monotonic()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr)  # noqa: S603
+
+        def check() -> None:
+            """Raises NodeError if the node has ended, and what ended a reader."""
+            if (code := process.poll()) is not None:
+                lines = said.read_text(errors="replace").strip().splitlines()
+                raise NodeError(f"the node ended with {code}: {lines[-1] if lines else 'without a word'}")
+            for reader in readers:
+                if reader.done():
+                    reader.result()
+            time.sleep(_POLL_S)
+
         try:
-            until_s = time.monotonic() + _FIRST_VIEW_S
-            while not all(node.arrivals.values()):
-                node.require_alive()
-                if time.monotonic() > until_s:
+            while not all(views.values()):
+                check()
+                if time.monotonic() > started_s + _FIRST_VIEW_S:
                     raise NodeError(f"no view of each kind within {_FIRST_VIEW_S:g} s; see what `gcd-node check` says")
-                time.sleep(_POLL_S)
-            first_ns = max(arrivals[0].at_ns for arrivals in node.arrivals.values())
-            cost = _watch(node, seconds, idle)
+            first_ns = max(found[0].at_ns for found in views.values())
+            cost = _cost(psutil.Process(process.pid), check, seconds, idle)
         except psutil.Error as error:
-            node.require_alive()
             raise NodeError(f"the node's process cannot be measured: {error}") from error
         finally:
-            node.close()
-    later = {view: [one for one in arrivals if one.at_ns > first_ns] for view, arrivals in node.arrivals.items()}
-    return view_figures(later) | {"GcdNodeMetrics.FIRST_VIEW": (first_ns - node.started_ns) / 1e9} | cost
+            closed.set()
+            process.terminate()
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+    later = {view: [each for each in found if each.at_ns > first_ns] for view, found in views.items()}
+    return view_figures(later) | {"GcdNodeMetrics.FIRST_VIEW": first_ns / 1e9 - started_s} | cost
 
 
-def _bench_config(config: NodeConfig, folder: str, pace: Pace, fps: float | None) -> NodeConfig:
-    """The launch file of one run: endless, with sockets in a folder of its own and no other way in."""
-    source = config.source
-    if isinstance(source, SyntheticSource):
-        source = replace(source, pace=pace, fps=source.fps if fps is None else fps, frames=None)
-    elif isinstance(source, FileSource | FolderSource):
-        source = replace(source, pace=pace, fps=source.fps if fps is None else fps, loop=True)
-    elif isinstance(source, McapSource):
-        source = replace(source, pace=pace, loop=True)
-    return replace(
-        config,
-        source=source,
-        publish=replace(config.publish, data=f"ipc://{folder}/data", status=f"ipc://{folder}/status"),
-        control=ControlConfig(endpoint=None),
-        health=replace(config.health, http=None),
-        viewer=ViewerConfig(),
-    )
+def _read(endpoint: str, view: str, found: list[Arrival], closed: threading.Event) -> None:
+    def note(received: ReceivedView) -> None:
+        seqs = received.header.src.seq
+        found.append(Arrival(at_ns=time.monotonic_ns(), age_ms=received.age_ms, seqs=seqs))
+
+    with ViewSubscriber(endpoint, view, conflate=False) as views:
+        views.run(note, closed)
 
 
-def _watch(node: "_Node", seconds: float, idle: float) -> dict[str, float]:
-    """What the node's process and the whole machine use for so long."""
-    begun_s = sampled_s = time.monotonic()
-    process = psutil.Process(node.process.pid)
-    before = process.cpu_times()
+def _cost(process: psutil.Process, check: Callable[[], None], seconds: float, idle: float) -> dict[str, float]:
+    """What the node's process and the whole machine use for so long; the machine's share by the second."""
+    begun_s, before, peak_bytes = time.monotonic(), process.cpu_times(), 0
     busy: list[float] = []
-    peak_bytes = 0
     psutil.cpu_percent()
-    while (now_s := time.monotonic()) < begun_s + seconds:
-        node.require_alive()
+    while time.monotonic() < begun_s + seconds:
+        check()
         peak_bytes = max(peak_bytes, process.memory_info().rss)
-        if now_s - sampled_s >= _CPU_INTERVAL_S:
+        if time.monotonic() >= begun_s + len(busy) + 1:
             busy.append(psutil.cpu_percent())
-            sampled_s = now_s
-        time.sleep(_POLL_S)
-    busy = busy or [psutil.cpu_percent()]
-    after = process.cpu_times()
-    return {
-        "ResourceMetrics.BASELINE_OVERALL_CPU_UTILIZATION": idle,
-        "ResourceMetrics.MEAN_OVERALL_CPU_UTILIZATION": float(np.mean(busy)),
-        "ResourceMetrics.MIN_OVERALL_CPU_UTILIZATION": min(busy),
-        "ResourceMetrics.MAX_OVERALL_CPU_UTILIZATION": max(busy),
-        "ResourceMetrics.STDDEV_OVERALL_CPU_UTILIZATION": float(np.std(busy)),
+    after, took_s = process.cpu_times(), time.monotonic() - begun_s
+    overall = {"BASELINE": idle, "MEAN": np.mean(busy), "MIN": min(busy), "MAX": max(busy), "STDDEV": np.std(busy)}
+    figures = {f"ResourceMetrics.{name}_OVERALL_CPU_UTILIZATION": float(share) for name, share in overall.items()}
+    return figures | {
         "GcdNodeMetrics.CPU_OVER_IDLE": float(np.mean(busy)) - idle,
-        "GcdNodeMetrics.CPU_CORES": (after.user + after.system - before.user - before.system) / (now_s - begun_s),
+        "GcdNodeMetrics.CPU_CORES": (after.user + after.system - before.user - before.system) / took_s,
         "GcdNodeMetrics.PEAK_MEMORY": peak_bytes / _MEBIBYTE,
     }
-
-
-class _Node:
-    """`gcd-node run` in a process, and a thread for each view that notes when it arrives."""
-
-    def __init__(self, config: NodeConfig, folder: Path) -> None:
-        launch, self._stderr = folder / "launch.toml", folder / "stderr"
-        launch.write_text(to_toml(config, secrets=True))
-        self.arrivals: dict[str, list[Arrival]] = {view: [] for view in config.view}
-        self._closed, self._error = threading.Event(), None
-        self._readers = [threading.Thread(target=self._read, args=(config.publish.data, view)) for view in config.view]
-        for reader in self._readers:
-            reader.start()
-        self.started_ns = time.monotonic_ns()
-        with self._stderr.open("wb") as stderr:
-            command = [sys.executable, "-m", "gcd_node", "run", str(launch)]
-            self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr)  # noqa: S603
-
-    def require_alive(self) -> None:
-        """Raises NodeError if the node has ended, and what ended a reader."""
-        if (code := self.process.poll()) is not None:
-            lines = self._stderr.read_text(errors="replace").strip().splitlines()
-            raise NodeError(f"the node ended with {code}: {lines[-1] if lines else 'without a word'}")
-        if self._error is not None:
-            raise self._error
-
-    def close(self) -> None:
-        """End the process and the readers."""
-        self._closed.set()
-        self.process.terminate()
-        try:
-            self.process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-        for reader in self._readers:
-            reader.join()
-
-    def _read(self, endpoint: str, view: str) -> None:
-        def note(found: ReceivedView) -> None:
-            now_ns, seqs = time.monotonic_ns(), found.header.src.seq
-            self.arrivals[view].append(Arrival(at_ns=now_ns, age_ms=found.age_ms, seqs=seqs))
-
-        try:
-            with ViewSubscriber(endpoint, view, conflate=False) as views:
-                views.run(note, self._closed)
-        except Exception as error:  # the end of a thread: require_alive() raises it
-            self._error = error
 
 
 def _metadata(config: NodeConfig, idle: float) -> dict[str, object]:

@@ -117,6 +117,8 @@ def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: 
         made.add_column(name.removeprefix(">"), justify="right" if name.startswith(">") else "left")
     for row in rows:
         made.add_row(*map(str, row))
+    for column in made.columns:
+        column.overflow = "fold"
     return made
 
 

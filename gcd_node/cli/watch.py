@@ -9,17 +9,15 @@ import sys
 import threading
 import time
 import webbrowser
-from collections import deque
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import typer
-from rich import box
-from rich.console import Console, Group
+from rich.console import Console, RenderableType
 from rich.live import Live
-from rich.styled import Styled
 from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
@@ -28,6 +26,7 @@ from gcd_client.endpoints import resolve_endpoint
 from gcd_client.protocol import MessageError, StatusMessage
 from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
 from gcd_node.cli.control import KeyFolder, NodeKey, client_keys
+from gcd_node.cli.main import table
 from gcd_node.errors import StaleError
 from gcd_node.health import Level
 
@@ -39,16 +38,7 @@ _RATE_SPAN = 10
 _EVENTS = 8
 _LONGEST = 60
 _STYLES = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "magenta"}
-_VIEW_STYLES = {"live": "green", "expired": "yellow", "ended": "dim"}
 _TITLE = "Virtual views: generated pixels, never evidence of free space"
-_SECTIONS = {
-    "source": "state, fps FPS, last_frame_age_ms ms ago, reconnects reconnects, corrupt corrupt, dropped dropped",
-    "window": "built built, rejected rejected, skipped skipped",
-    "model": "state, ms_p50 ms p50, ms_p99 ms p99, gpu_mem_mb MB, oom_count out of memory, nan_windows NaN",
-    "publish": "sent sent, subs subscribed, bytes B, dropped dropped",
-    "rec": "state, file, bytes B",
-}
-"""What the status table shows: of each section its fields, each with what follows its value."""
 
 Endpoint: TypeAlias = Annotated[str, Argument(metavar="ENDPOINT", help="ipc, ipc://PATH or tcp://HOST:PORT.")]
 Status: TypeAlias = Annotated[str, Option("--status", help="Its status endpoint.")]
@@ -77,33 +67,29 @@ def view(
     if hatch and kind not in ("win", "all"):
         raise typer.BadParameter("--hatch is for windows: --kind win or all")
     kinds = None if kind == "all" else ("win", "vis") if hatch else kind
-    keys, console, table, damaged = client_keys(key_folder, node_key), Console(markup=False), ViewTable(), 0
+    where, shown, damaged, saver = resolve_endpoint(endpoint, "data"), ViewTable(), 0, None
+    console, patience_s = Console(markup=False), math.inf if timeout is None else timeout
     with ExitStack() as stack:
-        saver = None
         if save is not None:
             from gcd_node.image_io import ViewSaver  # takes seconds, in which a subscriber would lose views
 
             saver = stack.enter_context(ViewSaver(save, hatch=hatch))
+        keys = client_keys(key_folder, node_key)
         views = stack.enter_context(ViewSubscriber(endpoint, name, kinds, conflate=False, keys=keys))
-        live = stack.enter_context(Live(console=console, auto_refresh=False)) if console.is_terminal else None
-        if live is None:  # the last picture of it, also after Ctrl-C
-            stack.callback(lambda: console.print(table.render(time.monotonic(), ended=views.ended, endpoint=endpoint)))
-        patience_s = math.inf if timeout is None else timeout
+        live = stack.enter_context(_live(console, lambda: shown.render(where, ended=views.ended)))
         until_s = time.monotonic() + patience_s
         while not (views.ended or views.received >= (limit or math.inf) or time.monotonic() >= until_s):
             received = views.receive(_REFRESH_MS)
             if received is not None:
                 until_s = time.monotonic() + patience_s
-                table.add(received, time.monotonic())
+                shown.add(received, time.monotonic())
                 try:
                     if saver is not None:
                         saver.add(received)
                 except MessageError:  # its pixels
                     damaged += 1
-            if live is not None:
-                live.update(table.render(time.monotonic(), ended=views.ended, endpoint=endpoint), refresh=True)
+            live.refresh()
     if timeout is not None and views.received == 0 and not views.ended:
-        where = resolve_endpoint(endpoint, "data")
         raise StaleError(f"no view from {where} within {timeout:g} s: is the node running, and has it such a view?")
     ending = "the stream ended" if views.ended else "stopped"
     files = 0 if saver is None else saver.files
@@ -129,27 +115,29 @@ def status(
     with ExitStack() as stack:
         notes = stack.enter_context(StatusSubscriber(endpoint, keys=client_keys(key_folder, node_key)))
         live = None
-        if console.is_terminal and not once and not as_json:
-            live = stack.enter_context(Live(console=console, auto_refresh=False))
-        while True:
+        if not once and not as_json:
+            live = stack.enter_context(_live(console, lambda: board.render(time.monotonic(), where)))
+        while not once or board.stale(time.monotonic()):
             note = notes.receive(_REFRESH_MS)
-            now_s = time.monotonic()
             if note is not None:
-                board.add(note, now_s, time.time_ns())
-            if once and board.stale(now_s):
-                if now_s > until_s:
-                    raise StaleError(_silence(board, now_s, where, timeout))
-            elif as_json and once:
-                typer.echo(json.dumps({"topic": "status", **board.record(now_s)}))
-            elif as_json and note is not None:
+                board.add(note, time.monotonic(), time.time_ns())
+            if live is not None:
+                live.refresh()
+            elif once and time.monotonic() > until_s and board.stale(time.monotonic()):
+                question = "is the node running, and is this the status endpoint of its [publish]?"
+                raise StaleError(f"no status from {where} within {timeout:g} s: {question}")
+            elif not once and note is not None:
                 origin = {"node_id": note.header.node_id, "boot_id": note.header.boot_id}
                 typer.echo(json.dumps({"topic": note.topic, **note.fields, **origin}))
-            elif live is not None:
-                live.update(board.render(now_s, where), refresh=True)
-            elif not as_json and (once or (note is not None and note.topic == "status")):  # into a file or a pipe
-                console.print(board.render(now_s, where))
-            if once and not board.stale(now_s):
-                return
+    if as_json:
+        typer.echo(json.dumps({"topic": "status", **board.record(time.monotonic())}))
+    else:
+        console.print(board.render(time.monotonic(), where))
+
+
+def _live(console: Console, draw: Callable[[], RenderableType]) -> Live:
+    """Drawn anew at every refresh(); into a file or a pipe once, at the end."""
+    return Live(get_renderable=draw, console=console, auto_refresh=False)
 
 
 def viewer(
@@ -171,9 +159,8 @@ def viewer(
         threading.Thread(target=lambda: (sys.stdin.buffer.read(), ended.set()), daemon=True).start()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: ended.set())
-    control_endpoint = None if control == "none" else control
-    node = NodeEndpoints(data=data, status=status_endpoint, control=control_endpoint, keys=keys)
-    with ViewerServer(http, node) as server:
+    commands = None if control == "none" else control
+    with ViewerServer(http, NodeEndpoints(data=data, status=status_endpoint, control=commands, keys=keys)) as server:
         typer.echo(f"page {server.operator_url}", err=True)  # nowhere else is the token shown
         if show and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
             webbrowser.open(server.operator_url)
@@ -186,49 +173,34 @@ class ViewTable:
     def __init__(self) -> None:
         self._newest: dict[str, ReceivedView] = {}
         self._arrivals: dict[str, deque[float]] = {}
-        self._missed: dict[str, int] = {}
-        self._bytes: dict[str, int] = {}
+        self._missed: Counter[str] = Counter()
 
     def add(self, view: ReceivedView, now_s: float) -> None:
         """A message that arrived now."""
         topic = view.message.topic
         self._newest[topic] = view
         self._arrivals.setdefault(topic, deque(maxlen=_RATE_SPAN)).append(now_s)
-        self._missed[topic] = self._missed.get(topic, 0) + view.skipped
-        self._bytes[topic] = self._bytes.get(topic, 0) + len(view.message.payload)
+        self._missed[topic] += view.skipped
 
-    def rows(self, now_s: float, *, ended: bool = False) -> list[tuple[str, ...]]:
-        """By topic: window, shape, age in ms, messages a second, messages missed, MB received, and the state, with what
-        lies outside the model's training."""
-        rows: list[tuple[str, ...]] = []
+    def rows(self, now_s: float, *, ended: bool) -> Iterator[tuple[str, ...]]:
+        """By topic: window, shape, age in ms, messages a second, messages missed, and the state, with what lies outside
+        the model's training."""
         for topic, newest in sorted(self._newest.items()):
             header, arrivals = newest.header, self._arrivals[topic]
-            since_ms = (now_s - arrivals[-1]) * 1000
-            expired = newest.expired or since_ms > header.valid_for_ms
-            span_s = arrivals[-1] - arrivals[0]
+            since_ms, span_s = 1000 * (now_s - arrivals[-1]), arrivals[-1] - arrivals[0]
             rate_hz = (len(arrivals) - 1) / span_s if span_s > 0 else 0.0
-            numbers = (f"{newest.age_ms + since_ms:.0f}", f"{rate_hz:.2f}", str(self._missed[topic]))
-            shape, megabytes = "x".join(map(str, header.shape)), f"{self._bytes[topic] / 1e6:.1f}"
+            expired = newest.expired or since_ms > header.valid_for_ms
             state = "ended" if ended else "expired" if expired else "live"
-            state = ", ".join((state, *header.quality.ood))
-            rows.append((topic, str(header.window_id), shape, *numbers, megabytes, state))
-        return rows
+            shape, age = "x".join(map(str, header.shape)), f"{newest.age_ms + since_ms:.0f}"
+            figures = (age, f"{rate_hz:.2f}", str(self._missed[topic]))
+            yield topic, str(header.window_id), shape, *figures, ", ".join((state, *header.quality.ood))
 
-    def render(self, now_s: float, *, ended: bool = False, endpoint: str = "") -> Table | Text:
-        """For rich. endpoint: named while nothing has come."""
-        rows = self.rows(now_s, ended=ended)
-        if not rows and not ended:
-            return Text(f"no view yet from {_shown(resolve_endpoint(endpoint, 'data'))}: is the node running?")
-        table = Table(title=_TITLE, title_style="dim", box=box.SIMPLE_HEAD, show_edge=False, min_width=len(_TITLE))
-        table.padding = (0, 1, 0, 0)
-        for name in ("topic", "window", "shape", "age ms", "rate Hz", "missed", "MB", "state"):
-            left = name in ("topic", "state")
-            table.add_column(
-                name, justify="left" if left else "right", no_wrap=name not in ("topic", "state"), overflow="fold"
-            )
-        for row in rows:
-            table.add_row(*row[:-1], Text(row[-1], style=_VIEW_STYLES.get(row[-1], "yellow")))
-        return table
+    def render(self, where: str, *, ended: bool) -> Table | Text:
+        """For rich. where: the endpoint, named while nothing has come."""
+        if not self._newest and not ended:
+            return Text(f"no view yet from {_shown(where)}: is the node running?")
+        columns = ("topic", ">window", ">shape", ">age ms", ">rate Hz", ">missed", "state")
+        return table(self.rows(time.monotonic(), ended=ended), columns, _TITLE)
 
 
 class StatusBoard:
@@ -236,31 +208,22 @@ class StatusBoard:
     holds was written by others: fields may be missing or of any type."""
 
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
-        self._stale_after_s, self._heard_s, self._boot_id = stale_after_s, 0.0, ""
+        self._stale_after_s, self._heard_s = stale_after_s, 0.0
         self._status: StatusMessage | None = None
         self._events: deque[tuple[float, Mapping[str, Any]]] = deque(maxlen=_EVENTS)
-        self.restarts = 0
 
     def add(self, note: StatusMessage, now_s: float, wall_ns: int) -> None:
         """A note arrived. wall_ns: the wall clock now; the first status may be one that was kept for late readers, and
         is as old as its stamp says."""
-        if self._boot_id not in ("", note.header.boot_id):
-            self._status, self.restarts = None, self.restarts + 1
-        self._boot_id = note.header.boot_id
         if note.topic == "status":
             kept_s = 0.0 if self._status is not None else max(0.0, (wall_ns - note.header.t_publish_ns) / 1e9)
             self._status, self._heard_s = note, now_s - kept_s
         elif note.topic == "event":
             self._events.append((now_s, note.fields))
 
-    def silent_s(self, now_s: float) -> float | None:
-        """Since the last status; None before the first."""
-        return None if self._status is None else max(0.0, now_s - self._heard_s)
-
     def stale(self, now_s: float) -> bool:
         """Whether the node has been silent for too long, or was never heard."""
-        silent_s = self.silent_s(now_s)
-        return silent_s is None or silent_s > self._stale_after_s
+        return self._status is None or now_s - self._heard_s > self._stale_after_s
 
     def level(self, now_s: float) -> Level:
         """As the node said, or STALE."""
@@ -271,90 +234,38 @@ class StatusBoard:
         now = {"level": int(self.level(now_s)), "stale": self.stale(now_s)}
         if self._status is None:
             return now
-        header, age_ms = self._status.header, round(1000 * (self.silent_s(now_s) or 0.0))
+        header, age_ms = self._status.header, round(1000 * (now_s - self._heard_s))
         return {**self._status.fields, "node_id": header.node_id, "boot_id": header.boot_id, "age_ms": age_ms, **now}
 
-    def render(self, now_s: float, endpoint: str = "") -> Group:
-        """For rich: a headline, the sections, the stages and the latest events; dim where they no longer hold.
-        endpoint: named while nothing has come."""
-        fields = {} if self._status is None else self._status.fields
-        parts = [_sections(fields), *([_stages(stages)] if (stages := _mapping(fields.get("stages"))) else [])]
-        if self._events:
-            parts.append(self._event_table(now_s))
-        dim = "dim" if self.stale(now_s) else ""
-        return Group(self._headline(now_s, endpoint), *(Styled(part, dim) for part in parts if part.row_count))
-
-    def _headline(self, now_s: float, endpoint: str) -> Text:
+    def render(self, now_s: float, where: str = "") -> Table | Text:
+        """For rich: the level, every field of the status under its name, and the latest events. where: the endpoint,
+        named while nothing has come."""
         level = self.level(now_s)
-        line = Text.assemble((f" {level.name} ", f"reverse {_STYLES[level]}"))
         if self._status is None:
-            where = f" from {_shown(endpoint)}" if endpoint else ""
-            return line.append(f" no status yet{where}: is the node running?")
-        fields = self._status.fields
-        state, reasons = _shown(fields.get("state", "?")), _shown(", ".join(_codes(fields.get("reasons"))))
-        line.append(f" {_shown(self._status.header.node_id)}", style="bold")
-        if self.stale(now_s):
-            line.append(f"  silent for {self.silent_s(now_s) or 0.0:.0f} s", style=_STYLES[level])
-            line.append(f"  before: {state}{f', {reasons}' if reasons else ''}", style="dim")
-        else:
-            missing = _shown(", ".join(_codes(fields.get("not_ready"))))
-            line.append(f"  {state}")
-            line.append("  ready" if fields.get("ready") is True else f"  not ready: {missing}", style="dim")
-            line.append(f"  {reasons}" if reasons else "", style=_STYLES[level])
-        return line.append(f"  restarted {self.restarts} times" if self.restarts else "", style="dim")
-
-    def _event_table(self, now_s: float) -> Table:
-        table = Table.grid(padding=(0, 2))
+            return Text(f"no status yet from {_shown(where)}: is the node running?", _STYLES[level])
+        node, grid = _shown(self._status.header.node_id), Table.grid(padding=(0, 2))
+        silence = f"  silent for {now_s - self._heard_s:.0f} s" if self.stale(now_s) else ""
+        grid.add_row(Text(level.name, _STYLES[level]), Text(node + silence))
+        for name, text in _facts(self._status.fields):
+            grid.add_row(Text(name, "bold"), Text(text))
         for heard_s, fields in reversed(self._events):
-            code, style = _shown(fields.get("code", "?")), _STYLES[_level(fields.get("level"))]
-            details = {key: value for key, value in fields.items() if key not in ("code", "level")}
-            table.add_row(Text(f"{now_s - heard_s:.0f} s ago", style="dim"), Text(code, style=style), _pairs(details))
-        return table
+            style = _STYLES[_level(fields.get("level"))]
+            grid.add_row(Text(f"{now_s - heard_s:.0f} s ago", "dim"), Text(_pairs(fields), style))
+        return grid
 
 
-def _silence(board: StatusBoard, now_s: float, where: str, timeout_s: float) -> str:
-    silent_s = board.silent_s(now_s)
-    last = "" if silent_s is None else f"; its last one is {silent_s:.0f} s old"
-    question = "is the node running, and is this the status endpoint of its [publish]?"
-    return f"no status from {where} within {timeout_s:g} s{last}: {question}"
+def _facts(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """A line for the plain values of a mapping, and lines of their own for each mapping in it."""
+    pending = [("node", fields)]
+    for name, mapping in pending:
+        nested = {key: value for key, value in mapping.items() if isinstance(value, Mapping)}
+        pending += nested.items()
+        if text := _pairs({key: value for key, value in mapping.items() if key not in nested}):
+            yield _shown(name), text
 
 
-def _sections(fields: Mapping[str, Any]) -> Table:
-    table = Table.grid(padding=(0, 2))
-    for name, columns in _SECTIONS.items():
-        section, keys = _mapping(fields.get(name)), (column.partition(" ") for column in columns.split(", "))
-        shown = [f"{_shown(section[key])}{space}{unit}" for key, space, unit in keys if section.get(key) is not None]
-        if shown:
-            table.add_row(Text(name, style="bold"), Text(", ".join(shown)))
-    last_ms = {name: _mapping(view).get("last_ms") for name, view in _mapping(fields.get("views")).items()}
-    views = {name: "never" if ms is None else f"{_shown(ms)} ms ago" for name, ms in last_ms.items()}
-    faults = _mapping(_mapping(fields.get("window")).get("reason_counts"))
-    for name, pairs in (("faults", faults), ("views", views), ("drops", _mapping(fields.get("drops")))):
-        if pairs:
-            table.add_row(Text(name, style="bold"), _pairs(pairs))
-    return table
-
-
-def _stages(stages: Mapping[str, Any]) -> Table:
-    table = Table(title="how long each stage takes, last minute", title_style="dim", title_justify="left")
-    for name in ("stage", "p50 ms", "p99 ms", "count"):
-        table.add_column(name, justify="left" if name == "stage" else "right", no_wrap=True)
-    for name, stage in stages.items():
-        figures = (_mapping(stage).get(key, "-") for key in ("p50_ms", "p99_ms", "count"))
-        table.add_row(Text(_shown(name)), *(Text(_shown(figure)) for figure in figures))
-    return table
-
-
-def _pairs(pairs: Mapping[str, Any]) -> Text:
-    return Text(", ".join(f"{_shown(key)} {_shown(value)}" for key, value in pairs.items()))
-
-
-def _mapping(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
-
-
-def _codes(value: object) -> list[str]:
-    return [each for each in value if isinstance(each, str)] if isinstance(value, list) else []
+def _pairs(pairs: Mapping[str, Any]) -> str:
+    return ", ".join(f"{_shown(key)} {_shown(value)}" for key, value in pairs.items() if value not in (None, []))
 
 
 def _level(value: object) -> Level:
@@ -367,6 +278,6 @@ def _level(value: object) -> Level:
 
 def _shown(value: object) -> str:
     """A foreign value on one line: no control characters, not too long."""
-    text = f"{value:.1f}" if isinstance(value, float) else str(value)
+    text = " ".join(map(str, value)) if isinstance(value, list) else str(value)
     text = "".join(char if char.isprintable() else "?" for char in text)
     return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."

@@ -1,15 +1,16 @@
 """`gcd-node weights`: look into checkpoints, convert them."""
 
+from dataclasses import astuple, fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
+import msgspec
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option, Typer
 
-from gcd_model import ModelConfig, WeightsReport, convert_weights, inspect_weights, weights_path
+from gcd_model import WeightsReport, convert_weights, inspect_weights, weights_path
 from gcd_node.cli.main import progress_bar, table
 
 weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
@@ -86,58 +87,11 @@ def convert(
 
 
 def _show(console: Console, report: WeightsReport) -> None:
-    console.print(_facts(report))
-    rows = (
-        (each.name, f"{each.parameters:,}", each.tensors, ", ".join(each.dtypes), _mb(each.size))
-        for each in report.networks
-    )
-    console.print(table(rows, ("network", ">parameters", ">tensors", "stored as", ">MB"), "Used"))
-    left_out: list[tuple[object, ...]] = [(each.kind, each.tensors, _mb(each.size)) for each in report.leftovers]
-    if report.optimizer_size:
-        left_out.append(("optimizer state, never read", "", _mb(report.optimizer_size)))
-    if report.other_entries and left_out:
-        left_out.append((f"other entries: {', '.join(report.other_entries)}", "", ""))
-    if left_out:
-        console.print(table(left_out, ("what", ">tensors", ">MB"), "Left out"))
-
-
-def _facts(report: WeightsReport) -> Table:
-    config = report.config
-    family = "unknown: no limits are checked, --motion-bucket must be given"
-    if report.family is not None:
-        family = f"{report.family} (told by {report.told_by})"
-    path = "direct" if report.move_time == 0 else f"the goal is reached in frame {report.move_time}"
-    scale = "not measured"
-    if report.uncertainty_scale is not None:
-        scale = f"{report.uncertainty_scale:.3g}: the deviation over samples times this is calibrated"
-    rows = (
-        ("layout", report.layout),
-        ("family", family),
-        ("camera control", config.camera),
-        ("trajectory", path),
-        ("frames, trained size", f"{config.frames}, {config.width}x{config.height}"),
-        *_widths(report),
-        ("parameters used", f"{report.parameters:,}"),
-        ("size on disk", f"{_mb(report.size)} MB"),
-        ("digest", report.digest),
-        ("trained", "yes" if report.trained else "no: random weights"),
-        ("uncertainty scale", scale),
-    )
-    return table(rows, title=report.path)
-
-
-def _widths(report: WeightsReport) -> tuple[tuple[str, str], ...]:
-    config = report.config
-    if not isinstance(config, ModelConfig):
-        depth, paint = (", ".join(map(str, each.widths)) for each in (config.depth, config.paint))
-        return ("depth widths", depth), ("paint widths", paint), ("paint steps", str(config.steps))
-    tower = config.image_encoder
-    heads = "no image tower" if tower is None else str(tower.heads)
-    return (
-        ("U-Net widths", ", ".join(map(str, config.unet.widths))),
-        ("head width, image heads", f"{config.unet.head_width}, {heads}"),
-    )
-
-
-def _mb(size: int) -> str:
-    return f"{size / 1e6:,.1f}"
+    """All that is known, by its names in WeightsReport; sizes are bytes."""
+    facts = {each.name: getattr(report, each.name) for each in fields(report)}
+    networks, leftovers, config = (facts.pop(name) for name in ("networks", "leftovers", "config"))
+    facts |= {"parameters": f"{report.parameters:,}", "config": msgspec.json.encode(config).decode()}
+    console.print(table(facts.items()))
+    console.print(table(map(astuple, networks), ("network", ">parameters", ">tensors", "stored as", ">bytes"), "Used"))
+    if leftovers:
+        console.print(table(map(astuple, leftovers), ("what", ">tensors", ">bytes"), "Left out"))

@@ -1,43 +1,48 @@
 """What a page is sent of a node, and what it may ask: reads the node's sockets as any client, and carries commands.
 
 From the page: one JSON object in a text message, one of Hello, Watch, Ask, Got.
-To the page: JSON objects with a `type` in text messages, and pictures in binary ones: the length of a JSON header as
-a 32-bit little-endian number, that header, and what it describes.
+To the page: JSON objects with a `type` in text messages, and pictures in binary ones: how long it waited here in ms as
+a 32-bit little-endian float, the length of a JSON header as such an integer, that header, and what it describes.
 """
 
 import asyncio
 import contextlib
 import json
 import logging
+import secrets
 import struct
 import time
 import zlib
-from collections import OrderedDict, deque
-from collections.abc import Generator, Mapping
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final, TypeAlias, get_args
+from typing import Annotated, Any, TypeAlias, get_args
 
 import msgspec
 from msgspec import Meta
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
 
 from gcd_client.control import Code, ControlClient, ControlError, Reply
 from gcd_client.endpoints import AuthError, ClientKeys
 from gcd_client.images import encode_jpegs
-from gcd_client.protocol import PREVIEW_ID, ClientError, MessageError, StatusMessage, ViewKind, kind_of, to_json
+from gcd_client.protocol import PREVIEW_ID, ClientError, MessageError, ViewKind, kind_of, to_json
 from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
 from gcd_node.auth import Role
 
 MAX_REQUEST = 4096  # bytes a message of a browser may have
 MOST_UNSEEN = 3  # pictures a browser may have on the way, sent and not yet shown
 MOST_WAITING = 64  # messages that wait for a browser
-_LOOKING: Final = frozenset({"describe", "views"})
-_STEERING: Final = frozenset({"set_view", "set_param", "get_config"})
-_KINDS: tuple[ViewKind, ...] = tuple(kind for kind in get_args(ViewKind) if kind != "frm")
+BEAT_S = 0.5  # a page that hears nothing for some of these knows that nobody lives here
+NOT_OURS, TRY_LATER = 1008, 1013  # codes with which a feed is closed
+_MOST_A_BEAT = 100  # messages of a browser
+_CLOSE_S, _STUCK_S = 2.0, 5.0
+_LOOKING, _STEERING = ("describe", "views"), ("set_view", "set_param", "get_config")  # verbs of the control socket
+_KINDS = tuple(kind for kind in get_args(ViewKind) if kind != "frm")
 _QUALITY = 85
-_RETRY_S, _REPLY_S = 2.0, 2.0
-_MOST_AT_ONCE, _SETTLE_S = 64, 0.05
+_RETRY_S, _REPLY_S, _SETTLE_S = 2.0, 2.0, 0.05
 _EVENTS = 50
-_LENGTH = struct.Struct("<I")
+_WAITED, _LENGTH = struct.Struct("<f"), struct.Struct("<I")
 _LOG = logging.getLogger(__name__)
 
 
@@ -62,9 +67,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
 
 
 class Got(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag="got"):
-    """The picture of this number is on the screen; more may come."""
-
-    number: Annotated[int, Meta(ge=0, le=2**53)]
+    """The oldest picture on the way has been shown; more may come."""
 
 
 Request: TypeAlias = Hello | Watch | Ask | Got
@@ -87,126 +90,23 @@ def text_message(kind: str, fields: Mapping[str, Any]) -> str:
     return json.dumps({**fields, "type": kind}, allow_nan=False, separators=(",", ":"))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Picture:
-    """A picture message for browsers, the same for all of them but for its number and its age.
+def picture(view: ReceivedView) -> bytes:
+    """What a browser is sent of a view, but for how long it waited: pictures as JPEG; class maps, visibility and
+    deviations packed without loss, depth as grey levels (zlib).
 
-    kind: of the topic, "src" for the input. age_ms, left_ms: how old its newest frame was, and how long it could still
-    be used, at `born_s` (monotonic).
+    The header has the topic's `kind` ("src" for the input), the protocol's `header`, the `offsets` of JPEGs, `age_ms`
+    of the newest frame, and `left_ms`, how long it can still be used. Raises MessageError: damaged pixels.
     """
-
-    view: str
-    kind: str
-    head: Mapping[str, Any]
-    payload: bytes
-    age_ms: float
-    left_ms: float
-    born_s: float = field(default_factory=time.monotonic)
-
-    def part(self, number: int, now_s: float) -> bytes:
-        """The binary message, as old as it is now."""
-        since_ms = max(0.0, 1000 * (now_s - self.born_s))
-        ages = {"age_ms": round(self.age_ms + since_ms, 1), "left_ms": round(self.left_ms - since_ms, 1)}
-        fields = {**self.head, "view": self.view, "kind": self.kind, "number": number, **ages}
-        head = text_message("picture", fields).encode()
-        return b"".join((_LENGTH.pack(len(head)), head, self.payload))
-
-
-def picture(view: ReceivedView) -> Picture:
-    """What a browser is sent of a view: pictures as JPEG; class maps, visibility and deviations packed without loss,
-    depth as grey levels (zlib). Raises MessageError: pixels that do not fit the header."""
-    header = view.header
-    payload, offsets = _packed(view)
-    return Picture(
-        view=header.view_id,
-        kind="src" if header.view_id == PREVIEW_ID else kind_of(view.message.topic),
-        head={"offsets": offsets, **_head(view)},
-        payload=payload,
-        age_ms=view.age_ms,
-        left_ms=header.valid_for_ms - (view.age_ms - header.age_ms),
-    )
-
-
-def _packed(view: ReceivedView) -> tuple[bytes, tuple[int, ...] | None]:
-    """Payload, and where each JPEG begins; None for pixels packed as one."""
-    encoding, payload = view.header.encoding, view.message.payload
-    if encoding == "jpeg":
-        return bytes(payload), view.header.offsets
-    if encoding == "rgb8":
-        return encode_jpegs(view.images, _QUALITY)
-    return zlib.compress(view.colours[..., 0].tobytes() if encoding == "invdepth16" else payload, 1), None
-
-
-def _head(view: ReceivedView) -> dict[str, Any]:
-    """What the page shows of a header. Times are seconds, as doubles: for the eye."""
-    header = view.header
-    frames, height, width, _ = header.shape
-    return {
-        "boot_id": header.boot_id,
-        "rev": header.view_rev,
-        "window_id": header.window_id,
-        "frames": frames,
-        "height": height,
-        "width": width,
-        "fps": header.src.fps_cond,
-        "source": {"kind": header.src.kind, "id": header.src.id, "fps": header.src.fps_in},
-        "epoch": header.src.epoch,
-        "captured_s": [stamp_ns / 1e9 for stamp_ns in header.t_capture_ns],
-        "clock": header.clock,
-        "at_s": header.t_publish_ns / 1e9,
-        "valid_for_ms": header.valid_for_ms,
-        "pose": None if header.pose is None else to_json(header.pose[-1]),
-        "synthetic": header.synthetic,
-        "quality": to_json(header.quality),
-        "model": to_json(header.model),
-        "scale": header.scale,
-        "classes": None if header.classes is None else [to_json(each) for each in header.classes],
-    }
-
-
-class Mailbox:
-    """What waits to be sent to one browser: of everything the newest.
-
-    A newer message replaces an unread one of its slot and keeps its place in the row. Pictures wait until the browser
-    has shown earlier ones, so that what it is too slow for is left out here and never piles up on the way.
-    """
-
-    def __init__(self) -> None:
-        self.changed = asyncio.Event()
-        self._waiting: OrderedDict[str, str | Picture] = OrderedDict()
-        self._sent = self._shown = 0
-
-    def put(self, slot: str, what: str | Picture) -> None:
-        """Leave a message; when it gets too much, the oldest is given up."""
-        self._waiting[slot] = what
-        if len(self._waiting) > MOST_WAITING:
-            self._waiting.popitem(last=False)
-        self.changed.set()
-
-    def put_picture(self, shown: Picture) -> None:
-        """Leave a picture."""
-        self.put(f"picture/{shown.view}/{shown.kind}", shown)
-
-    def drop_views(self) -> None:
-        """Forget the pictures that still wait, but for those of the input."""
-        for slot, what in list(self._waiting.items()):
-            if isinstance(what, Picture) and what.view != PREVIEW_ID:
-                del self._waiting[slot]
-
-    def shown(self, number: int) -> None:
-        """The browser has shown the picture of this number, and so all before it."""
-        self._shown = max(self._shown, min(number, self._sent))
-        self.changed.set()
-
-    def take(self, now_s: float) -> str | bytes | None:
-        """The message to send now; None while nothing waits, or only pictures and the browser is behind."""
-        room = self._sent - self._shown < MOST_UNSEEN
-        slot = next((slot for slot, each in self._waiting.items() if room or isinstance(each, str)), None)
-        what = None if slot is None else self._waiting.pop(slot)
-        if not isinstance(what, Picture):
-            return what
-        self._sent += 1
-        return what.part(self._sent, now_s)
+    header, payload = view.header, view.message.payload
+    offsets = header.offsets
+    if header.encoding == "rgb8":
+        payload, offsets = encode_jpegs(view.images, _QUALITY)
+    elif header.encoding != "jpeg":
+        payload = zlib.compress(view.colours[..., 0].tobytes() if header.encoding == "invdepth16" else payload, 1)
+    kind = "src" if header.view_id == PREVIEW_ID else kind_of(view.message.topic)
+    ages = {"age_ms": view.age_ms, "left_ms": header.valid_for_ms - (view.age_ms - header.age_ms)}
+    head = json.dumps({"kind": kind, "header": to_json(header), "offsets": offsets, **ages}, allow_nan=False).encode()
+    return b"".join((_LENGTH.pack(len(head)), head, payload))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -233,40 +133,41 @@ class NodeLink:
     def __init__(self, node: NodeEndpoints) -> None:
         """Begin to read the node's status."""
         self._node = node
-        self._watched: dict[Mailbox, str | None] = {}
-        self._readers: dict[str, asyncio.Task[None]] = {}
-        self._newest: dict[tuple[str, str], Picture] = {}
+        self.browsers: set[Browser] = set()
+        self._readers: dict[tuple[str, ViewKind], asyncio.Task[None]] = {}
         self._status_s: float | None = None
         self._last: dict[str, str] = {}
         self._events: deque[tuple[str, str]] = deque(maxlen=_EVENTS)
         self._count = 0
-        self._notes = asyncio.create_task(self._read_notes())
+        self._notes = asyncio.create_task(_kept_up("status", self._read_notes))
 
     @property
     def silent_ms(self) -> int | None:
         """Since the node's last status; None before the first."""
-        return None if self._status_s is None else round(1000 * max(0.0, time.monotonic() - self._status_s))
+        return None if self._status_s is None else round(1000 * (time.monotonic() - self._status_s))
 
-    def join(self, browser: Mailbox) -> None:
+    def join(self, browser: "Browser") -> None:
         """A browser is there: from now on it gets what the node says, and the input."""
         browser.put("welcome", text_message("welcome", {"commands": self._node.control is not None}))
-        self.watch(browser, None)
+        self.browsers.add(browser)
         for slot, text in [*self._events, *self._last.items()]:
             browser.put(slot, text)
+        self.read_what_is_watched()
 
-    def watch(self, browser: Mailbox, view: str | None) -> None:
-        """A browser wants to see this view instead of the one before; None for the input alone."""
-        browser.drop_views()
-        self._watched[browser] = view
-        self._read_what_is_watched()
-        for newest in self._newest.values():
-            if newest.view in (view, PREVIEW_ID):
-                browser.put_picture(newest)
-
-    def leave(self, browser: Mailbox) -> None:
+    def leave(self, browser: "Browser") -> None:
         """A browser has gone."""
-        self._watched.pop(browser, None)
-        self._read_what_is_watched()
+        self.browsers.discard(browser)
+        self.read_what_is_watched()
+
+    def read_what_is_watched(self) -> None:
+        """The input and the views on the browsers' screens, and no others; each topic the newest message alone."""
+        views = {browser.view for browser in self.browsers if browser.view is not None}
+        topics: set[tuple[str, ViewKind]] = {(view, kind) for view in views for kind in _KINDS}
+        topics |= {(PREVIEW_ID, "frm")} if self.browsers else set()
+        for topic in self._readers.keys() - topics:
+            self._readers.pop(topic).cancel()
+        for topic in topics - self._readers.keys():
+            self._readers[topic] = asyncio.create_task(_kept_up("/".join(topic), self._read_view, *topic))
 
     async def ask(self, ask: Ask, role: Role) -> str:
         """Carry a command to the node; the reply, a refusal too."""
@@ -286,86 +187,156 @@ class NodeLink:
         await asyncio.wait(readers)
 
     async def _request(self, ask: Ask, role: Role) -> Reply:
+        if ask.verb not in _LOOKING and (role != "operator" or ask.verb not in _STEERING):
+            known = f"a page asks for {', '.join(_LOOKING)}; opened with its token also for {', '.join(_STEERING)}"
+            raise ControlError(f"{known}; not for {ask.verb!r}", Code.FORBIDDEN)
         endpoint = self._node.control
-        if ask.verb not in _LOOKING | _STEERING:
-            known = ", ".join(sorted(_LOOKING | _STEERING))
-            raise ControlError(f"a page asks for {known}, not for {ask.verb!r}; use `gcd-node ctl`", Code.FORBIDDEN)
-        if ask.verb in _STEERING and role != "operator":
-            raise ControlError(
-                "you are looking, not steering: open the address that was printed, with its #token=...", Code.FORBIDDEN
-            )
         if endpoint is None:
             raise ControlError("this node takes no commands: it has no [control] endpoint", Code.FORBIDDEN)
         keys = self._node.keys_for(endpoint)
         with ControlClient(endpoint, keys=keys, timeout_s=_REPLY_S, attempts=1) as client:
             return await client.request_async(ask.verb, ask.args)
 
-    def _read_what_is_watched(self) -> None:
-        views = {view for view in self._watched.values() if view is not None}
-        views |= {PREVIEW_ID} if self._watched else set()
-        for view in self._readers.keys() - views:
-            self._readers.pop(view).cancel()
-            self._newest = {key: newest for key, newest in self._newest.items() if key[0] != view}
-        for view in views - self._readers.keys():
-            self._readers[view] = asyncio.create_task(self._read_view(view))
-
-    async def _read_view(self, view: str) -> None:
-        """Until it is cancelled. Of the views that have come, the newest of each topic: nobody must see old ones."""
-        endpoint, keys = self._node.data, self._node.keys_for(self._node.data)
-        kinds = ("frm",) if view == PREVIEW_ID else _KINDS
+    async def _read_view(self, view: str, kind: ViewKind) -> None:
         await asyncio.sleep(_SETTLE_S)  # a reader that was just cancelled still lets go of a file that this one may get
-        while True:
-            with _logged_errors(view), ViewSubscriber(endpoint, view, kinds, conflate=False, keys=keys) as views:
-                while True:
-                    newest: dict[str, ReceivedView] = {}
-                    received, count = await views.receive_async(), 0
-                    while received is not None:
-                        newest[received.message.topic] = received
-                        count += 1  # a node that is faster than this must not keep everybody waiting
-                        received = await views.receive_async(0) if count < _MOST_AT_ONCE else None
-                    for each in newest.values():
-                        with contextlib.suppress(MessageError):  # its pixels: the page leaves it out
-                            self._take_picture(await asyncio.to_thread(picture, each))
-            await asyncio.sleep(_RETRY_S)
+        endpoint = self._node.data
+        with ViewSubscriber(endpoint, view, kind, keys=self._node.keys_for(endpoint)) as views:
+            while True:
+                if (received := await views.receive_async()) is None:  # the stream's end; another may begin
+                    continue
+                part = await asyncio.to_thread(picture, received)
+                for browser in self.browsers:
+                    if view in (browser.view, PREVIEW_ID):
+                        browser.put(f"picture/{view}/{kind}", part)
 
     async def _read_notes(self) -> None:
-        """Until it is cancelled."""
-        while True:
-            keys = self._node.keys_for(self._node.status)
-            with _logged_errors("status"), StatusSubscriber(self._node.status, keys=keys) as notes:
-                async for note in notes:
-                    self._take_note(note)
-            await asyncio.sleep(_RETRY_S)
-
-    def _take_picture(self, shown: Picture) -> None:
-        self._newest[shown.view, shown.kind] = shown
-        for browser, watched in self._watched.items():
-            if shown.view in (watched, PREVIEW_ID):
-                browser.put_picture(shown)
-
-    def _take_note(self, note: StatusMessage) -> None:
-        self._count += 1
-        header, slot = note.header, note.topic
-        origin = {"node_id": header.node_id, "boot_id": header.boot_id, "at_s": header.t_publish_ns / 1e9}
-        text = text_message(note.topic, {**origin, "number": self._count, "fields": dict(note.fields)})
-        if note.topic == "event":
-            slot = f"event/{self._count}"
-            self._events.append((slot, text))
-        else:
-            self._last[note.topic] = text
-        if note.topic == "status":
-            # The first may be one that was kept for late readers, and is as old as its stamp says.
-            kept_s = 0.0 if self._status_s is not None else max(0.0, (time.time_ns() - header.t_publish_ns) / 1e9)
-            self._status_s = time.monotonic() - kept_s
-        for browser in self._watched:
-            browser.put(slot, text)
+        endpoint = self._node.status
+        with StatusSubscriber(endpoint, keys=self._node.keys_for(endpoint)) as notes:
+            async for note in notes:
+                self._count += 1
+                header, slot = note.header, note.topic
+                told = {"node_id": header.node_id, "boot_id": header.boot_id, "at_s": header.t_publish_ns / 1e9}
+                text = text_message(slot, {**told, "number": self._count, "fields": dict(note.fields)})
+                if slot == "event":
+                    slot = f"event/{self._count}"
+                    self._events.append((slot, text))
+                else:
+                    self._last[slot] = text
+                if slot == "status":
+                    self._status_s = time.monotonic()
+                for browser in self.browsers:
+                    browser.put(slot, text)
 
 
-@contextlib.contextmanager
-def _logged_errors(name: str) -> Generator[None]:
-    try:
-        yield
-    except ClientError as error:
-        _LOG.warning("the page gets nothing of %s: %s", name, error)
-    except Exception:  # the end of a task
-        _LOG.exception("reading %s broke", name)
+async def _kept_up(name: str, read: Callable[..., Awaitable[None]], *arguments: str) -> None:
+    """Read until this is cancelled, whatever happens."""
+    while True:
+        try:
+            await read(*arguments)
+        except ClientError as error:
+            _LOG.warning("the page gets nothing of %s: %s", name, error)
+        except Exception:  # the end of a task
+            _LOG.exception("reading %s broke", name)
+        await asyncio.sleep(_RETRY_S)
+
+
+class Browser:
+    """One browser: what it says is read here, and of all there is for it the newest is sent.
+
+    A newer message replaces an unsent one of its slot and keeps its place in the row. Pictures wait until the browser
+    has shown earlier ones, so that what it is too slow for is left out here and never piles up on the way.
+    """
+
+    def __init__(self, connection: ServerConnection, link: NodeLink, token: str) -> None:
+        self.view: str | None = None
+        self._connection, self._link, self._token = connection, link, token
+        self._role: Role = "viewer"
+        self._waiting: dict[str, tuple[float, str | bytes]] = {}  # since when (monotonic), and what
+        self._changed = asyncio.Event()
+        self._unseen = self._heard = 0
+
+    async def serve(self) -> None:
+        """Returns when the browser has gone or was sent away."""
+        sender = asyncio.create_task(self._send())
+        try:
+            self._link.join(self)
+            async for text in self._connection:
+                self._heard += 1
+                if self._heard > _MOST_A_BEAT:
+                    return await self.close(NOT_OURS, "too many messages")
+                await self._take(parse_request(text))
+        except MessageError as error:
+            _LOG.debug("a page is sent away: %s", error)
+            await self.close(NOT_OURS, "this is no request of the page")
+        except ConnectionClosed:
+            pass
+        finally:
+            self._link.leave(self)
+            sender.cancel()
+
+    async def close(self, code: int, reason: str) -> None:
+        """Say good-bye; who takes nothing any more is cut off."""
+        try:
+            await asyncio.wait_for(self._connection.close(code, reason), _CLOSE_S)
+        except TimeoutError:
+            self._connection.transport.abort()
+
+    def put(self, slot: str, what: str | bytes) -> None:
+        """Leave a text or a picture; when it gets too much, the oldest is given up."""
+        self._waiting[slot] = time.monotonic(), what
+        if len(self._waiting) > MOST_WAITING:
+            del self._waiting[next(iter(self._waiting))]
+        self._changed.set()
+
+    def shown(self) -> None:
+        """The browser has shown a picture."""
+        self._unseen = max(0, self._unseen - 1)
+        self._changed.set()
+
+    def next_message(self) -> str | bytes | None:
+        """What to send now; None while nothing waits, or only pictures and the browser is behind."""
+        room = self._unseen < MOST_UNSEEN
+        slot = next((slot for slot, (_, what) in self._waiting.items() if room or isinstance(what, str)), None)
+        if slot is None:
+            return None
+        since_s, what = self._waiting.pop(slot)
+        if isinstance(what, str):
+            return what
+        self._unseen += 1
+        return _WAITED.pack(1000 * (time.monotonic() - since_s)) + what
+
+    async def _take(self, request: Request) -> None:
+        match request:
+            case Hello(token=token):
+                right = secrets.compare_digest((token or "").encode(errors="replace"), self._token.encode())
+                self._role = "operator" if right else "viewer"
+                refused = token is not None and not right
+                self.put("role", text_message("role", {"role": self._role, "refused": refused}))
+            case Watch(view=view):
+                self.view = view
+                self._link.read_what_is_watched()
+            case Ask() as ask:
+                self.put(f"reply/{ask.id}", await self._link.ask(ask, self._role))
+            case Got():
+                self.shown()
+
+    async def _send(self) -> None:
+        """Send what waits, and a beat twice a second; who takes nothing for 5 s is cut off."""
+        beat_s = 0.0
+        try:
+            while True:
+                self._changed.clear()
+                if time.monotonic() >= beat_s:
+                    beat_s, self._heard = time.monotonic() + BEAT_S, 0
+                    message = text_message("beat", {"silent_ms": self._link.silent_ms})
+                else:
+                    message = self.next_message()
+                if message is not None:
+                    await asyncio.wait_for(self._connection.send(message), _STUCK_S)
+                    continue
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._changed.wait(), max(0.0, beat_s - time.monotonic()))
+        except ConnectionClosed:
+            pass
+        except TimeoutError:
+            self._connection.transport.abort()

@@ -56,7 +56,7 @@ def rehearsed(config: NodeConfig, folder: Path) -> NodeConfig:
 def test_a_launch_file_passes_every_check_that_needs_no_hardware(path: Path, tmp_path: Path) -> None:
     config = rehearsed(load_config(path), tmp_path)
     findings = {each.topic: each for each in check_launch(config, 2**36)}
-    assert list(findings) == ["endpoints", "source", "weights", "memory", "views", "time"]
+    assert list(findings) == ["endpoints", "source", "weights", "views"]
     errors = {topic: str(each.error) for topic, each in findings.items() if each.error is not None}
     assert errors == {}
     assert findings["weights"].verdict == "warning"

@@ -1,44 +1,60 @@
-"""The page's server as pages, foreign pages and HTTP clients meet it, without a browser; and what it is made of."""
+"""The page's server without a browser and without a node: what it serves and to whom, what a feed gives, and what
+hostile clients can do with both."""
 
+import contextlib
+import logging
 import re
+import socket
+import threading
 import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from cameras import until
 from fakes import Box, FakeSource, FakeSynthesizer, made_node, traits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from viewer_clients import (
     TOKEN,
+    WAIT_S,
+    answer,
+    endpoints_in,
+    farewell,
     get,
+    hear,
     host_of,
-    lonely_viewer,
-    nobody,
-    received,
+    open_feed,
+    raw_feed,
+    role,
+    say,
     taken_apart,
+    viewer_of,
 )
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from wire_messages import class_map, depth, visibility, window
 
 from gcd_client.images import colours, decode_jpegs, images
-from gcd_client.protocol import MessageError
+from gcd_client.protocol import MessageError, ViewMessage
+from gcd_client.subscriber import ReceivedView
 from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, EndpointError
-from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Mailbox, parse_request, picture
-from gcd_node.viewer.server import ViewerServer, load_page, security_headers
+from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, parse_request, picture
+from gcd_node.viewer.server import HEADERS, MOST_BROWSERS, ViewerServer, load_page
 
 pytestmark = pytest.mark.timeout(90)
 
 
 @pytest.fixture
 def viewer(tmp_path: Path) -> Iterator[ViewerServer]:
-    with lonely_viewer(tmp_path) as opened:
+    with viewer_of(tmp_path) as opened:
         yield opened
 
 
-# Laws.
+# What is sent.
 
 
 @settings(deadline=None, max_examples=50)
@@ -48,38 +64,50 @@ def test_what_is_no_request_of_the_page_is_refused(text: str | bytes) -> None:
         parse_request(text)
 
 
-def test_a_mailbox_gives_the_newest_of_each_slot_in_the_order_of_the_slots() -> None:
-    box = Mailbox()
+def received(message: ViewMessage, age_ms: float = 50.0) -> ReceivedView:
+    return ReceivedView(message=message, age_ms=age_ms, expired=False, skipped=0, restarted=False)
+
+
+def silent_browser() -> Browser:
+    return Browser(cast("Any", None), cast("Any", None), TOKEN)
+
+
+def test_of_what_waits_a_browser_gets_the_newest_in_the_order_of_the_slots_and_never_too_much() -> None:
+    browser = silent_browser()
     for slot, text in (("a", "old"), ("b", "1"), ("a", "new")):
-        box.put(slot, text)
-    assert [box.take(0.0) for _ in range(3)] == ["new", "1", None]
+        browser.put(slot, text)
+    assert [browser.next_message() for _ in range(3)] == ["new", "1", None]
+    for number in range(10 * MOST_WAITING):
+        browser.put(f"event/{number}", str(number))
+    kept = [browser.next_message() for _ in range(MOST_WAITING + 1)]
+    assert kept == [*(str(number) for number in range(9 * MOST_WAITING, 10 * MOST_WAITING)), None]
 
 
 def test_a_browser_has_no_more_pictures_on_the_way_than_it_may() -> None:
-    box, shown = Mailbox(), picture(received(window()))
+    browser, shown = silent_browser(), picture(received(window()))
 
     def taken() -> int:
         for each in range(10):
-            box.put_picture(shown)
-            if box.take(0.0) is None:
+            browser.put("picture", shown)
+            if browser.next_message() is None:
                 return each
         return 10
 
     assert taken() == MOST_UNSEEN
-    box.put("status", "text")
-    assert box.take(0.0) == "text"  # texts do not wait for pictures
-    box.shown(2)
+    browser.put("picture", shown)
+    time.sleep(0.05)
+    browser.put("status", "text")
+    assert browser.next_message() == "text"  # texts do not wait for pictures
+    browser.shown()
+    late = browser.next_message()
+    assert isinstance(late, bytes)
+    assert taken_apart(late)[0]["waited_ms"] >= 50
+    browser.shown()
+    browser.shown()
     assert taken() == 2
-    box.shown(10**9)  # more than it was sent
+    for _ in range(1000):  # more than it was sent
+        browser.shown()
     assert taken() == MOST_UNSEEN
-
-
-def test_a_mailbox_nobody_empties_does_not_grow() -> None:
-    box = Mailbox()
-    for number in range(10 * MOST_WAITING):
-        box.put(f"event/{number}", str(number))
-    kept = [box.take(0.0) for _ in range(MOST_WAITING + 1)]
-    assert kept == [*(str(number) for number in range(9 * MOST_WAITING, 10 * MOST_WAITING)), None]
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "jpeg"])
@@ -93,10 +121,10 @@ def test_a_view_is_sent_as_pictures_that_are_what_it_was(encoding: str) -> None:
     made_node(config, FakeSynthesizer(traits()), FakeSource(14), box).run()
     message = box.of("win")[0]
     sent = picture(received(message, age_ms=message.header.age_ms + 50))
-    head, payload = taken_apart(sent.part(7, sent.born_s + 1.0))
-    assert (head["kind"], head["view"], head["number"], head["frames"]) == ("win", "main", 7, 14)
-    assert head["age_ms"] == pytest.approx(message.header.age_ms + 1050, abs=1)
-    assert head["left_ms"] == pytest.approx(message.header.valid_for_ms - 1050, abs=1)
+    head, payload = taken_apart(bytes(4) + sent)
+    assert (head["kind"], head["header"]["view_id"], head["header"]["shape"][0]) == ("win", "main", 14)
+    assert head["age_ms"] == message.header.age_ms + 50
+    assert head["left_ms"] == message.header.valid_for_ms - 50
     shown = decode_jpegs(payload, tuple(head["offsets"]), message.header.shape)
     assert np.abs(shown.astype(int) - images(message).astype(int)).mean() < 3
 
@@ -107,24 +135,26 @@ def test_maps_are_sent_without_loss_and_depth_as_grey_levels() -> None:
         (visibility(3), "vis", bytes(visibility(3).payload)),
         (depth(3), "depth", colours(depth(3))[..., 0].tobytes()),
     ):
-        head, payload = taken_apart(picture(received(message)).part(1, time.monotonic()))
+        head, payload = taken_apart(bytes(4) + picture(received(message)))
         assert (head["kind"], zlib.decompress(payload)) == (kind, levels)
-        assert [each["name"] for each in head["classes"] or ()] == [each.name for each in message.header.classes or ()]
+        classes = head["header"].get("classes", ())
+        assert [each["name"] for each in classes] == [each.name for each in message.header.classes or ()]
 
 
 # The page over HTTP.
 
 
-def test_every_file_of_the_page_is_served_with_headers_that_let_nothing_else_in(viewer: ViewerServer) -> None:
-    for path, file in load_page().items():
+def test_every_file_is_served_with_headers_that_let_nothing_else_in_and_none_holds_the_token(
+    viewer: ViewerServer,
+) -> None:
+    assert viewer.operator_url == f"{viewer.url}#token={TOKEN}"
+    for path, (content, kind) in load_page().items():
         status, headers, body = get(viewer, path)
-        assert (status, body, headers["Content-Type"]) == (200, *file)
-        assert headers["X-Content-Type-Options"] == "nosniff"
-        policy = headers["Content-Security-Policy"]
-        assert policy.startswith("default-src 'none'")
-        assert "unsafe" not in policy
-        assert f"connect-src 'self' ws://{host_of(viewer)};" in policy
-        assert set(security_headers("x")) <= set(headers)
+        assert (status, body, headers["Content-Type"]) == (200, content, f"{kind}; charset=utf-8")
+        assert HEADERS.items() <= dict(headers).items()
+        assert TOKEN not in body.decode() + str(headers)
+    assert HEADERS["Content-Security-Policy"].startswith("default-src 'none'")
+    assert "unsafe" not in HEADERS["Content-Security-Policy"]
 
 
 def test_the_page_needs_nothing_from_elsewhere_and_nothing_inline() -> None:
@@ -140,13 +170,6 @@ def test_the_page_needs_nothing_from_elsewhere_and_nothing_inline() -> None:
     assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\sstyle=|\son[a-z]+=", page["/"])
 
 
-def test_the_page_does_not_hold_the_token(viewer: ViewerServer) -> None:
-    assert viewer.operator_url == f"{viewer.url}#token={TOKEN}"
-    for path in load_page():
-        _, headers, body = get(viewer, path)
-        assert TOKEN not in body.decode() + str(headers)
-
-
 @pytest.mark.parametrize(
     "hosts", [["evil.example"], ["127.0.0.1.evil.example:80"], [""], [], ["127.0.0.1", "evil.example"], ["0.0.0.0"]]
 )
@@ -157,28 +180,118 @@ def test_a_foreign_name_made_to_point_here_gets_nothing(viewer: ViewerServer, ho
     assert get(viewer, "/", hosts=["localhost:9000"])[0] == 200  # a tunnel may end at another port
 
 
-@pytest.mark.parametrize(
-    "path", ["/../config.py", "/..%2fconfig.py", "/page/main.js", "//etc/passwd", "/feed/", "/x" * 40]
-)
-def test_there_are_no_other_files(viewer: ViewerServer, path: str) -> None:
-    assert get(viewer, path)[0] == 404
-
-
-@pytest.mark.parametrize("method", ["POST", "HEAD"])
-def test_only_get_is_answered(viewer: ViewerServer, method: str) -> None:
-    assert get(viewer, "/", method=method)[0] == 405
-
-
-def test_a_page_of_another_site_is_not_told_what_is_here(viewer: ViewerServer) -> None:
+def test_there_are_no_other_files_no_other_methods_and_no_pages_of_other_sites(viewer: ViewerServer) -> None:
+    for path in ("/../config.py", "/..%2fconfig.py", "/page/main.js", "//etc/passwd", "/feed/", "/x" * 40):
+        assert get(viewer, path)[0] == 404, path
+    for method in ("POST", "HEAD"):
+        assert get(viewer, "/", method=method)[0] == 405
     assert get(viewer, "/", Origin="https://evil.example")[0] == 403
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0:8470", "[::]:8470", "robot:8470", "", "127.0.0.1:", "127.0.0.1:70000"])
 def test_others_than_ports_of_this_machine_are_refused(address: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
-        ViewerServer(address, nobody(tmp_path))
+        ViewerServer(address, endpoints_in(tmp_path))
 
 
 def test_a_port_in_use_is_refused(viewer: ViewerServer, tmp_path: Path) -> None:
     with pytest.raises(EndpointError):
-        ViewerServer(host_of(viewer), nobody(tmp_path))
+        ViewerServer(host_of(viewer), endpoints_in(tmp_path))
+
+
+# The feed.
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://{host}", "http://localhost", ""]
+)
+def test_a_foreign_page_cannot_open_the_feed(viewer: ViewerServer, origin: str) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        open_feed(viewer.url, origin.format(host=host_of(viewer)))
+    assert refused.value.response.status_code == 403
+
+
+def test_who_comes_is_a_viewer_until_the_token_is_shown_which_is_in_no_log(
+    viewer: ViewerServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in (None, "gcd_node", "websockets", "websockets.server"):
+        caplog.set_level(logging.DEBUG, logger=name)
+    with open_feed(viewer.url) as feed:
+        assert role(feed) == ("viewer", False)
+        assert role(feed, token=TOKEN + "x") == ("viewer", True)
+        assert role(feed, token=TOKEN) == ("operator", False)
+    told = [record.getMessage() for record in caplog.records if record.name != "websockets.client"]  # our own end
+    assert not [line for line in told if TOKEN in line]
+
+
+@pytest.mark.parametrize(("token", "verbs"), [({}, ("set_view", "set_param", "get_config")), ({"token": TOKEN}, ())])
+def test_what_a_page_may_not_ask_is_refused_without_asking_the_node(
+    viewer: ViewerServer, token: dict[str, str], verbs: tuple[str, ...]
+) -> None:
+    with open_feed(viewer.url) as feed:
+        role(feed, **token)
+        for verb in (*verbs, "shutdown", "remove_view", "record_start", "nonsense"):
+            reply = answer(feed, verb, view="main")
+            assert (reply["ok"], reply["code"]) == (False, "FORBIDDEN")
+
+
+def test_a_node_without_a_control_socket_takes_no_commands(tmp_path: Path) -> None:
+    node = endpoints_in(tmp_path, control=False)
+    with ViewerServer("127.0.0.1:0", node, TOKEN) as viewer, open_feed(viewer.url) as feed:
+        assert hear(feed, "welcome")["commands"] is False
+        role(feed, token=TOKEN)
+        assert "[control]" in answer(feed, "describe")["message"]
+
+
+def test_a_ninth_page_is_asked_to_wait(viewer: ViewerServer) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(MOST_BROWSERS):
+            stack.enter_context(open_feed(viewer.url))
+        until(lambda: viewer.browsers == MOST_BROWSERS)
+        with open_feed(viewer.url) as ninth:
+            assert farewell(ninth) == 1013
+        assert get(viewer, "/")[0] == 200
+    until(lambda: viewer.browsers == 0)
+    with open_feed(viewer.url) as feed:
+        assert hear(feed, "beat")
+
+
+@pytest.mark.parametrize(
+    ("sent", "code"),
+    [
+        ("x" * 5000, 1009),
+        ("{}", 1008),
+        ("[" * 4000, 1008),
+        ('{"type":"watch","view":"../x"}', 1008),
+        ('{"type":"got","more":2}', 1008),
+        (b"\x00\x01", 1008),
+    ],
+)
+def test_who_sends_what_no_page_sends_is_sent_away(viewer: ViewerServer, sent: str | bytes, code: int) -> None:
+    with open_feed(viewer.url) as other, open_feed(viewer.url) as feed:
+        feed.send(sent)
+        assert farewell(feed) == code
+        assert hear(other, "beat")
+
+
+def test_a_flood_is_cut_off_and_others_do_not_notice(viewer: ViewerServer) -> None:
+    with open_feed(viewer.url) as other, open_feed(viewer.url) as feed:
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(100_000):
+                say(feed, "got")
+        assert farewell(feed) == 1008
+        assert role(other, token=TOKEN) == ("operator", False)
+
+
+def test_the_end_waits_for_nobody_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    viewer = viewer_of(tmp_path)
+    host, port = host_of(viewer).split(":")
+    hanging = [*(raw_feed(viewer) for _ in range(3)), socket.create_connection((host, int(port)), WAIT_S)]
+    with open_feed(viewer.url) as feed:
+        hear(feed, "beat")
+        viewer.close()
+        assert farewell(feed) == 1001
+    viewer.close()
+    for each in hanging:
+        each.close()
+    until(lambda: not [each.name for each in threading.enumerate() if each.name.startswith("viewer")])

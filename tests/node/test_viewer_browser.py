@@ -1,13 +1,10 @@
 """The page in a real browser: a headless Chromium, one for the whole module, beside nodes over real sockets."""
 
-import json
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +12,11 @@ import pytest
 from cameras import Bench, Camera, until
 from fakes import FakeSynthesizer, painting_traits
 from rig import Rig
+from viewer_clients import viewer_of
 from wire_messages import origin
 
 from gcd_node.config import PublishConfig
 from gcd_node.publisher import Publisher
-from gcd_node.viewer.feed import NodeEndpoints
-from gcd_node.viewer.server import ViewerServer
 
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs the Python package selenium, of the extra `dev`")
@@ -32,19 +28,6 @@ pytestmark = [
 PROCESS = Path(__file__).with_name("viewer_process.py")
 LOOK_MS = 100  # of the page: TICK_MS in main.js
 DESKTOP, PHONE = (1280, 900), (360, 740)
-
-
-@dataclass(frozen=True)
-class Silence:
-    """Whether the page had a connection, and how long the server and the node had said nothing; None: not known."""
-
-    is_open: bool
-    ms: tuple[float | None, ...]
-
-    def is_death(self, limits_ms: list[float]) -> bool:
-        """By the page's rule."""
-        over = [ms is not None and ms > limit for ms, limit in zip(self.ms, limits_ms, strict=True)]
-        return not self.is_open or any(over)
 
 
 class Page:
@@ -76,17 +59,16 @@ class Page:
     def state(self) -> str:
         return str(self.run("return document.body.dataset.state"))
 
-    def limits_ms(self) -> list[float]:
-        """For how long the server, and the node, may say nothing."""
+    def looks(self) -> list[object]:
+        """Whether by its rule the node was dead when the page looked before it turned to its state, and when it did,
+        by its own clock; and the longest silence that is not death, ms."""
         script = """
             const done = arguments[0];
-            import("/link.js").then(({BEAT_LOST_MS, NODE_SILENT_MS}) => done([BEAT_LOST_MS, NODE_SILENT_MS]));"""
+            import("/link.js").then(({Link, BEAT_LOST_MS, NODE_SILENT_MS}) => {
+                const dead = (silence) => Link.prototype.life.call({heard: 0, reason: ""}, silence)[0] === "dead";
+                done([...JSON.parse(document.body.dataset.silence).map(dead), Math.max(BEAT_LOST_MS, NODE_SILENT_MS)]);
+            });"""
         return list(self._driver.execute_async_script(script))
-
-    def silences(self) -> list[Silence]:
-        """By the page's own clock, when it looked last before it turned to its state, and when it did."""
-        told = json.loads(self.run("return document.body.dataset.silence"))
-        return [Silence(is_open=each["isOpen"], ms=(each["quietMs"], each["silentMs"])) for each in told]
 
     @property
     def revision(self) -> int:
@@ -147,18 +129,6 @@ def page(driver: Any) -> Page:
     return shown
 
 
-@dataclass(frozen=True)
-class Steered:
-    """A node that is steered by angles, and its viewer, each in a process of its own."""
-
-    process: "subprocess.Popen[str]"
-    operator_url: str
-
-    @property
-    def url(self) -> str:
-        return self.operator_url.partition("#")[0]
-
-
 @pytest.fixture(scope="module")
 def starting(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[subprocess.Popen[str]]":
     command = [sys.executable, str(PROCESS), str(tmp_path_factory.mktemp("steered"))]
@@ -169,7 +139,8 @@ def starting(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[subprocess.P
 
 
 @pytest.fixture(scope="module")
-def steered(starting: "subprocess.Popen[str]") -> Iterator[Steered]:
+def operator_url(starting: "subprocess.Popen[str]") -> Iterator[str]:
+    """Of the page of a node that is steered by angles; both in processes of their own."""
     assert starting.stdout is not None
     assert starting.stdout.readline() == "there\n", "the node did not start"
     folder = str(starting.args[-1])  # type: ignore[index]
@@ -177,13 +148,18 @@ def steered(starting: "subprocess.Popen[str]") -> Iterator[Steered]:
     command = [sys.executable, "-m", "gcd_node", "viewer", "--http", "127.0.0.1:0", *endpoints]
     viewer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert viewer.stderr is not None
-    yield Steered(starting, viewer.stderr.readline().removeprefix("page ").strip())
+    yield viewer.stderr.readline().removeprefix("page ").strip()
     viewer.terminate()
     viewer.communicate()
 
 
-def test_the_pictures_move_and_say_how_old_they_are(page: Page, steered: Steered) -> None:
-    page.open(steered.url)
+@pytest.fixture
+def url(operator_url: str) -> str:
+    return operator_url.partition("#")[0]
+
+
+def test_the_pictures_move_and_say_how_old_they_are(page: Page, url: str) -> None:
+    page.open(url)
     page.wait(lambda: page.state == "live" and page.text("input-badge").startswith("input, "))
     assert page.text("view-badge").startswith("generated, ")
     assert page.text("view-badge").endswith(" s old")
@@ -195,8 +171,8 @@ def test_the_pictures_move_and_say_how_old_they_are(page: Page, steered: Steered
     assert page.complaints() == []
 
 
-def test_without_the_token_a_slider_is_refused_and_the_page_says_so(page: Page, steered: Steered) -> None:
-    page.open(steered.url)
+def test_without_the_token_a_slider_is_refused_and_the_page_says_so(page: Page, url: str) -> None:
+    page.open(url)
     page.wait(lambda: page.revision > 0 and page.run("return !document.getElementById('azimuth_deg').disabled"))
     assert page.text("role") == "viewer"
     before = page.revision
@@ -209,8 +185,8 @@ def test_without_the_token_a_slider_is_refused_and_the_page_says_so(page: Page, 
     assert page.revision == before
 
 
-def test_with_the_token_a_slider_raises_the_revision_of_the_view(page: Page, steered: Steered) -> None:
-    page.open(steered.operator_url)
+def test_with_the_token_a_slider_raises_the_revision_of_the_view(page: Page, operator_url: str) -> None:
+    page.open(operator_url)
     page.wait(lambda: page.text("role") == "operator" and page.revision > 0)
     assert "token" not in page.run("return location.href")  # it leaves the address at once
     assert page.run("return ['min', 'max'].map((each) => document.getElementById('azimuth_deg')[each])") == [
@@ -224,23 +200,23 @@ def test_with_the_token_a_slider_raises_the_revision_of_the_view(page: Page, ste
     page.wait(lambda: "VIEW_SET" in page.text("events"))
     page.slide("elevation_deg", 10)
     page.wait(lambda: page.revision == before + 2)
-    page.forget(steered.url)
+    page.forget(operator_url.partition("#")[0])
 
 
-def test_another_view_is_a_click_away(page: Page, steered: Steered) -> None:
-    page.open(steered.url)
+def test_another_view_is_a_click_away(page: Page, url: str) -> None:
+    page.open(url)
     page.wait(lambda: page.run("return document.querySelectorAll('#views input').length") == 2)
     page.run("document.querySelector('#views input[value=swing]').click()")
     page.wait(lambda: page.run("return document.getElementById('pose').elements.kind.value") == "orbit")
     page.wait(lambda: page.state == "live" and page.text("view-note").endswith("revision 1"))
     assert page.run("return !document.getElementById('orbit').hidden")
-    page.forget(steered.url)
+    page.forget(url)
 
 
 @pytest.mark.parametrize("size", [PHONE, (320, 600), DESKTOP])
-def test_nothing_scrolls_sideways(page: Page, steered: Steered, size: tuple[int, int]) -> None:
+def test_nothing_scrolls_sideways(page: Page, url: str, size: tuple[int, int]) -> None:
     page.size(size)
-    page.open(steered.url)
+    page.open(url)
     page.wait(lambda: page.state == "live" and page.text("answer") == "" and "age" in page.text("stage-table"))
     content, room, window = page.run(
         "const root = document.documentElement; return [root.scrollWidth, root.clientWidth, window.innerWidth]"
@@ -255,30 +231,24 @@ def test_nothing_scrolls_sideways(page: Page, steered: Steered, size: tuple[int,
 def _require_prompt_death(page: Page) -> None:
     """It was shown at the first look after it was so, and looks follow each other as fast as the machine lets them;
     the silence that means it leaves one look of 2 s."""
-    limits_ms = page.limits_ms()
-    before, then = page.silences()
-    print(f"dead after a silence of {then.ms} ms; at the look before {before.ms} ms; limits {limits_ms} ms")
-    assert max(limits_ms) + LOOK_MS <= 2000
-    assert then.is_death(limits_ms)
-    assert not before.is_death(limits_ms)
+    *dead, longest_ms = page.looks()
+    assert dead == [False, True]
+    assert longest_ms + LOOK_MS <= 2000
 
 
-def test_a_hung_node_is_shown_as_dead_and_as_alive_once_it_goes_on(page: Page, steered: Steered) -> None:
-    page.open(steered.url)
+def test_a_hung_node_is_shown_as_dead_and_as_alive_once_it_goes_on_and_a_killed_one_as_dead(
+    page: Page, url: str, starting: "subprocess.Popen[str]"
+) -> None:
+    page.open(url)
     page.wait(lambda: page.state == "live")
-    steered.process.send_signal(signal.SIGSTOP)
+    starting.send_signal(signal.SIGSTOP)
     try:
         page.wait(lambda: page.state == "dead")
         _require_prompt_death(page)
     finally:
-        steered.process.send_signal(signal.SIGCONT)
+        starting.send_signal(signal.SIGCONT)
     page.wait(lambda: page.state == "live")
-
-
-def test_a_killed_node_is_shown_as_dead(page: Page, steered: Steered) -> None:
-    page.open(steered.url)
-    page.wait(lambda: page.state == "live")
-    steered.process.kill()
+    starting.kill()
     page.wait(lambda: page.state == "dead")
     _require_prompt_death(page)
     page.wait(lambda: page.text("view-veil") == "DEAD")
@@ -289,12 +259,9 @@ def test_a_killed_node_is_shown_as_dead(page: Page, steered: Steered) -> None:
 def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Page, tmp_path: Path) -> None:
     camera = Camera(fps=10.0)
     model = FakeSynthesizer(painting_traits())
-    node = NodeEndpoints(
-        data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status", control=f"ipc://{tmp_path}/control"
-    )
     with (
         Rig(tmp_path, Bench(camera), model, views="[view.main]", watched=False) as rig,
-        ViewerServer("127.0.0.1:0", node) as viewer,
+        viewer_of(tmp_path) as viewer,
     ):
         rig.await_state("active")
         page.open(viewer.operator_url)
@@ -320,15 +287,13 @@ def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Pa
 
 
 def test_who_comes_to_a_node_that_is_not_there_is_told_so(page: Page, tmp_path: Path) -> None:
-    node = NodeEndpoints(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status", control=None)
-    with ViewerServer("127.0.0.1:0", node) as viewer:
+    with viewer_of(tmp_path) as viewer:
         page.open(viewer.url)
         page.wait(lambda: "has not spoken" in page.text("why"))
         assert page.state == "connecting"
         assert page.text("view-badge") == "no view yet"
         assert page.text("input-badge") == "no input yet"
-        opened = partial(Publisher, PublishConfig(data=node.data, status=node.status))
-        with opened() as publisher:
+        with Publisher(PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")) as publisher:
 
             def speak() -> bool:
                 publisher.note("status", origin(), {"state": "active", "level": 0})

@@ -1,4 +1,4 @@
-"""Clients of a page's server that are no browser, good ones and bad ones, and servers for them."""
+"""Clients of a page's server that are no browser, good ones and bad ones, and a server for them."""
 
 import base64
 import contextlib
@@ -8,16 +8,13 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rig import Rig
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from gcd_client.protocol import ViewMessage
-from gcd_client.subscriber import ReceivedView
 from gcd_node.viewer.feed import NodeEndpoints
 from gcd_node.viewer.server import ViewerServer
 
@@ -25,23 +22,14 @@ TOKEN = "a-token-of-the-tests"
 WAIT_S = 30.0
 
 
-def nobody(folder: Path, *, control: bool = True) -> NodeEndpoints:
-    """Endpoints at which no node answers."""
+def endpoints_in(folder: Path, *, control: bool = True) -> NodeEndpoints:
+    """Of the node of a Rig in this folder, or of none."""
     at = f"ipc://{folder}"
     return NodeEndpoints(data=f"{at}/data", status=f"{at}/status", control=f"{at}/control" if control else None)
 
 
-@contextlib.contextmanager
-def lonely_viewer(folder: Path) -> Iterator[ViewerServer]:
-    """A page's server at whose endpoints no node answers."""
-    with ViewerServer("127.0.0.1:0", nobody(folder), TOKEN) as opened:
-        yield opened
-
-
-@contextlib.contextmanager
-def viewer_of(rig: Rig) -> Iterator[ViewerServer]:
-    with ViewerServer("127.0.0.1:0", nobody(rig.folder), TOKEN) as opened:
-        yield opened
+def viewer_of(folder: Path) -> ViewerServer:
+    return ViewerServer("127.0.0.1:0", endpoints_in(folder), TOKEN)
 
 
 def host_of(viewer: ViewerServer) -> str:
@@ -63,13 +51,15 @@ def get(viewer: ViewerServer, path: str, *, hosts: list[str] | None = None, meth
     return answer.status, answer.headers, body
 
 
-def open_feed(viewer: ViewerServer, origin: str | None = None) -> ClientConnection:
-    wanted = viewer.url.rstrip("/") if origin is None else origin
-    return connect(f"ws://{host_of(viewer)}/feed", origin=wanted or None, open_timeout=WAIT_S, max_size=2**26)  # type: ignore[arg-type]
+def open_feed(url: str, origin: str | None = None) -> ClientConnection:
+    """url: of the page, as it is printed. origin: what the browser says the page came from."""
+    page = url.partition("/#")[0].rstrip("/")
+    feed = page.replace("http:", "ws:") + "/feed"
+    return connect(feed, origin=page if origin is None else origin or None, open_timeout=WAIT_S, max_size=2**26)  # type: ignore[arg-type]
 
 
-def say(feed: ClientConnection, **what: object) -> None:
-    feed.send(json.dumps(what))
+def say(feed: ClientConnection, kind: str, **what: object) -> None:
+    feed.send(json.dumps({"type": kind, **what}))
 
 
 def hear(feed: ClientConnection, kind: str, holds: Callable[[Any], bool] = lambda _: True) -> Any:
@@ -77,25 +67,40 @@ def hear(feed: ClientConnection, kind: str, holds: Callable[[Any], bool] = lambd
     until_s = time.monotonic() + WAIT_S
     while time.monotonic() < until_s:
         told = feed.recv(WAIT_S)
-        head = json.loads(told) if isinstance(told, str) else taken_apart(told)[0]
+        head = json.loads(told) if isinstance(told, str) else {"type": "picture", **taken_apart(told)[0]}
         if head["type"] == "picture":
-            say(feed, type="got", number=head["number"])
+            say(feed, "got")
         if head["type"] == kind and holds(head):
             return head
     raise AssertionError(f"no {kind} came")
 
 
-def farewell(feed: ClientConnection) -> tuple[int, str]:
-    """Code and reason with which the other end closes; what comes before is thrown away."""
+def role(feed: ClientConnection, **token: str) -> tuple[str, bool]:
+    """What the server makes of who says hello, and whether it refused a token."""
+    say(feed, "hello", **token)
+    told = hear(feed, "role")
+    return told["role"], told["refused"]
+
+
+def answer(feed: ClientConnection, verb: str, **args: object) -> Any:
+    say(feed, "ask", id=5, verb=verb, args=args)
+    reply = hear(feed, "reply")
+    assert (reply["id"], reply["verb"]) == (5, verb)
+    return reply
+
+
+def farewell(feed: ClientConnection) -> int:
+    """The code with which the other end closes; what comes before is thrown away."""
     with contextlib.suppress(ConnectionClosed):
         while feed.recv(WAIT_S) is not None:
             pass
-    return feed.close_code or 0, feed.close_reason or ""
+    return feed.close_code or 0
 
 
 def taken_apart(part: bytes) -> tuple[Any, bytes]:
-    (size,) = struct.unpack_from("<I", part)
-    return json.loads(part[4 : 4 + size]), part[4 + size :]
+    """Header, with how long it waited, and payload."""
+    waited_ms, size = struct.unpack_from("<fI", part)
+    return {**json.loads(part[8 : 8 + size]), "waited_ms": waited_ms}, part[8 + size :]
 
 
 def raw_feed(viewer: ViewerServer) -> socket.socket:
@@ -114,10 +119,6 @@ def raw_feed(viewer: ViewerServer) -> socket.socket:
         answer += raw.recv(1)
     assert b" 101 " in answer
     return raw
-
-
-def received(message: ViewMessage, age_ms: float = 50.0) -> ReceivedView:
-    return ReceivedView(message=message, age_ms=age_ms, expired=False, skipped=0, restarted=False)
 
 
 def send_raw(raw: socket.socket, what: dict[str, object]) -> None:

@@ -4,7 +4,7 @@ export const BEAT_LOST_MS = 1500; // the server speaks at least twice a second
 export const NODE_SILENT_MS = 1800; // the node itself once a second
 const AGAIN_MS = [250, 500, 1000, 2000, 3000];
 const REPLY_MS = 4000;
-const HEAD_BYTES = 4;
+const HEAD_BYTES = 8;
 
 export class Link {
   // on: one function for each type of message, and `picture(head, bytes)`, `open()`.
@@ -36,8 +36,9 @@ export class Link {
     this.heard = performance.now();
     this.attempts = 0;
     if (typeof data !== "string") {
-      const size = new DataView(data).getUint32(0, true);
-      const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, HEAD_BYTES, size)));
+      const said = new DataView(data);
+      const size = said.getUint32(4, true);
+      const head = read(JSON.parse(new TextDecoder().decode(new Uint8Array(data, HEAD_BYTES, size))), said.getFloat32(0, true));
       this.on.picture(head, new Uint8Array(data, HEAD_BYTES + size), this.heard);
       return;
     }
@@ -103,6 +104,15 @@ export class Link {
     if (silentMs > NODE_SILENT_MS) return ["dead", `the node has been silent for ${seconds(silentMs)}: hung, or gone`];
     return ["alive", ""];
   }
+}
+
+// What the page needs of a picture: the protocol's header, and what the server says of it. Times of capture are seconds.
+function read({ header, kind, offsets, age_ms, left_ms }, waitedMs) {
+  const [frames, height, width] = header.shape;
+  const { fps_cond: fps, epoch } = header.src;
+  const captured_s = header.t_capture.map(([s, ns]) => s + ns / 1e9);
+  const ages = { age_ms: age_ms + waitedMs, left_ms: left_ms - waitedMs };
+  return { ...header, kind, offsets, ...ages, frames, height, width, fps, epoch, captured_s, rev: header.view_rev };
 }
 
 export function seconds(ms) {

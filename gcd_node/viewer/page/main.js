@@ -36,14 +36,14 @@ const link = new Link({
   },
   picture: (head, bytes, at) => {
     taking = taking.then(() => take(head, bytes, at)).catch((error) => console.warn("a picture could not be shown", error))
-      .finally(() => link.say({ type: "got", number: head.number }));
+      .finally(() => link.say({ type: "got" }));
   },
 });
 const controls = new Controls(link);
 
 async function take(head, bytes, at) {
   if (head.kind === "src") return input.take(head, bytes, at);
-  if (head.view !== view.view) return;
+  if (head.view_id !== view.view) return;
   await view.take(head, bytes, at);
 }
 

@@ -60,7 +60,7 @@ export class InputPicture {
     if (this.past.length && this.past.at(-1).head.boot_id !== head.boot_id) this.past = [];
     this.past.push({ head, coded: new Blob([bytes], { type: "image/jpeg" }), at });
     while (at - this.past[0].at > REMEMBERED_MS) this.past.shift();
-    element("input-facts").textContent = `${head.source.kind} ${head.source.id}, ${head.source.fps.toFixed(1)} FPS`;
+    element("input-facts").textContent = `${head.src.kind} ${head.src.id}, ${head.src.fps_in.toFixed(1)} FPS`;
   }
 
   // playing: the frame of the view that is on the screen, to find its moment; null if there is none.
@@ -125,7 +125,7 @@ export class ViewPicture {
     if (head.kind in this.maps) return this.maps[head.kind].take(head, await unpacked(bytes));
     if (head.kind === "std") return this.std.take(head, await unpacked(bytes));
     const bitmaps = await frames(head, bytes);
-    if (head.view !== this.view) return bitmaps.forEach((each) => each.close());
+    if (head.view_id !== this.view) return bitmaps.forEach((each) => each.close());
     this.next?.bitmaps.forEach((each) => each.close());
     this.next = { head, bitmaps, at, decoded: performance.now() };
   }
