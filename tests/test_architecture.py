@@ -23,9 +23,9 @@ OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "w
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
-    ("gcd_node", 61, 15_553),
-    ("tests/node", 86, 15_835),
-    ("train/gcd_train", 149, 31_760),
+    ("gcd_node", 59, 14_236),
+    ("tests/node", 83, 15_132),
+    ("train/gcd_train", 149, 31_642),
     ("tests/train", 90, 15_733),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""

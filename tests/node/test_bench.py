@@ -59,7 +59,7 @@ def test_a_real_node_is_measured_under_the_published_names(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("source", "code", "said"), [('kind = "v4l2"', 64, "--stream"), ('path = "none.mp4"', 70, "no such video")]
+    ("source", "code", "said"), [('kind = "v4l2"', 64, "--stream"), ('path = "none.mp4"', 70, "none.mp4")]
 )
 def test_what_cannot_be_measured_is_one_line(
     source: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
