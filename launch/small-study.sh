@@ -56,7 +56,7 @@ for path in gradual direct; do
     --out "$ROOT/study-$path-scratch" "${TRAIN[@]}" --set "model.weights=$PRETRAINED"
 done
 
-METHODS=copy_source,mean_target,ground_homography,depth_reprojection,depth_reprojection_on_mean,reproject_rgbd,vanilla_svd
+METHODS=copy_source,mean_target,ground_homography,reproject_rgbd,vanilla_svd
 if [ "${HEXPLANE:-yes}" = yes ]; then METHODS=$METHODS,hexplane_1; fi
 BUDGET=(--hexplane-updates "${UPDATES:-200}" --hexplane-rays "${RAYS:-512}")
 MEASURE=(${LPIPS:+--lpips "$LPIPS"} --views last)

@@ -11,10 +11,9 @@ from gcd_train.evaluation.predictors import (
     SourceClip,
     TargetStatistics,
     fit_statistics,
-    pixel_rays,
     to_pictures,
 )
-from gcd_train.evaluation.reprojection import DepthReprojection, GroundHomography, splat
+from gcd_train.evaluation.reprojection import GroundHomography
 
 FRAMES, HEIGHT, WIDTH = 5, 64, 96
 MARK, MARK_CLASS = -1.0, 12
@@ -52,22 +51,6 @@ def agreement(video: torch.Tensor, target: torch.Tensor, seen: torch.Tensor) -> 
     return float(seen.float().mean()), float(error)
 
 
-@pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.9, tilt_deg=4.0)])
-def test_reprojecting_a_plane_gives_the_picture_drawn_by_rays(mount: CameraMount) -> None:
-    clip = plane_clip(cameras(mount))
-    made = DepthReprojection(fill=marked_fill(), classes=13).predict(seen_by(cameras(mount), clip))
-    assert made.video is not None
-    assert made.classes is not None
-    seen = made.video[:, 0] > MARK / 2
-    assert seen.float().mean() > 0.5
-    share, error = agreement(made.video, to_pictures(clip.target), seen & near_ground(clip))
-    assert share > 0.15
-    assert error < 0.03
-    right = made.classes == torch.from_numpy(clip.target_classes)
-    assert right[seen].float().mean() > 0.97
-    assert (made.classes[~seen] == MARK_CLASS).all()
-
-
 @pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.2, tilt_deg=-3.0)])
 def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount: CameraMount) -> None:
     clip = plane_clip(cameras(mount))
@@ -79,15 +62,6 @@ def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount:
     assert share > 0.15
     assert error < 0.03
     assert (made.classes == torch.from_numpy(clip.target_classes))[seen].float().mean() > 0.97
-
-
-def test_the_nearer_surface_hides_the_farther_one() -> None:
-    camera = cameras().source
-    ray = pixel_rays(camera)[20, 30]
-    points = torch.stack([ray * 9.0, ray * 3.0, ray * 20.0])
-    shown, covered = splat(torch.tensor([[0.2, 0.7, 0.9]]), points, camera)
-    assert shown[0, 20, 30].item() == pytest.approx(0.7)
-    assert torch.nonzero(covered).tolist() == [[20, 30]]
 
 
 def test_the_majority_map_takes_the_commonest_class_of_each_pixel() -> None:
@@ -105,16 +79,15 @@ def turned(azimuth_deg: float, elevation_deg: float = 0.0, radius_m: float = 0.0
 
 
 @pytest.mark.parametrize("change", [turned(50.0), turned(-70.0, 20.0, -1.5), turned(0.0, -12.0, 2.0)])
-def test_on_a_plane_that_a_camera_orbits_both_reprojections_give_what_rays_draw(change: SphericalDelta) -> None:
+def test_on_a_plane_that_a_camera_orbits_the_ground_homography_gives_what_rays_draw(change: SphericalDelta) -> None:
     path = spherical_trajectory(STAGE_SOURCE, change, frames=FRAMES, move_time=FRAMES - 1)
     pair = CameraPair.orbit(path, hfov_deg=53.13, height=HEIGHT, width=WIDTH)
     clip = plane_clip(pair)
     fill = TargetStatistics(mean=marked_fill().mean)
-    for each in (GroundHomography(fill=fill), DepthReprojection(fill=fill, classes=0)):
-        made = each.predict(replace(seen_by(pair, clip), source_classes=None))
-        assert made.classes is None
-        assert made.video is not None
-        seen = made.video[:, 0] > MARK / 2
-        share, error = agreement(made.video, to_pictures(clip.target), seen & near_ground(clip))
-        assert share > 0.3
-        assert error < 0.03
+    made = GroundHomography(fill=fill).predict(replace(seen_by(pair, clip), source_classes=None))
+    assert made.classes is None
+    assert made.video is not None
+    seen = made.video[:, 0] > MARK / 2
+    share, error = agreement(made.video, to_pictures(clip.target), seen & near_ground(clip))
+    assert share > 0.3
+    assert error < 0.03

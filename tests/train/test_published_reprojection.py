@@ -94,13 +94,12 @@ def test_points_of_the_data_sets_own_views_are_drawn_instead_where_there_are_som
 
 def test_a_run_is_told_where_holes_of_class_maps_are_of_no_class() -> None:
     filled = replace(SETTINGS, statistics=fit_statistics(PlaneClips.make(1)))
-    names = ("copy_source", "ground_homography", "depth_reprojection", "reproject_semd")
+    names = ("copy_source", "ground_homography", "reproject_semd")
     told = {name: [described(name, each).get("holes") for each in (SETTINGS, filled)] for name in names}
     nothing = "of no class"
     assert told == {
         "copy_source": [None, None],
         "ground_homography": [nothing, None],
-        "depth_reprojection": [nothing, None],
         "reproject_semd": [nothing, nothing],
     }
     assert described("ground_homography", replace(SETTINGS, classes=())) == {
@@ -113,7 +112,6 @@ def test_without_training_clips_holes_are_black_and_the_others_are_offered() -> 
     assert usual_baselines(SETTINGS) == (
         "copy_source",
         "ground_homography",
-        "depth_reprojection",
         "reproject_rgbd",
         "reproject_semd",
     )

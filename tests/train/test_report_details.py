@@ -89,7 +89,7 @@ def test_visible_pixels_diversity_and_sharpness_stand_in_a_table() -> None:
 
 
 @pytest.mark.parametrize("width", [32, 64, 192])
-@pytest.mark.parametrize("name", ["source", "depth_reprojection_on_mean", "plain-small (4 steps)", "W" * 40])
+@pytest.mark.parametrize("name", ["source", "majority_map_of_many_clips", "plain-small (4 steps)", "W" * 40])
 def test_a_caption_is_no_wider_than_its_picture_and_nothing_of_it_is_lost(name: str, width: int) -> None:
     lines, scale = caption(name, width)
     assert all(cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] + 2 <= width for line in lines)

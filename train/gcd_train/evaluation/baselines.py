@@ -41,14 +41,13 @@ from gcd_train.evaluation.predictors import (
 from gcd_train.evaluation.reprojection import (
     REPROJECT_RGBD,
     REPROJECT_SEMD,
-    DepthReprojection,
     GroundHomography,
     ReprojectRgbd,
     ReprojectSemd,
 )
 
-VANILLA_SVD, DEPTH_ON_MEAN = "vanilla_svd", "depth_reprojection_on_mean"
-"""Stable Video Diffusion, and depth reprojection with holes as in the mean target and the majority map."""
+VANILLA_SVD = "vanilla_svd"
+"""Stable Video Diffusion."""
 MOTION_BUCKET = 127.0
 """What Stable Video Diffusion is told of the motion: the middle of its range."""
 FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
@@ -298,8 +297,8 @@ def described(name: str, settings: BaselineSettings, trained_on: str = "nothing"
 
 def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
     """Names of those that need nothing but the clips and, for means, training targets."""
-    means = () if settings.statistics is None else ("mean_target", "majority_map", DEPTH_ON_MEAN)
-    always = ("copy_source", "ground_homography", "depth_reprojection", REPROJECT_RGBD, REPROJECT_SEMD)
+    means = () if settings.statistics is None else ("mean_target", "majority_map")
+    always = ("copy_source", "ground_homography", REPROJECT_RGBD, REPROJECT_SEMD)
     wanted = {*means, *always}
     if not settings.classes:
         wanted -= {"majority_map", REPROJECT_SEMD}
@@ -311,7 +310,7 @@ def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
 def _made(name: str, settings: BaselineSettings) -> Predictor:
     """Raises RecipeError where what it needs is not there."""
     classes, trained = settings.classes, settings.statistics
-    if trained is None and name in ("mean_target", "majority_map", DEPTH_ON_MEAN):
+    if trained is None and name in ("mean_target", "majority_map"):
         raise RecipeError(f"{name} wants training clips for its means: give --train FOLDER, or leave it out")
     fill = settings.fill
     if name in ("majority_map", REPROJECT_SEMD) and not (classes and fill.majority is not None):
@@ -327,18 +326,13 @@ def _made(name: str, settings: BaselineSettings) -> Predictor:
         "copy_source": CopySource,
         "mean_target": lambda: Fixed(name=name, prediction=Prediction(video=fill.mean)),
         "ground_homography": lambda: GroundHomography(fill=fill),
-        "depth_reprojection": lambda: DepthReprojection(fill=fill.constant, classes=len(classes)),
-        DEPTH_ON_MEAN: lambda: DepthReprojection(fill=fill, classes=len(classes), name=DEPTH_ON_MEAN),
         REPROJECT_RGBD: lambda: ReprojectRgbd(published=settings.published),
         REPROJECT_SEMD: lambda: ReprojectSemd(classes=classes, published=settings.published),
     }
     return makers[name]()
 
 
-_NAMES = (
-    *("copy_source", "mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN),
-    *(REPROJECT_RGBD, REPROJECT_SEMD, VANILLA_SVD),
-)
-_OF_MEANS = ("mean_target", "majority_map", "ground_homography", "depth_reprojection", DEPTH_ON_MEAN)
-_WITH_HOLES = ("ground_homography", "depth_reprojection", REPROJECT_SEMD)
+_OF_MEANS = ("mean_target", "majority_map", "ground_homography")
+_NAMES = ("copy_source", *_OF_MEANS, REPROJECT_RGBD, REPROJECT_SEMD, VANILLA_SVD)
+_WITH_HOLES = ("ground_homography", REPROJECT_SEMD)
 _PICTURES_ALONE = ("mean_target", REPROJECT_RGBD, VANILLA_SVD)

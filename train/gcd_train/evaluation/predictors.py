@@ -170,15 +170,6 @@ class TargetStatistics:
     mean: Tensor
     majority: Tensor | None = None
 
-    @property
-    def constant(self) -> "TargetStatistics":
-        """The same without a place: each frame's mean colour and commonest class, everywhere in the frame."""
-        colour = self.mean.mean(dim=(2, 3), keepdim=True).expand_as(self.mean)
-        if self.majority is None:
-            return replace(self, mean=colour)
-        frames = [torch.full_like(frame, int(frame.flatten().mode().values)) for frame in self.majority]
-        return replace(self, mean=colour, majority=torch.stack(frames))
-
 
 def fit_statistics(clips: ClipSource, *, progress: Callable[[int, int], None] | None = None) -> TargetStatistics:
     """Mean picture and majority class of training targets.

@@ -10,12 +10,10 @@ from torch import Tensor
 
 from gcd_model.colours import nearest_classes, palette
 from gcd_model.config import SemanticClass
-from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
-    FAR_M,
     CameraPair,
     Prediction,
     SourceClip,
@@ -27,83 +25,6 @@ from gcd_train.evaluation.predictors import (
     to_pixels,
 )
 from gcd_train.pointcloud import SplatOptions, published_tensor
-
-# Depth and classes are picked a quarter pixel off the middle of a pixel drawn at twice the size, colours are its mean.
-# Rays through the middle are still best: 17.50 dB on 16 held-out clips, against 17.42 through where depth was picked.
-_NEAREST_M = 0.1  # in front of the target camera
-# The two below gave the best PSNR of several on our driving world, level with looking up the exact target depth.
-_SAME_SURFACE = 0.05  # relative depth within which points mix instead of hiding each other
-_LEAST_WEIGHT = 0.2  # bilinear weight from which a point counts as covering a pixel
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DepthReprojection:
-    """Every source pixel as a point in space, splatted into the target camera; points behind others are hidden.
-
-    fill: what is shown where no point falls. classes: how many there are, 0 without an ontology.
-    """
-
-    fill: TargetStatistics
-    classes: int
-    name: str = "depth_reprojection"
-    privileged: bool = True
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor. The sky (depth 0) is taken to be far away."""
-        cameras, depth = clip.cameras, torch.from_numpy(clip.source_depth.copy()).double()
-        values, labels = to_pictures(clip.source), to_labels(clip.source_classes)
-        if labels is not None:  # points show colours and one vote for their class, [T, 3 + K, H, W]
-            votes = F.one_hot(labels.long(), self.classes).permute(0, 3, 1, 2).float()
-            values = torch.cat([values, votes], dim=1)
-        points = pixel_rays(cameras.source) * torch.where(depth > 0, depth, FAR_M)[..., None]
-        target_from_source = invert_rigid(cameras.source_from_target)
-        moved: list[tuple[Tensor, Tensor]] = []
-        for shows, at, pose in zip(values, points, target_from_source, strict=True):
-            at = at.flatten(0, 1) @ pose[:3, :3].T + pose[:3, 3]
-            moved.append(splat(shows.flatten(1), at, cameras.target))
-        shown, covered = (torch.stack(each) for each in zip(*moved, strict=True))
-        video = torch.where(covered[:, None], shown[:, :3], self.fill.mean)
-        if clip.source_classes is None or self.fill.majority is None:
-            return Prediction(video=video)
-        labels = shown[:, 3:].max(dim=1).indices.to(torch.uint8)  # several times faster than argmax
-        return Prediction(video=video, classes=torch.where(covered, labels, self.fill.majority))
-
-
-def splat(values: Tensor, points: Tensor, camera: Intrinsics) -> tuple[Tensor, Tensor]:
-    """Points drawn into a picture, each over the four pixels around it, the nearest surface of each pixel only.
-
-    Args:
-        values: float32 [C, N], what the points show. points: float64 [N, 3] in the camera's axes, metres.
-    Returns:
-        Weighted mean of what falls on each pixel, [C, H, W] (0 where nothing does), and where something does, [H, W].
-    """
-    pixel, weight, owner = _footprints(points, camera)
-    depth = points[owner, 2]
-    nearest = depth.new_full((camera.height * camera.width,), torch.inf).scatter_reduce(0, pixel, depth, "amin")
-    front = depth <= nearest[pixel] * (1 + _SAME_SURFACE)
-    pixel, weight, owner = pixel[front], weight[front].float(), owner[front]
-    total = weight.new_zeros(camera.height * camera.width).index_add(0, pixel, weight)
-    summed = values.new_zeros(len(values), len(total)).index_add(1, pixel, values[:, owner] * weight)
-    shape = (camera.height, camera.width)
-    return (summed / total.clamp(min=_LEAST_WEIGHT)).view(-1, *shape), (total > 0).view(shape)
-
-
-def _footprints(points: Tensor, camera: Intrinsics) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of a point and a pixel it touches: flat pixel number, bilinear weight and point number, [M] each."""
-    ahead = torch.nonzero(points[:, 2] > _NEAREST_M)[:, 0]
-    place = to_pixels(points[ahead], camera) - 0.5  # whole numbers at pixel centres
-    corner = place.floor()
-    pairs: list[tuple[Tensor, Tensor, Tensor]] = []
-    for right in (0, 1):
-        for down in (0, 1):
-            at = corner + corner.new_tensor([right, down])
-            weight = (1 - (place - at).abs()).prod(dim=-1)
-            inside = (at >= 0).all(dim=-1) & (at[:, 0] < camera.width) & (at[:, 1] < camera.height)
-            kept = inside & (weight > _LEAST_WEIGHT)
-            pairs.append(((at[kept, 1] * camera.width + at[kept, 0]).long(), weight[kept], ahead[kept]))
-    pixels, weights, owners = zip(*pairs, strict=True)
-    return torch.cat(pixels), torch.cat(weights), torch.cat(owners)
-
 
 _NEAREST_SOURCE_M = 0.1  # in front of the source camera
 
