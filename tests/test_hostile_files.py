@@ -222,11 +222,6 @@ def base_of_recipe(here: Path, plant: Plant) -> list[str]:
     return ["gcd-train", "recipes", "recipe.toml"]
 
 
-@text_door("toml")
-def distillation(here: Path, plant: Plant) -> list[str]:
-    return ["gcd-train", "train", plant("student.toml"), "--data", "data", "--valid", "valid", "--out", "out"]
-
-
 @text_door("json")
 def pair_world(here: Path, plant: Plant) -> list[str]:
     (here / "pairs").mkdir()

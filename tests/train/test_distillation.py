@@ -4,6 +4,7 @@ import json
 from copy import deepcopy
 from pathlib import Path
 
+import msgspec
 import pytest
 import torch
 from tiny_driving import smaller
@@ -19,58 +20,44 @@ from gcd_train.data.batches import SampleBatches
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
 from gcd_train.errors import Interrupted, RecipeError
-from gcd_train.recipe import OptimiserRecipe, UNetRecipe
+from gcd_train.recipe import OptimiserRecipe, Recipe, SampleLossRecipe, StudentRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
-from gcd_train.recipe_files import checked_recipe
 from gcd_train.stop import StopSignal
-from gcd_train.training.distill import (
-    Distiller,
-    SampleLoss,
-    as_training,
-    colour_loss,
-    sampled,
-    schedule_of,
-    student_config,
-    teacher_of,
-)
-from gcd_train.training.distill_recipe import (
-    DistillRecipe,
-    SampleLossRecipe,
-    StudentRecipe,
-    load_distillation,
-    packaged_distillations,
-)
+from gcd_train.training.distill import SampleLoss, colour_loss, sampled, schedule_of
 from gcd_train.training.draws import Draws
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import Batch, denoiser_of
-from gcd_train.training.run import RunInputs
-from gcd_train.training.setup import Precision, loaded_base
+from gcd_train.training.run import RunInputs, Trainer
+from gcd_train.training.setup import Precision, loaded_base, run_config, student_config
 
 CPU = Precision.of(ComputeRecipe(device="cpu"))
-STAGE = {"budget": {"updates": 2}, "optimiser": {"rate": 1e-3}}
-STUDENT = {"steps": 2, "sigma_min": 1.0, "train": "lora", "lora": {"rank": 2}}
 LOSS = {"latent": 1.0, "l1": 1.0, "frames": 2}
 
 
-def tiny(teacher: Path, **changes: object) -> DistillRecipe:
+def tiny(teacher: Path, **changes: object) -> Recipe:
     table = {
         "name": "tiny-student",
         "seed": 5,
-        "teacher": {"weights": str(teacher)},
-        "student": STUDENT,
+        "model": {"weights": str(teacher), "train": "lora", "lora": {"rank": 2}},
+        "student": {"steps": 2, "sigma_min": 1.0, "learned_steps": [1, 2], "loss": LOSS},
         "compute": {"device": "cpu"},
         "log": {"valid_clips": 1},
-        "latents": {},
-        "batches": {"clip_batch": 1},
-        "paired": {**STAGE, "loss": LOSS, "steps": [1, 2], "ema": {"limit": 0.9}},
+        "latents": {"augmentation": 0.02},
+        "unet": {
+            "budget": {"updates": 2},
+            "optimiser": {"rate": 1e-3},
+            "ema": {"limit": 0.9},
+            "clip_batch": 1,
+            "dropout": 0.0,
+            "loss": {"sensitivity": True},
+        },
     }
-    return checked_recipe({**table, **changes}, "tiny", DistillRecipe)
+    return msgspec.convert({**table, **changes}, Recipe)
 
 
-def distiller(recipe: DistillRecipe, path: Path, stop: StopSignal | None = None) -> Distiller:
-    teacher, data = teacher_of(recipe), RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9))
-    inputs = RunInputs(recipe=as_training(recipe, teacher), data=data, folder=RunFolder(path), stop=stop or Never())
-    return Distiller(inputs, recipe, teacher)
+def distiller(recipe: Recipe, path: Path, stop: StopSignal | None = None) -> Trainer:
+    data = RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9))
+    return Trainer(RunInputs(recipe=recipe, data=data, folder=RunFolder(path), stop=stop or Never()))
 
 
 @pytest.fixture(scope="module")
@@ -184,9 +171,9 @@ def test_a_distillation_ends_in_a_weight_file_that_takes_the_students_steps(run:
 def test_a_distillation_says_what_it_measures(run: Path) -> None:
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     measured = {line["stage"]: line for line in lines if line["kind"] == "measured"}
-    assert set(measured) == {"paired", "export"}
+    assert set(measured) == {"unet", "export"}
     assert all(5 < line["psnr"] < 60 for line in measured.values())
-    said = next(line for line in lines if line["kind"] == "loss" and line["stage"] == "paired")
+    said = next(line for line in lines if line["kind"] == "loss" and line["stage"] == "unet")
     assert {"latent", "l1"} <= set(said)
 
 
@@ -194,14 +181,14 @@ def test_a_distillation_says_what_it_measures(run: Path) -> None:
 def test_a_stopped_distillation_goes_on_to_the_same_weights(run: Path, teacher: Path, tmp_path: Path) -> None:
     (tmp_path / "latents").symlink_to(run / "latents")
     with pytest.raises(Interrupted):
-        distiller(tiny(teacher), tmp_path, After(1)).run("paired")
-    assert saved(tmp_path / "paired", "paired").note.updates == 1
-    distiller(tiny(teacher), tmp_path).run("paired")
-    assert_same_states(tmp_path, run, "paired")
+        distiller(tiny(teacher), tmp_path, After(1)).run("unet")
+    assert saved(tmp_path / "unet", "unet").note.updates == 1
+    distiller(tiny(teacher), tmp_path).run("unet")
+    assert_same_states(tmp_path, run, "unet")
 
 
 def test_the_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher: Path) -> None:
-    paired = saved(run / "paired", "paired").best
+    paired = saved(run / "unet", "unet").best
     adapter = read_adapter(run / "tiny-student-adapter.safetensors")
     assert adapter.tensors.keys() == paired.keys()
     assert all(torch.equal(adapter.tensors[name], paired[name]) for name in paired)
@@ -211,23 +198,11 @@ def test_the_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher
     assert changed == {f"{name.removesuffix('.up')}.weight" for name in paired if name.endswith(".up")}
 
 
-def test_a_recipe_that_cannot_be_run_says_what_is_wrong(teacher: Path) -> None:
-    with pytest.raises(RecipeError, match="go together"):
-        tiny(teacher, latents=None)
+def test_a_student_learns_without_dropout(teacher: Path) -> None:
+    with pytest.raises(msgspec.ValidationError, match=r"\[student\]"):
+        tiny(teacher, unet={"budget": {"updates": 1}, "optimiser": {"rate": 1.0}})
 
 
 def test_a_teacher_whose_camera_goes_another_way_is_refused(teacher: Path) -> None:
     with pytest.raises(RecipeError, match="at its goal in frame 3"):
-        teacher_of(tiny(teacher, data={"path": "direct"}))
-
-
-def test_every_recipe_that_ships_can_be_read() -> None:
-    names = packaged_distillations()
-    assert "distill-kubric" in names
-    assert [load_distillation(f"package:{name}").name for name in names] == names
-
-
-def test_a_recipe_without_a_teacher_is_sent_to_train(tmp_path: Path) -> None:
-    (tmp_path / "plain.toml").write_text("seed = 1\n")
-    with pytest.raises(RecipeError, match=r"names no \[teacher\]"):
-        load_distillation(tmp_path / "plain.toml")
+        run_config(tiny(teacher, data={"path": "direct"}))

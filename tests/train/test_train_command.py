@@ -5,8 +5,8 @@ import msgspec
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
+from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import packaged_recipes
-from gcd_train.training.distill_recipe import DistillRecipe
 
 
 def test_a_missing_recipe_ends_with_the_exit_code_of_a_bad_configuration(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_a_distillation_is_listed_and_shown_whole_and_train_takes_it(tmp_path: P
     assert "package:distill-kubric" in CliRunner().invoke(app, ["recipes"]).output
     shown = CliRunner().invoke(app, ["recipes", "package:distill-kubric", "--set=student.steps=7"])
     assert shown.exit_code == 0, shown.output
-    assert msgspec.convert(tomllib.loads(shown.output), DistillRecipe).student.steps == 7
+    assert msgspec.convert(tomllib.loads(shown.output), Recipe).student.steps == 7
     folders = [f"--{name}={tmp_path}" for name in ("data", "out")]
     refused = CliRunner().invoke(app, ["train", "package:distill-kubric", *folders])
     assert refused.exit_code == 78

@@ -255,6 +255,44 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return self.accumulate if self.batch is None else self.batch // self.clip_batch
 
 
+class SampleLossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a student's sample is compared with its pair in; each is a weight, and what weighs nothing is not computed.
+
+    latent: squared error of latents, with the emphasis and sensitivity that unet.loss says.
+    l1, gradient, ssim, energy: of decoded pictures, see `picture_losses`; `frames` consecutive ones of each clip.
+    colours: cross-entropy of the classes that decoded colours stand for, for models that paint classes; softness is the
+    distance of colours (of 0 to 1) at which it becomes unsure.
+    """
+
+    latent: NotNegative = 1.0
+    l1: NotNegative = 0.0
+    gradient: NotNegative = 0.0
+    ssim: NotNegative = 0.0
+    energy: NotNegative = 0.0
+    colours: NotNegative = 0.0
+    softness: Positive = 0.15
+    frames: Count = 4
+
+    @property
+    def of_pictures(self) -> bool:
+        """Whether anything has to be decoded."""
+        return any((self.l1, self.gradient, self.ssim, self.energy, self.colours))
+
+
+class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A distillation: model.weights are the teacher's, whose networks learn through another sampler, without guidance.
+
+    steps: of the sampler that ships. sigma_max, sigma_min: its first and last noise level; left out as the teacher has
+    them. learned_steps: numbers of steps, of which each update draws one; left out, the student's own alone.
+    """
+
+    steps: Count = 1
+    sigma_max: Positive | None = None
+    sigma_min: Positive | None = None
+    learned_steps: tuple[Count, ...] | None = None
+    loss: SampleLossRecipe = SampleLossRecipe()
+
+
 class ExportRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Weight files that a run writes at its end, each under the recipe's name.
 
@@ -285,6 +323,7 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     vae: VAERecipe | None = None
     latents: LatentsRecipe | None = None
     unet: UNetRecipe
+    student: StudentRecipe | None = None
     export: ExportRecipe = ExportRecipe()
 
     def __post_init__(self) -> None:
@@ -300,6 +339,13 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise ValueError(
                 f'model.train "{self.model.train}" builds on given weights, whose autoencoder must stay: leave [vae] '
                 'out (without = ["vae"])'
+            )
+        if self.student is not None and (
+            self.model.weights is None or self.vae is not None or self.unet.dropout or self.unet.image_share
+        ):
+            raise ValueError(
+                "a [student] learns whole clips of a teacher, and is used without guidance: give model.weights, leave "
+                "out [vae], and set unet.dropout and unet.image_share to 0"
             )
         if (self.data.kind == "cache") != (self.unet.source == "cache"):
             raise ValueError('a latent cache is read with both data.kind "cache" and unet.source "cache"')

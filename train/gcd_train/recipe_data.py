@@ -10,9 +10,8 @@ NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 Count: TypeAlias = Annotated[int, Meta(ge=1)]
 Share: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
 StageName: TypeAlias = Literal["vae", "latents", "unet", "export"]
-DistillStageName: TypeAlias = Literal["latents", "paired", "export"]
 LiveStageName: TypeAlias = Literal["depth", "paint", "detail"]
-AnyStageName: TypeAlias = StageName | DistillStageName | LiveStageName
+AnyStageName: TypeAlias = StageName | LiveStageName
 
 
 class Budget(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

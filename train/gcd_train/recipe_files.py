@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias, TypeVar, cast
+from typing import TypeAlias, cast
 
 import msgspec
 import tomli_w
@@ -18,8 +18,7 @@ from gcd_train.recipe import Recipe
 
 PACKAGED = Path(__file__).parent / "recipes"
 """Where the recipes that ship with the package lie; those that only serve as a base, in `bases/`."""
-DISTILLATIONS = PACKAGED / "distillation"
-BASE, WITHOUT, SMALL, TEACHER = "base", "without", "small", "teacher"
+BASE, WITHOUT, SMALL = "base", "without", "small"
 _DEEPEST = 20
 
 Table: TypeAlias = dict[str, object]
@@ -43,8 +42,7 @@ def recipe_path(source: str | Path, beside: Path | None = None) -> Path:
     """Where a recipe lies: a path, taken from the folder `beside` if it is not absolute, or `package:NAME`."""
     kind, _, name = str(source).partition(":")
     if kind == "package":
-        distillation = DISTILLATIONS / f"{name}.toml"
-        return distillation if distillation.is_file() else PACKAGED / distillation.name
+        return PACKAGED / f"{name}.toml"
     return Path(source) if beside is None else beside / source
 
 
@@ -148,7 +146,6 @@ def _removed(table: Mapping[str, object], keys: Sequence[str], told: str, name: 
     return {**table, first: _removed(cast(Table, below), rest, told, name)}
 
 
-Kind = TypeVar("Kind", bound=msgspec.Struct)
 _KEYS = (*Recipe.__struct_fields__, BASE, WITHOUT, SMALL)
 
 
@@ -171,17 +168,7 @@ def parse_recipe(text: bytes, name: str) -> Recipe:
     return _recipe(MergedTable(parsed(text, name), (name,)), small=False, changes=())
 
 
-def checked_recipe(table: Table, place: str, kind: type[Kind], changes: Sequence[str] = ()) -> Kind:
-    """A table as a recipe of some kind, changed for this run; `place` is for the message. Raises RecipeError."""
-    try:
-        return msgspec.convert(_changed(table, changes), kind)
-    except msgspec.ValidationError as error:
-        raise RecipeError(f"{place}: {explain_settings_error(str(error), kind)}") from error
-
-
 def _recipe(read: MergedTable, *, small: bool, changes: Sequence[str]) -> Recipe:
-    if TEACHER in read.table:
-        raise RecipeError(f"{read.place} has a [{TEACHER}]: it is a distillation, and no recipe of a training")
     require_known(read.table, _KEYS, read.place)
     own = {key: value for key, value in read.table.items() if key not in (SMALL, WITHOUT)}
     if not small:
@@ -213,7 +200,10 @@ def _changed(table: Table, changes: Sequence[str]) -> Table:
 
 
 def _checked(table: Table, place: str) -> Recipe:
-    return checked_recipe(table, place, Recipe)
+    try:
+        return msgspec.convert(table, Recipe)
+    except msgspec.ValidationError as error:
+        raise RecipeError(f"{place}: {explain_settings_error(str(error), Recipe)}") from error
 
 
 def _change(change: str) -> Table:

@@ -1,7 +1,6 @@
 """`gcd-train train`: from a recipe and data to a weight file; `gcd-train recipes`: what there is to train."""
 
 import logging
-import os
 import signal
 import threading
 import warnings
@@ -20,9 +19,8 @@ from gcd_train.cli.common import command_line, errors_shown
 from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
 from gcd_train.recipe import Recipe
-from gcd_train.recipe_data import Budget, ComputeRecipe, DistillStageName, StageName
-from gcd_train.recipe_files import TEACHER, load_recipe, packaged_recipes, read_merged, to_toml
-from gcd_train.training.distill_recipe import DistillRecipe, load_distillation, packaged_distillations
+from gcd_train.recipe_data import Budget, ComputeRecipe, StageName
+from gcd_train.recipe_files import load_recipe, packaged_recipes, to_toml
 
 if TYPE_CHECKING:
     from gcd_train.data.open import DataPlaces
@@ -51,7 +49,7 @@ Changes: TypeAlias = Annotated[
 ]
 Stage: TypeAlias = Annotated[
     str | None,
-    Option(help=f"Only this one: {', '.join(dict.fromkeys((*get_args(StageName), *get_args(DistillStageName))))}."),
+    Option(help=f"Only this one: {', '.join(get_args(StageName))}."),
 ]
 Small: TypeAlias = Annotated[
     bool, Option("--small", help="Model, size, batch and budget of the recipe's table `small`, for a CPU.")
@@ -83,15 +81,10 @@ def train(
         if is_live(recipe):
             _train_live(recipe, data, valid, out)
             return
-        places = DataPlaces(data=data, valid=valid)
-        if TEACHER in read_merged(recipe).table:
-            if small:
-                raise RecipeError(f"{recipe} is a distillation, which has no table `small`; leave out --small")
-            student = load_distillation(recipe, changes or ())
-            _distill(student, places, out, latents, _stage_named(stage, get_args(DistillStageName)))
-            return
         loaded = load_recipe(recipe, small=small, changes=changes or ())
-        _in_processes(loaded, places, out, latents, _stage_named(stage, get_args(StageName)))
+        _in_processes(
+            loaded, DataPlaces(data=data, valid=valid), out, latents, _stage_named(stage, get_args(StageName))
+        )
 
 
 def _stop_when_asked() -> threading.Event:
@@ -136,10 +129,7 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
             console.print(live_toml(recipe), markup=False, end="")
             return
         if recipe is not None:
-            if TEACHER in read_merged(recipe).table:
-                whole = to_toml(load_distillation(recipe, changes or ()))
-            else:
-                whole = to_toml(load_recipe(recipe, small=small, changes=changes or ()))
+            whole = to_toml(load_recipe(recipe, small=small, changes=changes or ()))
             console.print(whole, markup=False, end="")
             return
         table = Table(box=SIMPLE, pad_edge=False, padding=(0, 0))
@@ -149,8 +139,6 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
             table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
         for name in live_recipes():
             table.add_row(f"package:{name}", *_live_row(load_live_recipe(f"package:{name}")))
-        for name in packaged_distillations():
-            table.add_row(f"package:{name}", *_student_row(load_distillation(f"package:{name}")))
         # a name that is cut off cannot be given to `train`: a narrow terminal breaks lines instead
         widest = console.measure(table, options=console.options.update(max_width=1000)).maximum
         console.width = max(console.width, widest)
@@ -161,46 +149,16 @@ def _row(recipe: Recipe) -> tuple[str, ...]:
     data, unet, model = recipe.data, recipe.unet, recipe.model
     kind = data.kind if data.modality == "rgb" else f"{data.kind}, classes"
     clips = f"{unet.clip_batch * unet.parts}"
-    return kind, f"{model.base} ({model.family})", _length(unet.budget), clips, model.weights or "nothing"
+    base = model.base if recipe.student is None else f"student, {recipe.student.steps} steps"
+    return kind, f"{base} ({model.family})", _length(unet.budget), clips, model.weights or "nothing"
 
 
 def _live_row(recipe: LiveRecipe) -> tuple[str, ...]:
     return "live", "live", _length(recipe.paint.budget), f"{recipe.paint.batch} views", "nothing"
 
 
-def _student_row(recipe: DistillRecipe) -> tuple[str, ...]:
-    clips, steps = recipe.batches.clip_batch * recipe.batches.accumulate, recipe.student.steps
-    return (
-        recipe.data.kind,
-        f"student, {steps} steps",
-        _length(recipe.paired.budget),
-        f"{clips}",
-        recipe.teacher.weights,
-    )
-
-
 def _length(budget: Budget) -> str:
     return f"{budget.updates}" if budget.updates is not None else f"{budget.minutes:g} min"
-
-
-def _distill(
-    recipe: DistillRecipe, places: "DataPlaces", out: Path, latents: Path | None, stage: DistillStageName | None
-) -> None:
-    from gcd_train.data.open import open_data
-    from gcd_train.training.distill import Distiller, as_training, teacher_of
-    from gcd_train.training.monitor import RunFolder, TensorBoard
-    from gcd_train.training.run import RunInputs
-
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise RecipeError("a distillation is the work of one process; start it without torchrun")
-    stop, teacher = _stop_when_asked(), teacher_of(recipe)
-    training = as_training(recipe, teacher)
-    folder = RunFolder(out, TensorBoard(out / "tensorboard") if recipe.log.tensorboard else None)
-    data = open_data(training, teacher.config, teacher.family, places)
-    inputs = RunInputs(recipe=training, data=data, folder=folder, stop=stop, latents=latents)
-    distiller = Distiller(inputs, recipe, teacher)
-    with folder.begun(recipe, command_line()):
-        distiller.run(stage)
 
 
 def _in_processes(
@@ -225,11 +183,11 @@ def _run(
     from gcd_train.data.open import open_data
     from gcd_train.training.monitor import RunFolder, TensorBoard
     from gcd_train.training.run import RunInputs, Trainer
-    from gcd_train.training.setup import family_of, model_config
+    from gcd_train.training.setup import family_of, run_config
 
     stop = _stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
-    data = open_data(recipe, model_config(recipe.model), family_of(recipe.model), places)
+    data = open_data(recipe, run_config(recipe), family_of(recipe.model), places)
     folder = RunFolder(out, board)
     inputs = RunInputs(recipe=recipe, data=data, latents=latents, folder=folder, stop=stop, processes=processes)
     trainer = Trainer(inputs)

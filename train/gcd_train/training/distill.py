@@ -4,120 +4,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model import FAMILIES, Family, ModelConfig
+from gcd_model import ModelConfig
 from gcd_model.clip import RenderOptions
 from gcd_model.diffusion import Schedule, sample
-from gcd_model.errors import OptionError
-from gcd_model.networks import LoadedWeights, Networks
-from gcd_model.weights.adapter import base_digest
-from gcd_train.data.latents import EncodedClips
+from gcd_model.networks import Networks
 from gcd_train.errors import RecipeError
-from gcd_train.recipe import LossRecipe, ModelRecipe, OptimiserRecipe, Recipe, UNetRecipe
-from gcd_train.recipe_data import AnyStageName, Budget
-from gcd_train.training.distill_recipe import BatchRecipe, DistillRecipe, PairedRecipe, SampleLossRecipe, StudentRecipe
+from gcd_train.recipe import SampleLossRecipe, StudentRecipe, UNetRecipe
 from gcd_train.training.draws import Draws
 from gcd_train.training.export import Validation
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import energy_l1, frame_losses, gradient_l1, ssim
 from gcd_train.training.objective import Batch, BatchSource, Denoiser, denoiser_of, draw_noise
 from gcd_train.training.optimiser import ParameterGroup
-from gcd_train.training.run import RunInputs, Trainer
-from gcd_train.training.setup import Precision, digest_of, loaded_base
+from gcd_train.training.setup import Precision
 from gcd_train.training.trainable import keep_trained_alone
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Teacher:
-    """What a weight file says of itself. config: the teacher's own. move_time: frame in which the goal is reached."""
-
-    config: ModelConfig
-    family: Family
-    move_time: int
-
-
-def teacher_of(recipe: DistillRecipe) -> Teacher:
-    """Read the teacher's card.
-
-    Raises:
-        RecipeError: nobody says what family it is of, or its camera goes another way than [data] says.
-        CheckpointError: the file is missing or cannot be read.
-    """
-    loaded = loaded_base(recipe.teacher.weights)
-    teacher = Teacher(config=loaded.diffusion.config, family=_family(recipe, loaded), move_time=loaded.move_time)
-    goal = recipe.data.goal_frame(teacher.config.frames)
-    if teacher.move_time != goal:
-        raise RecipeError(
-            f"{recipe.teacher.weights} is at its goal in frame {teacher.move_time}, the recipe's [data] says frame "
-            f"{goal}; set data.path, or data.move_time"
-        )
-    return teacher
-
-
-def student_config(teacher: ModelConfig, recipe: StudentRecipe) -> ModelConfig:
-    """The teacher's networks, sampled in the student's steps and without guidance.
-
-    Raises RecipeError for noise levels that do not fall.
-    """
-    sampling = teacher.sampling
-    high, low = recipe.sigma_max or sampling.sigma_max, recipe.sigma_min or sampling.sigma_min
-    if recipe.steps > 1 and low >= high:
-        raise RecipeError(f"student.sigma_min must be below sigma_max, got {low:g} and {high:g}; change one of them")
-    changed = msgspec.structs.replace(sampling, steps=recipe.steps, sigma_max=high, sigma_min=low, guidance=(1.0, 1.0))
-    return msgspec.structs.replace(teacher, sampling=changed)
-
-
-def as_training(recipe: DistillRecipe, teacher: Teacher) -> Recipe:
-    """The distillation as far as a training says it: what data, encoders and batches are told.
-
-    Raises RecipeError for what a training would refuse, too.
-    """
-    batches, told, student = recipe.batches, recipe.batches.augmentation, recipe.student
-    unet = UNetRecipe(
-        budget=Budget(updates=1),
-        optimiser=OptimiserRecipe(rate=1.0),
-        source=batches.source,
-        clip_batch=batches.clip_batch,
-        accumulate=batches.accumulate,
-        dropout=0.0,
-        augmentation=teacher.config.sampling.augmentation if told is None else told,
-        fps=batches.fps,
-        motion_bucket=batches.motion_bucket,
-        loss=LossRecipe(class_weights=recipe.paired.loss.class_weights),
-    )
-    try:
-        return Recipe(
-            name=recipe.name,
-            seed=recipe.seed,
-            data=recipe.data,
-            model=ModelRecipe(
-                weights=recipe.teacher.weights, family=teacher.family.name, train=student.train, lora=student.lora
-            ),
-            compute=recipe.compute,
-            log=recipe.log,
-            latents=recipe.latents,
-            unet=unet,
-            export=recipe.export,
-        )
-    except (ValueError, OptionError) as error:
-        raise RecipeError(f"the recipe cannot be run: {error}") from error
-
-
-def _family(recipe: DistillRecipe, loaded: LoadedWeights) -> Family:
-    named = recipe.teacher.family
-    if named is None and loaded.family is not None:
-        return loaded.family
-    family = None if named is None else FAMILIES.get(named)
-    if family is None:
-        raise RecipeError(
-            f"teacher.family must be one of {', '.join(FAMILIES)}, as {recipe.teacher.weights} does not tell; "
-            f"got {named!r}"
-        )
-    return family
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +33,7 @@ class Compared:
 
 
 class SampleLoss:
-    """The paired loss of one stage.
+    """The loss of a student.
 
     Pictures are compared with what the autoencoder makes of the true latents, so what it cannot draw is no fault of
     the student's, and no pictures have to be read. Raises RecipeError for losses the model has nothing to put in.
@@ -254,16 +158,16 @@ class PairedTask:
         networks: Networks,
         batches: BatchSource,
         validation: Validation,
-        recipe: PairedRecipe,
-        taken: BatchRecipe,
+        recipe: UNetRecipe,
+        student: StudentRecipe,
         loss: SampleLoss,
         precision: Precision,
         seed: int,
     ) -> None:
-        """networks: the student's, of its own config. taken: how batches are."""
+        """networks: the student's, of its own config. recipe: how batches are."""
         self._networks, self._batches, self._validation = networks, batches, validation
-        self._taken, self._loss, self._precision, self._seed = taken, loss, precision, seed
-        self._steps = recipe.steps or (networks.config.sampling.steps,)
+        self._recipe, self._loss, self._precision, self._seed = recipe, loss, precision, seed
+        self._steps = student.learned_steps or (networks.config.sampling.steps,)
         self._denoiser = precision.placed(denoiser_of(networks))
         keep_trained_alone(self._denoiser)
 
@@ -279,9 +183,9 @@ class PairedTask:
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """How far samples from fresh noise are from their pairs."""
-        taken, number = self._taken, progress.updates * self._taken.accumulate + progress.part
+        recipe, number = self._recipe, progress.updates * self._recipe.parts + progress.part
         draws = Draws(self._seed, "paired", number, self._precision.device)
-        batch = self._batches.whole_clips(draws, taken.clip_batch)
+        batch = self._batches.whole_clips(draws, recipe.clip_batch)
         schedule = schedule_of(self._networks.config, drawn_steps(self._steps, draws))
         with self._precision.arithmetic():
             made = sampled(self._denoiser, batch, start_of(batch, self._networks.config, draws), schedule)
@@ -295,27 +199,3 @@ class PairedTask:
     def measure(self, picture: Path) -> dict[str, float]:
         """Held-out clips through the shipped synthesizer, in the student's own steps."""
         return self._validation.measure(self._networks, picture)
-
-
-class Distiller(Trainer):
-    """A training whose denoiser learns through its own sampler, from where its teacher stands."""
-
-    denoiser_stage: AnyStageName = "paired"
-
-    def __init__(self, inputs: RunInputs, recipe: DistillRecipe, teacher: Teacher) -> None:
-        """inputs: with the recipe that `as_training` makes. Raises RecipeError as `Trainer`, and `student_config`."""
-        self._paired, self._taken = recipe.paired, recipe.batches
-        super().__init__(inputs, student_config(teacher.config, recipe.student))
-
-    def _identity(self, networks: Networks) -> str:
-        model = self._recipe.model
-        told = digest_of(self._recipe.seed, self._config.sampling, model.train, model.lora)
-        return f"{base_digest(networks.state_dict())}-{told}"
-
-    def _train(self, networks: Networks, batches: BatchSource, clips: EncodedClips | None, identity: str) -> None:
-        recipe, precision = self._paired, self._precision
-        weights = self._weights(clips) if recipe.loss.sensitivity else None
-        loss = SampleLoss(networks, recipe.loss, weights, precision)
-        seed = self._recipe.seed
-        task = PairedTask(networks, batches, self._validation(), recipe, self._taken, loss, precision, seed)
-        self._loop(task, "paired", recipe, identity, self._taken.accumulate)

@@ -23,6 +23,7 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
 from gcd_train.recipe_data import AnyStageName, Budget
 from gcd_train.stop import StopSignal
+from gcd_train.training.distill import PairedTask, SampleLoss
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.export import ExportJob, Validation, export
 from gcd_train.training.loop import Loop, LoopOptions, Task
@@ -34,8 +35,8 @@ from gcd_train.training.setup import (
     digest_of,
     family_of,
     fill,
-    model_config,
     require_exportable,
+    run_config,
     sampled_as_trained,
     start_networks,
 )
@@ -43,6 +44,7 @@ from gcd_train.training.trainable import adapter_of, halve_frozen, let_train, me
 from gcd_train.training.vae import VAETask
 
 _log = logging.getLogger(__name__)
+_DENOISER: AnyStageName = "unet"  # the stage that several processes share
 
 
 class StageTable(Protocol):
@@ -73,19 +75,16 @@ class RunInputs:
 
 
 class Trainer:
-    """The stages of one run, of a training or a distillation, in their order; each goes on where it stopped.
+    """The stages of one run in their order; each goes on where it stopped."""
 
-    config: of the networks, where the recipe's [model] does not say it.
-    """
-
-    denoiser_stage: AnyStageName = "unet"
-    """The stage that trains the denoiser: the one that several processes share."""
-
-    def __init__(self, inputs: RunInputs, config: ModelConfig | None = None) -> None:
-        """Raises RecipeError if the recipe's model cannot be built or exported, or its device is not there."""
+    def __init__(self, inputs: RunInputs) -> None:
+        """Raises RecipeError if the recipe's model cannot be built or exported, its device is not there, or a student
+        is to learn in several processes."""
+        if inputs.recipe.student is not None and inputs.processes.count > 1:
+            raise RecipeError("a distillation is the work of one process; start it without torchrun")
         self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
         self._family = family_of(inputs.recipe.model)
-        self._config = config or self._trained_config()
+        self._config = self._trained_config()
         require_exportable(inputs.recipe, self._config)
         self._precision = Precision.of(inputs.recipe.compute)
         self._engine = Engine(processes=inputs.processes, compute=inputs.recipe.compute)
@@ -113,7 +112,7 @@ class Trainer:
             raise RecipeError(f"this recipe has no stage {only!r}, only {', '.join(steps)}")
         for stage in (only,) if only else steps:
             _log.info("stage %s", stage)
-            if stage == self.denoiser_stage:
+            if stage == _DENOISER:
                 steps[stage]()
             else:
                 self._inputs.processes.by_the_first(steps[stage], self._inputs.stop)
@@ -125,15 +124,16 @@ class Trainer:
             steps["vae"] = partial(self._train_vae, self._recipe.vae)
         if self._recipe.latents is not None:
             steps["latents"] = lambda: self._encodings.encode(self._start())
-        return {**steps, self.denoiser_stage: self._train_denoiser, "export": self._export}
+        return {**steps, _DENOISER: self._train_denoiser, "export": self._export}
 
     def _trained_config(self) -> ModelConfig:
         """The networks' config, by the recipe. Raises DataError for clips that do not fit it."""
         recipe, data = self._recipe, self._inputs.data
-        config = model_config(recipe.model)
-        if self._family.output == "semantic" and data.valid.classes:
-            config = msgspec.structs.replace(config, semantic_classes=tuple(data.valid.classes))
-        config = sampled_as_trained(config, recipe.unet)
+        config = run_config(recipe)
+        if recipe.student is None:
+            if self._family.output == "semantic" and data.valid.classes:
+                config = msgspec.structs.replace(config, semantic_classes=tuple(data.valid.classes))
+            config = sampled_as_trained(config, recipe.unet)
         for clips in (data.clips, data.valid):
             require_fit(clips, config, recipe.unet.fps)
         return config
@@ -149,7 +149,7 @@ class Trainer:
         """Put in what the denoiser's stage trained, adapters beside their layers; returns its updates so far."""
         identity = self._identity(networks)
         let_train(networks, self._recipe.model, self._recipe.seed)
-        return fill(networks, self._folder, self.denoiser_stage, identity)
+        return fill(networks, self._folder, _DENOISER, identity)
 
     def _adapter(self, card: Card) -> Adapter:
         """What the denoiser's stage trained, apart from its base."""
@@ -164,8 +164,14 @@ class Trainer:
     def _identity(self, networks: Networks) -> str:
         """What the state of the denoiser's stage belongs to; `networks` hold what was trained before it."""
         config, model = self._config, self._recipe.model
-        shape = digest_of(config.unet, config.prediction, self._recipe.seed)
-        part = "" if model.train == "all" else f"-{base_digest(networks.state_dict())}-{digest_of(model.lora)}"
+        told = (config.unet, config.prediction, self._recipe.seed)
+        student = self._recipe.student is not None
+        shape = digest_of(*told, *((config.sampling,) if student else ()))
+        part = (
+            ""
+            if model.train == "all" and not student
+            else f"-{base_digest(networks.state_dict())}-{digest_of(model.lora)}"
+        )
         return f"{autoencoder_digest(networks)}-{shape}{part}"
 
     def _loop(self, task: Task, stage: AnyStageName, table: StageTable, identity: str, parts: int = 1) -> None:
@@ -179,7 +185,7 @@ class Trainer:
             stop=self._inputs.stop,
             frames_per_clip=self._config.frames,
             parts=parts,
-            engine=self._engine if stage == self.denoiser_stage else Engine(),
+            engine=self._engine if stage == _DENOISER else Engine(),
         )
         Loop(task, self._folder, options).run()
 
@@ -204,8 +210,14 @@ class Trainer:
         """Train networks that lie ready. clips: encoded ones, where batches are made of such."""
         recipe, seed = self._recipe.unet, self._recipe.seed
         weights = self._weights(clips) if recipe.loss.sensitivity else None
-        task = UNetTask(networks, batches, self._validation(), recipe, weights, self._precision, seed)
-        self._loop(task, "unet", recipe, identity, recipe.parts)
+        student, precision = self._recipe.student, self._precision
+        task: Task
+        if student is None:
+            task = UNetTask(networks, batches, self._validation(), recipe, weights, precision, seed)
+        else:
+            loss = SampleLoss(networks, student.loss, weights, precision)
+            task = PairedTask(networks, batches, self._validation(), recipe, student, loss, precision, seed)
+        self._loop(task, _DENOISER, recipe, identity, recipe.parts)
 
     def _export(self) -> None:
         recipe, networks = self._recipe, self._start()

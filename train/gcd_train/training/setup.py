@@ -19,7 +19,7 @@ from gcd_model.weights.adapter import DIFFUSION, carried_over
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state
 from gcd_train.errors import RecipeError, RunError
-from gcd_train.recipe import ModelRecipe, Recipe, UNetChanges, UNetRecipe, VAEChanges
+from gcd_train.recipe import ModelRecipe, Recipe, StudentRecipe, UNetChanges, UNetRecipe, VAEChanges
 from gcd_train.recipe_data import AnyStageName, ComputeRecipe
 from gcd_train.training.checkpoint import newest_weights, require_identity
 from gcd_train.training.monitor import RunFolder
@@ -30,11 +30,9 @@ _BASES: dict[str, ModelConfig] = {
     "svd-14": SVD_14,
     "small": SMALL,
 }
-_DENOISER = ("unet.", "camera.")
 _PREFIXES: dict[AnyStageName, tuple[str, ...]] = {
     "vae": ("target_encoder.", "decoder."),
-    "unet": _DENOISER,
-    "paired": _DENOISER,
+    "unet": ("unet.", "camera."),
 }
 
 
@@ -64,6 +62,42 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
             f"numbers; got {config.height} and {config.width}"
         )
     return config
+
+
+def run_config(recipe: Recipe) -> ModelConfig:
+    """The networks of a run: a student's are its teacher's, sampled in the student's steps and without guidance.
+
+    Raises:
+        RecipeError: as `model_config`; a teacher of another family or path than the recipe says, or noise levels that
+            do not fall. CheckpointError: the teacher's file is missing or cannot be read.
+    """
+    student, weights = recipe.student, recipe.model.weights
+    if student is None or weights is None:
+        return model_config(recipe.model)
+    teacher = loaded_base(weights)
+    config, family = teacher.diffusion.config, family_of(recipe.model)
+    if teacher.family not in (None, family):
+        raise RecipeError(f"{weights} is of the family {teacher.family.name}; set model.family to it")
+    goal = recipe.data.goal_frame(config.frames)
+    if teacher.move_time != goal:
+        raise RecipeError(
+            f"{weights} is at its goal in frame {teacher.move_time}, the recipe's [data] says frame {goal}; set "
+            "data.path, or data.move_time"
+        )
+    return student_config(config, student)
+
+
+def student_config(teacher: ModelConfig, recipe: StudentRecipe) -> ModelConfig:
+    """The teacher's networks, sampled in the student's steps and without guidance.
+
+    Raises RecipeError for noise levels that do not fall.
+    """
+    sampling = teacher.sampling
+    high, low = recipe.sigma_max or sampling.sigma_max, recipe.sigma_min or sampling.sigma_min
+    if recipe.steps > 1 and low >= high:
+        raise RecipeError(f"student.sigma_min must be below sigma_max, got {low:g} and {high:g}; change one of them")
+    changed = msgspec.structs.replace(sampling, steps=recipe.steps, sigma_max=high, sigma_min=low, guidance=(1.0, 1.0))
+    return msgspec.structs.replace(teacher, sampling=changed)
 
 
 def _paints(recipe: ModelRecipe) -> bool:
