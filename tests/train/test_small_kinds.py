@@ -24,7 +24,7 @@ from gcd_train.data.loader import LoadedBatch
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import ClipSource, PaintedClips, SomeClips, collate, to_network
 from gcd_train.errors import DataError, Interrupted
-from gcd_train.recipe import ClassWeightsName, NoiseRecipe, Recipe
+from gcd_train.recipe import ClassWeightsName, Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
 from gcd_train.stop import StopSignal
 from gcd_train.training.conditioner import Conditioner, mirrored_path
@@ -32,7 +32,7 @@ from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.run import RunInputs, Trainer
-from gcd_train.training.setup import Precision, model_config, sampled_as_trained, start_networks
+from gcd_train.training.setup import Precision, model_config, start_networks
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
@@ -293,17 +293,6 @@ def test_people_and_vehicles_of_our_world_count_as_published(name: str, factor: 
     weights: ClassWeightsName = "driving"
     emphasis = class_emphasis(painted_one, COLOUR_WEIGHTS[weights], (1, 1))
     assert emphasis.item() == pytest.approx(factor - 1)
-
-
-def test_late_noise_takes_over_where_the_recipe_says() -> None:
-    mixed = NoiseRecipe(fixed_share=0.5)
-    unet = msgspec.structs.replace(
-        tiny_recipe().unet, noise=NoiseRecipe(fixed_share=1.0, fixed_sigma=40.0), late_noise=mixed, late_from=0.8
-    )
-    assert unet.noise_at(0.79).fixed_share == 1.0
-    assert unet.noise_at(0.8) is mixed
-    config = model_config(tiny_recipe().model)
-    assert sampled_as_trained(config, unet).sampling.steps == 4  # sigma 80 is among the late ones
 
 
 @pytest.mark.parametrize(

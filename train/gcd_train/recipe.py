@@ -213,8 +213,6 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     streams, instead of one each as released.
     augmentation: noise strength on source frames, what the network is told and, with "pixels", what it gets.
     fps, motion_bucket: what the network is told where the clip or its camera path does not say it.
-    late_noise: noise levels from the share `late_from` of the budget on, so that a network that first learned one step
-    also learns several.
     """
 
     budget: Budget
@@ -227,8 +225,6 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     accumulate: Count = 1
     batch: Count | None = None
     noise: NoiseRecipe = NoiseRecipe()
-    late_noise: NoiseRecipe | None = None
-    late_from: Share = 1.0
     loss: LossRecipe = LossRecipe()
     dropout: Share = 0.1
     dropout_per: Literal["frame", "clip"] = "frame"
@@ -244,10 +240,6 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             raise ValueError(f"a batch of {self.batch} clips is no multiple of clip_batch, {self.clip_batch}")
         if self.accumulate != 1:
             raise ValueError("an update's clips are told by batch or by accumulate: give one of them")
-
-    def noise_at(self, share: float) -> NoiseRecipe:
-        """The noise levels when that share of the budget is used."""
-        return self.noise if self.late_noise is None or share < self.late_from else self.late_noise
 
     @property
     def parts(self) -> int:

@@ -234,7 +234,7 @@ class UNetTask:
             batch,
             draws,
             self._precision,
-            noise=recipe.noise_at(progress.share),
+            noise=recipe.noise,
             loss=recipe.loss,
             channel_weights=self._weights,
             step=progress.updates,

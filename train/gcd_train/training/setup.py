@@ -141,7 +141,7 @@ def sampled_as_trained(config: ModelConfig, recipe: UNetRecipe) -> ModelConfig:
 
     Raises RecipeError if the sampler visits noise levels that the recipe never trains.
     """
-    sampling, noise = config.sampling, recipe.noise_at(1.0)
+    sampling, noise = config.sampling, recipe.noise
     if noise.fixed_share == 1 and (sampling.steps, sampling.sigma_max) != (1, noise.fixed_sigma):
         raise RecipeError(
             f"the recipe trains sigma {noise.fixed_sigma:g} alone, the model is sampled in {sampling.steps} steps from "
