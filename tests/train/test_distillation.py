@@ -11,7 +11,7 @@ from tiny_driving import smaller
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved
 
 from gcd_model import Clip, RenderOptions, Synthesizer, Traits, load_synthesizer
-from gcd_model.config import DRIVING_CLASSES, SVD_14
+from gcd_model.config import SVD_14
 from gcd_model.networks import Networks, random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
@@ -20,10 +20,10 @@ from gcd_train.data.batches import SampleBatches
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
 from gcd_train.errors import Interrupted, RecipeError
-from gcd_train.recipe import OptimiserRecipe, Recipe, SampleLossRecipe, StudentRecipe, UNetRecipe
+from gcd_train.recipe import OptimiserRecipe, Recipe, StudentRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
 from gcd_train.stop import StopSignal
-from gcd_train.training.distill import SampleLoss, colour_loss, sampled, schedule_of
+from gcd_train.training.distill import sampled, schedule_of
 from gcd_train.training.draws import Draws
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import Batch, denoiser_of
@@ -31,7 +31,6 @@ from gcd_train.training.run import RunInputs, Trainer
 from gcd_train.training.setup import Precision, loaded_base, run_config, student_config
 
 CPU = Precision.of(ComputeRecipe(device="cpu"))
-LOSS = {"latent": 1.0, "l1": 1.0, "frames": 2}
 
 
 def tiny(teacher: Path, **changes: object) -> Recipe:
@@ -39,7 +38,7 @@ def tiny(teacher: Path, **changes: object) -> Recipe:
         "name": "tiny-student",
         "seed": 5,
         "model": {"weights": str(teacher), "train": "lora", "lora": {"rank": 2}},
-        "student": {"steps": 2, "sigma_min": 1.0, "learned_steps": [1, 2], "loss": LOSS},
+        "student": {"steps": 2, "sigma_min": 1.0, "learned_steps": [1, 2]},
         "compute": {"device": "cpu"},
         "log": {"valid_clips": 1},
         "latents": {"augmentation": 0.02},
@@ -137,25 +136,6 @@ def test_a_student_has_its_own_steps_and_no_guidance() -> None:
         student_config(config, StudentRecipe(steps=2, sigma_min=900.0))
 
 
-def test_a_colour_between_two_classes_costs_more_than_either() -> None:
-    colours = torch.tensor([kind.colour for kind in DRIVING_CLASSES]) / 255
-    road, car = (colours[i].view(1, 3, 1, 1) * 2 - 1 for i in (1, 8))
-    right, between, wrong = (colour_loss(each, car, colours, 0.15) for each in (car, (road + car) / 2, road))
-    assert right < between < wrong
-
-
-def test_losses_that_the_model_cannot_have_are_refused(networks: Networks) -> None:
-    with pytest.raises(RecipeError, match=r"loss\.colours"):
-        SampleLoss(networks, SampleLossRecipe(colours=1.0), None, CPU)
-
-
-def test_a_perfect_sample_costs_nothing(networks: Networks, batch: Batch) -> None:
-    loss = SampleLoss(networks, SampleLossRecipe(l1=1.0, gradient=1.0, ssim=1.0, energy=1.0), None, CPU)
-    compared = loss.of(batch.target, batch, Draws(0, "run", 0, CPU.device))
-    assert set(compared.parts) == {"latent", "l1", "gradient", "ssim", "energy"}
-    assert compared.total.item() == pytest.approx(0.0, abs=1e-5)
-
-
 def test_a_distillation_ends_in_a_weight_file_that_takes_the_students_steps(run: Path) -> None:
     synthesizer = load_synthesizer(run / "tiny-student.safetensors", device="cpu")
     sampling = synthesizer.traits.config.sampling
@@ -174,7 +154,7 @@ def test_a_distillation_says_what_it_measures(run: Path) -> None:
     assert set(measured) == {"unet", "export"}
     assert all(5 < line["psnr"] < 60 for line in measured.values())
     said = next(line for line in lines if line["kind"] == "loss" and line["stage"] == "unet")
-    assert {"latent", "l1"} <= set(said)
+    assert said["latent"] > 0
 
 
 @pytest.mark.slow

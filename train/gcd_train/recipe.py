@@ -247,32 +247,9 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return self.accumulate if self.batch is None else self.batch // self.clip_batch
 
 
-class SampleLossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a student's sample is compared with its pair in; each is a weight, and what weighs nothing is not computed.
-
-    latent: squared error of latents, with the emphasis and sensitivity that unet.loss says.
-    l1, gradient, ssim, energy: of decoded pictures, see `picture_losses`; `frames` consecutive ones of each clip.
-    colours: cross-entropy of the classes that decoded colours stand for, for models that paint classes; softness is the
-    distance of colours (of 0 to 1) at which it becomes unsure.
-    """
-
-    latent: NotNegative = 1.0
-    l1: NotNegative = 0.0
-    gradient: NotNegative = 0.0
-    ssim: NotNegative = 0.0
-    energy: NotNegative = 0.0
-    colours: NotNegative = 0.0
-    softness: Positive = 0.15
-    frames: Count = 4
-
-    @property
-    def of_pictures(self) -> bool:
-        """Whether anything has to be decoded."""
-        return any((self.l1, self.gradient, self.ssim, self.energy, self.colours))
-
-
 class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A distillation: model.weights are the teacher's, whose networks learn through another sampler, without guidance.
+    """A distillation: model.weights are the teacher's, whose networks learn through another sampler, without
+    guidance, by the squared error of latents with the emphasis and sensitivity that unet.loss says.
 
     steps: of the sampler that ships. sigma_max, sigma_min: its first and last noise level; left out as the teacher has
     them. learned_steps: numbers of steps, of which each update draws one; left out, the student's own alone.
@@ -282,7 +259,6 @@ class StudentRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     sigma_max: Positive | None = None
     sigma_min: Positive | None = None
     learned_steps: tuple[Count, ...] | None = None
-    loss: SampleLossRecipe = SampleLossRecipe()
 
 
 class ExportRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -143,8 +143,6 @@ def frame_losses(
 
 _C1, _C2 = 0.01**2, 0.03**2
 _WINDOW, _WINDOW_SIGMA = 7, 1.5
-_CELL = 8
-_FLAT = 1e-6  # keeps the root differentiable where nothing changes; brightness squared
 
 
 def gradient_l1(pictures: Tensor, targets: Tensor) -> Tensor:
@@ -153,15 +151,6 @@ def gradient_l1(pictures: Tensor, targets: Tensor) -> Tensor:
     across = (difference[..., 1:] - difference[..., :-1]).abs().mean()
     down = (difference[..., 1:, :] - difference[..., :-1, :]).abs().mean()
     return across + down
-
-
-def energy_l1(pictures: Tensor, targets: Tensor) -> Tensor:
-    """Mean absolute difference of how much is drawn in cells of 8 pixels a side, [N, C, H, W] each -> scalar.
-
-    How much is the mean length of the gradient. Where it lies within a cell is not asked: being sharp at all pays here,
-    which differences pixel by pixel punish. What is left over beside whole cells is not looked at.
-    """
-    return (_energy(pictures) - _energy(targets)).abs().mean()
 
 
 def ssim(pictures: Tensor, targets: Tensor) -> Tensor:
@@ -185,12 +174,6 @@ def kl_to_normal(posterior: Posterior) -> Tensor:
     """
     log_variance = posterior.log_variance
     return 0.5 * (posterior.mean**2 + log_variance.exp() - 1 - log_variance).mean()
-
-
-def _energy(x: Tensor) -> Tensor:
-    across = x[..., :-1, 1:] - x[..., :-1, :-1]
-    down = x[..., 1:, :-1] - x[..., :-1, :-1]
-    return F.avg_pool2d((across**2 + down**2 + _FLAT).sqrt(), _CELL)
 
 
 def _smoothed(x: Tensor) -> Tensor:

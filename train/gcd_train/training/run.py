@@ -23,7 +23,7 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
 from gcd_train.recipe_data import AnyStageName, Budget
 from gcd_train.stop import StopSignal
-from gcd_train.training.distill import PairedTask, SampleLoss
+from gcd_train.training.distill import StudentTask
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.export import ExportJob, Validation, export
 from gcd_train.training.loop import Loop, LoopOptions, Task
@@ -215,8 +215,7 @@ class Trainer:
         if student is None:
             task = UNetTask(networks, batches, self._validation(), recipe, weights, precision, seed)
         else:
-            loss = SampleLoss(networks, student.loss, weights, precision)
-            task = PairedTask(networks, batches, self._validation(), recipe, student, loss, precision, seed)
+            task = StudentTask(networks, batches, self._validation(), recipe, student, weights, precision, seed)
         self._loop(task, _DENOISER, recipe, identity, recipe.parts)
 
     def _export(self) -> None:
