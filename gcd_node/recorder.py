@@ -11,14 +11,11 @@ import os
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeAlias
-
-from mcap.writer import CompressionType, Writer
 
 from gcd_client.protocol import PROTO, EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_node.auth import Client
@@ -30,19 +27,16 @@ from gcd_node.messages import MessageSink, PublisherStats, utc_offset_ns
 from gcd_node.ros_messages import (
     COMMAND_TOPIC,
     IMAGE_TOPIC,
-    RosMessage,
+    McapFile,
     command_messages,
-    definition,
     input_messages,
     note_messages,
-    serialized,
     view_messages,
     view_topic,
 )
 
 _LOG = logging.getLogger(__name__)
 _MB = 10**6
-_CHUNK_BYTES = 64 * 1024  # what a reader can lose of a file that was never finished
 _QUEUED_BYTES, _QUEUED_ITEMS = 64 * 2**20, 4096
 _LOCKSTEP_S, _PATIENCE_S, _FLUSH_S = 5.0, 10.0, 2.0
 _DRIFT_NS = 1_000_000
@@ -73,65 +67,6 @@ def check_room(config: RecordConfig, root: Path) -> float:
         limit = f"keep_free_mb is {config.keep_free_mb:g}: make room on it"
         raise RoomError("DISK_LOW", f"the disk of {root} has {free_mb:.0f} MB left, {limit}")
     return free_mb
-
-
-class McapFile:
-    """An MCAP file being written. size, messages: so far. begun_ns: UTC."""
-
-    def __init__(self, path: Path) -> None:
-        """Create `path`. Raises OSError: it is there already, or cannot be."""
-        self.path, self.begun_ns = path, time.time_ns()
-        self._file = path.open("xb")
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library=f"gcd-node; mcap-python/{version('mcap')}")
-        self._ids: dict[str, int] = {}  # of a type its schema's, of a topic its channel's
-        self.size = self.messages = 0
-
-    def describe(self, name: str, facts: Mapping[str, str]) -> None:
-        """Add metadata."""
-        self._writer.add_metadata(name, dict(facts))
-
-    def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Add a file."""
-        self._writer.add_attachment(self.begun_ns, self.begun_ns, name, media_type, data)
-
-    def write(self, messages: Iterable[RosMessage]) -> None:
-        """Add messages that belong together: all of them, or none if one cannot be made. Raises OSError."""
-        for each, data in [(each, serialized(each.fields)) for each in messages]:
-            kind = each.fields.__msgtype__
-            if kind not in self._ids:
-                self._ids[kind] = self._writer.register_schema(kind, "ros2msg", definition(kind).encode())
-            if each.topic not in self._ids:
-                self._ids[each.topic] = self._writer.register_channel(each.topic, "cdr", self._ids[kind])
-            self._writer.add_message(
-                channel_id=self._ids[each.topic],
-                log_time=each.log_ns,
-                data=data,  # pyright: ignore[reportArgumentType]  it is copied
-                publish_time=each.sent_ns,
-                sequence=each.sequence % 2**32,
-            )
-            self.messages += 1
-        self.size = self._file.tell()
-
-    def flush(self) -> None:
-        """Close the chunk in work, so that a reader gets it whatever happens next. Raises OSError: the disk is full or
-        broken."""
-        self._writer.flush()
-        os.fdatasync(self._file.fileno())
-        self.size = self._file.tell()
-
-    def close(self, *, is_broken: bool = False) -> bool:
-        """Write index and end, but not behind a write that failed. Returns whether it has them; without them a reader
-        gets the chunks before."""
-        try:
-            with closing(self._file):
-                if not is_broken:
-                    self._writer.finish()
-                    self.flush()
-        except OSError as error:
-            _LOG.warning("%s is not finished: %s", self.path, error)
-            return False
-        return not is_broken
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
