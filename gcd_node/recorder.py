@@ -38,7 +38,7 @@ from gcd_node.ros_messages import (
 _LOG = logging.getLogger(__name__)
 _MB = 10**6
 _QUEUED_BYTES, _QUEUED_ITEMS = 64 * 2**20, 4096
-_LOCKSTEP_S, _PATIENCE_S, _FLUSH_S = 5.0, 10.0, 2.0
+_PATIENCE_S, _FLUSH_S = 10.0, 2.0
 _DRIFT_NS = 1_000_000
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PACKAGES = ("gcd-node", "torch", "numpy", "mcap")
@@ -82,8 +82,8 @@ class _Item:
 class Recorder:
     """Of one life of a node: a MessageSink before another one, that records what passes, once it was published.
 
-    Every method may be called from any thread; none waits for the disk. What finds no room in the queue is dropped; in
-    lockstep whoever has a picture waits for room, for 5 s at most. Previews are not recorded: frames are.
+    Every method may be called from any thread; none waits for the disk: what finds no room in the queue is dropped.
+    Previews are not recorded: the frames themselves are.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Recorder:
         self._head: dict[str, _Item] = {}  # what was said and still holds: every file begins with it
         self._source: SourceInfo | None = None
         self._utc_offset_ns = 0
-        self._waits, self._end_s = False, -math.inf  # of the recording under way, as all that follows
+        self._end_s = -math.inf  # of the recording under way, as all that follows
         self._items: deque[_Item] = deque()
         self._dropped: Counter[str] = Counter()  # what found no room or could not be written, by topic
         self._said: list[_Item] = []  # at the head of the newest file
@@ -119,8 +119,7 @@ class Recorder:
         with self._changed:
             if not self.available or self.busy:
                 return False
-            self._waits, self._end_s = self._config.source.pace == "lockstep", math.inf
-            self._dropped, self._files = Counter(), []
+            self._dropped, self._files, self._end_s = Counter(), [], math.inf
             self._stop = self._failure = None
             self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
             self._thread.start()
@@ -133,7 +132,7 @@ class Recorder:
             return False
         with self._changed:
             self._stop = self._stop or reason
-            self._end_s, self._waits = min(self._end_s, time.monotonic() + patience_s), False
+            self._end_s = min(self._end_s, time.monotonic() + patience_s)
             self._changed.notify_all()
         return True
 
@@ -210,9 +209,6 @@ class Recorder:
 
     def stop_waiting(self) -> None:
         self._sink.stop_waiting()
-        with self._changed:
-            self._waits = False
-            self._changed.notify_all()
 
     @property
     def stats(self) -> PublisherStats:
@@ -223,21 +219,15 @@ class Recorder:
         with self._changed:
             if is_head:
                 self._head[topic] = item
-            if size:
-                self._changed.wait_for(lambda: not self._waits or self._has_room(item), _LOCKSTEP_S)
             if self._end_s < math.inf:
                 return
-            if self._has_room(item):
+            waiting = sum(each.size for each in self._items)  # of pictures, one of which always finds room
+            is_full = waiting + size > _QUEUED_BYTES if size and waiting else len(self._items) >= _QUEUED_ITEMS
+            if is_full:
+                self._dropped[topic] += 1
+            else:
                 self._items.append(item)
                 self._changed.notify_all()
-            else:
-                self._dropped[topic] += 1
-
-    def _has_room(self, item: _Item) -> bool:
-        if not item.size:
-            return len(self._items) < _QUEUED_ITEMS
-        waiting = sum(each.size for each in self._items)
-        return waiting == 0 or waiting + item.size <= _QUEUED_BYTES  # one always finds room
 
     # What follows runs in the recorder thread alone.
 
@@ -256,10 +246,9 @@ class Recorder:
             _LOG.exception("the recording broke")
             self._failure = "INTERNAL", f"{type(error).__name__}; see the log"
         with self._changed:
-            self._end_s, self._waits = -math.inf, False
+            self._end_s = -math.inf
             self._dropped.update(item.topic for item in self._items)
             self._items.clear()
-            self._changed.notify_all()
         finished = bool(self._files) and self._files[-1].close(is_broken=is_broken)
         reason, message = self._failure or (self._stop or "INTERNAL", "")
         done = self.report()
@@ -285,7 +274,6 @@ class Recorder:
                     lambda: bool(self._items) or self._end_s < math.inf, max(0.0, flush_s - time.monotonic())
                 )
                 item = self._items.popleft() if self._items else None
-                self._changed.notify_all()
             if item is not None and item not in self._said:
                 self._write(file, item)
             if time.monotonic() >= flush_s:

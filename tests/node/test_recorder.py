@@ -34,7 +34,6 @@ from rig import LOCKSTEP, Rig
 from wire_messages import origin
 
 from gcd_client.control import Code
-from gcd_node import recorder as recorder_module
 from gcd_node import ros_messages
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.health import Level
@@ -295,17 +294,6 @@ def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.M
     disk.released.set()
     until(lambda: not disk.recorder.busy)
     assert disk.told == ["REC_STARTED", "REC_STOPPED"]
-
-
-def test_in_lockstep_the_source_waits_for_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "_QUEUED_BYTES", 3 * 100 * 100 * 4)
-    disk = Hanging(tmp_path, monkeypatch, LOCKSTEP)
-    threading.Timer(0.5, disk.released.set).start()
-    for seq in range(10):
-        disk.frame(seq, 100)
-    disk.recorder.close(60.0)
-    assert [each.sequence for each in of(said(files(tmp_path)[0]), "/src/image")] == list(range(10))
-    assert disk.recorder.report().dropped == {}
 
 
 def test_what_cannot_be_written_is_counted_and_the_rest_goes_on(
