@@ -168,11 +168,9 @@ class Recorder:
         source, record, at_ns = self._source, self._config.record, time.time_ns()
         if source is None or "inputs" not in record.what or self._end_s < math.inf:
             return
-        if (
-            source.clock == "realtime"
-        ):  # by an offset that is held still, so that steps between stamps stay the camera's
+        if source.clock == "realtime":
             offset_ns = utc_offset_ns()
-            if abs(offset_ns - self._utc_offset_ns) > _DRIFT_NS:
+            if abs(offset_ns - self._utc_offset_ns) > _DRIFT_NS:  # else held, so that steps stay the camera's
                 self._utc_offset_ns = offset_ns
             at_ns = frame.stamp_ns + self._utc_offset_ns
             frame = replace(frame, stamp_ns=at_ns)
@@ -199,13 +197,11 @@ class Recorder:
         self._sink.end(message, delay_ms=delay_ms)
 
     def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        def write(file: McapFile) -> None:
+            file.write(note_messages(topic, header, fields, file.begun_ns))
+
         self._sink.note(topic, header, fields)
-        self._put(
-            f"/gcd/{topic}",
-            0,
-            lambda file: file.write(note_messages(topic, header, fields, file.begun_ns)),
-            is_head=topic == "meta",
-        )
+        self._put(f"/gcd/{topic}", 0, write, is_head=topic == "meta")
 
     def stop_waiting(self) -> None:
         self._sink.stop_waiting()
@@ -222,8 +218,7 @@ class Recorder:
             if self._end_s < math.inf:
                 return
             waiting = sum(each.size for each in self._items)  # of pictures, one of which always finds room
-            is_full = waiting + size > _QUEUED_BYTES if size and waiting else len(self._items) >= _QUEUED_ITEMS
-            if is_full:
+            if len(self._items) >= _QUEUED_ITEMS or (size and waiting and waiting + size > _QUEUED_BYTES):
                 self._dropped[topic] += 1
             else:
                 self._items.append(item)
