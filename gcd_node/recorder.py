@@ -11,14 +11,11 @@ import os
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeAlias
-
-from mcap.writer import CompressionType, Writer
 
 from gcd_client.protocol import PROTO, EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_node.auth import Client
@@ -30,21 +27,18 @@ from gcd_node.messages import MessageSink, PublisherStats, utc_offset_ns
 from gcd_node.ros_messages import (
     COMMAND_TOPIC,
     IMAGE_TOPIC,
-    RosMessage,
+    McapFile,
     command_messages,
-    definition,
     input_messages,
     note_messages,
-    serialized,
     view_messages,
     view_topic,
 )
 
 _LOG = logging.getLogger(__name__)
 _MB = 10**6
-_CHUNK_BYTES = 64 * 1024  # what a reader can lose of a file that was never finished
 _QUEUED_BYTES, _QUEUED_ITEMS = 64 * 2**20, 4096
-_LOCKSTEP_S, _PATIENCE_S, _FLUSH_S = 5.0, 10.0, 2.0
+_PATIENCE_S, _FLUSH_S = 10.0, 2.0
 _DRIFT_NS = 1_000_000
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PACKAGES = ("gcd-node", "torch", "numpy", "mcap")
@@ -75,65 +69,6 @@ def check_room(config: RecordConfig, root: Path) -> float:
     return free_mb
 
 
-class McapFile:
-    """An MCAP file being written. size, messages: so far. begun_ns: UTC."""
-
-    def __init__(self, path: Path) -> None:
-        """Create `path`. Raises OSError: it is there already, or cannot be."""
-        self.path, self.begun_ns = path, time.time_ns()
-        self._file = path.open("xb")
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library=f"gcd-node; mcap-python/{version('mcap')}")
-        self._ids: dict[str, int] = {}  # of a type its schema's, of a topic its channel's
-        self.size = self.messages = 0
-
-    def describe(self, name: str, facts: Mapping[str, str]) -> None:
-        """Add metadata."""
-        self._writer.add_metadata(name, dict(facts))
-
-    def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Add a file."""
-        self._writer.add_attachment(self.begun_ns, self.begun_ns, name, media_type, data)
-
-    def write(self, messages: Iterable[RosMessage]) -> None:
-        """Add messages that belong together: all of them, or none if one cannot be made. Raises OSError."""
-        for each, data in [(each, serialized(each.fields)) for each in messages]:
-            kind = each.fields.__msgtype__
-            if kind not in self._ids:
-                self._ids[kind] = self._writer.register_schema(kind, "ros2msg", definition(kind).encode())
-            if each.topic not in self._ids:
-                self._ids[each.topic] = self._writer.register_channel(each.topic, "cdr", self._ids[kind])
-            self._writer.add_message(
-                channel_id=self._ids[each.topic],
-                log_time=each.log_ns,
-                data=data,  # pyright: ignore[reportArgumentType]  it is copied
-                publish_time=each.sent_ns,
-                sequence=each.sequence % 2**32,
-            )
-            self.messages += 1
-        self.size = self._file.tell()
-
-    def flush(self) -> None:
-        """Close the chunk in work, so that a reader gets it whatever happens next. Raises OSError: the disk is full or
-        broken."""
-        self._writer.flush()
-        os.fdatasync(self._file.fileno())
-        self.size = self._file.tell()
-
-    def close(self, *, is_broken: bool = False) -> bool:
-        """Write index and end, but not behind a write that failed. Returns whether it has them; without them a reader
-        gets the chunks before."""
-        try:
-            with closing(self._file):
-                if not is_broken:
-                    self._writer.finish()
-                    self.flush()
-        except OSError as error:
-            _LOG.warning("%s is not finished: %s", self.path, error)
-            return False
-        return not is_broken
-
-
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class _Item:
     """Something on its way to the disk. topic: where its loss is counted. size: bytes of a picture, 0 of what is small.
@@ -147,8 +82,8 @@ class _Item:
 class Recorder:
     """Of one life of a node: a MessageSink before another one, that records what passes, once it was published.
 
-    Every method may be called from any thread; none waits for the disk. What finds no room in the queue is dropped; in
-    lockstep whoever has a picture waits for room, for 5 s at most. Previews are not recorded: frames are.
+    Every method may be called from any thread; none waits for the disk: what finds no room in the queue is dropped.
+    Previews are not recorded: the frames themselves are.
     """
 
     def __init__(
@@ -161,7 +96,7 @@ class Recorder:
         self._head: dict[str, _Item] = {}  # what was said and still holds: every file begins with it
         self._source: SourceInfo | None = None
         self._utc_offset_ns = 0
-        self._waits, self._end_s = False, -math.inf  # of the recording under way, as all that follows
+        self._end_s = -math.inf  # of the recording under way, as all that follows
         self._items: deque[_Item] = deque()
         self._dropped: Counter[str] = Counter()  # what found no room or could not be written, by topic
         self._said: list[_Item] = []  # at the head of the newest file
@@ -184,8 +119,7 @@ class Recorder:
         with self._changed:
             if not self.available or self.busy:
                 return False
-            self._waits, self._end_s = self._config.source.pace == "lockstep", math.inf
-            self._dropped, self._files = Counter(), []
+            self._dropped, self._files, self._end_s = Counter(), [], math.inf
             self._stop = self._failure = None
             self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
             self._thread.start()
@@ -198,7 +132,7 @@ class Recorder:
             return False
         with self._changed:
             self._stop = self._stop or reason
-            self._end_s, self._waits = min(self._end_s, time.monotonic() + patience_s), False
+            self._end_s = min(self._end_s, time.monotonic() + patience_s)
             self._changed.notify_all()
         return True
 
@@ -234,11 +168,9 @@ class Recorder:
         source, record, at_ns = self._source, self._config.record, time.time_ns()
         if source is None or "inputs" not in record.what or self._end_s < math.inf:
             return
-        if (
-            source.clock == "realtime"
-        ):  # by an offset that is held still, so that steps between stamps stay the camera's
+        if source.clock == "realtime":
             offset_ns = utc_offset_ns()
-            if abs(offset_ns - self._utc_offset_ns) > _DRIFT_NS:
+            if abs(offset_ns - self._utc_offset_ns) > _DRIFT_NS:  # else held, so that steps stay the camera's
                 self._utc_offset_ns = offset_ns
             at_ns = frame.stamp_ns + self._utc_offset_ns
             frame = replace(frame, stamp_ns=at_ns)
@@ -265,19 +197,14 @@ class Recorder:
         self._sink.end(message, delay_ms=delay_ms)
 
     def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
+        def write(file: McapFile) -> None:
+            file.write(note_messages(topic, header, fields, file.begun_ns))
+
         self._sink.note(topic, header, fields)
-        self._put(
-            f"/gcd/{topic}",
-            0,
-            lambda file: file.write(note_messages(topic, header, fields, file.begun_ns)),
-            is_head=topic == "meta",
-        )
+        self._put(f"/gcd/{topic}", 0, write, is_head=topic == "meta")
 
     def stop_waiting(self) -> None:
         self._sink.stop_waiting()
-        with self._changed:
-            self._waits = False
-            self._changed.notify_all()
 
     @property
     def stats(self) -> PublisherStats:
@@ -288,21 +215,14 @@ class Recorder:
         with self._changed:
             if is_head:
                 self._head[topic] = item
-            if size:
-                self._changed.wait_for(lambda: not self._waits or self._has_room(item), _LOCKSTEP_S)
             if self._end_s < math.inf:
                 return
-            if self._has_room(item):
+            waiting = sum(each.size for each in self._items)  # of pictures, one of which always finds room
+            if len(self._items) >= _QUEUED_ITEMS or (size and waiting and waiting + size > _QUEUED_BYTES):
+                self._dropped[topic] += 1
+            else:
                 self._items.append(item)
                 self._changed.notify_all()
-            else:
-                self._dropped[topic] += 1
-
-    def _has_room(self, item: _Item) -> bool:
-        if not item.size:
-            return len(self._items) < _QUEUED_ITEMS
-        waiting = sum(each.size for each in self._items)
-        return waiting == 0 or waiting + item.size <= _QUEUED_BYTES  # one always finds room
 
     # What follows runs in the recorder thread alone.
 
@@ -321,10 +241,9 @@ class Recorder:
             _LOG.exception("the recording broke")
             self._failure = "INTERNAL", f"{type(error).__name__}; see the log"
         with self._changed:
-            self._end_s, self._waits = -math.inf, False
+            self._end_s = -math.inf
             self._dropped.update(item.topic for item in self._items)
             self._items.clear()
-            self._changed.notify_all()
         finished = bool(self._files) and self._files[-1].close(is_broken=is_broken)
         reason, message = self._failure or (self._stop or "INTERNAL", "")
         done = self.report()
@@ -350,7 +269,6 @@ class Recorder:
                     lambda: bool(self._items) or self._end_s < math.inf, max(0.0, flush_s - time.monotonic())
                 )
                 item = self._items.popleft() if self._items else None
-                self._changed.notify_all()
             if item is not None and item not in self._said:
                 self._write(file, item)
             if time.monotonic() >= flush_s:

@@ -1,15 +1,25 @@
-"""What a node saw, drew, said and was asked, as ROS 2 messages: by the definitions of rosbags, no ROS needed."""
+"""What a node saw, drew, said and was asked, as ROS 2 messages in MCAP files: by the definitions of rosbags, no ROS
+needed."""
 
 import json
+import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from numpy.typing import NDArray
 
 from gcd_client.images import depth_m, encode_jpegs, images
@@ -20,7 +30,9 @@ from gcd_node.frame import Frame, SourceInfo
 from gcd_node.health import Level
 from gcd_node.verbs import VERBS
 
+_LOG = logging.getLogger(__name__)
 IMAGE_TOPIC, COMMAND_TOPIC = "/src/image", "/gcd/command"
+_CHUNK_BYTES = 64 * 1024  # what a reader can lose of a file that was never finished
 _VIEW_NAMES = {"win": "image", "cls": "classes", "std": "std", "vis": "visibility", "depth": "depth"}
 _LEVELS = {"lost": Level.ERROR, "failed": Level.ERROR, "stalled": Level.WARN, "degraded": Level.WARN}
 """Of a part of the node in a state that is not all right."""
@@ -45,14 +57,69 @@ def _types() -> Any:
     return ros2_types()
 
 
-def definition(kind: str) -> str:
-    """The text that says what messages of a type hold, with every type in it."""
-    return _types().generate_msgdef(kind, ros_version=2)[0]
+class McapFile:
+    """An MCAP file being written. size, messages: so far. begun_ns: UTC."""
 
+    def __init__(self, path: Path) -> None:
+        """Create `path`. Raises OSError: it is there already, or cannot be."""
+        self.path, self.begun_ns = path, time.time_ns()
+        self._file = path.open("xb")
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library=f"gcd-node; mcap-python/{version('mcap')}")
+        self._ids: dict[str, int] = {}  # of a type its schema's, of a topic its channel's
+        self.size = self.messages = 0
+        self._flushed = (0, 0)  # size and messages that are on the disk for certain
 
-def serialized(fields: Any) -> memoryview:
-    """A message as CDR."""
-    return _types().serialize_cdr(fields, fields.__msgtype__, little_endian=True)
+    def describe(self, name: str, facts: Mapping[str, str]) -> None:
+        """Add metadata."""
+        self._writer.add_metadata(name, dict(facts))
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """Add a file."""
+        self._writer.add_attachment(self.begun_ns, self.begun_ns, name, media_type, data)
+
+    def write(self, messages: Iterable[RosMessage]) -> None:
+        """Add messages that belong together: all of them, or none if one cannot be made. Raises OSError."""
+        types = _types()
+        kinds = [(each, each.fields.__msgtype__) for each in messages]
+        for each, kind, data in [(each, kind, types.serialize_cdr(each.fields, kind)) for each, kind in kinds]:
+            if kind not in self._ids:
+                text = types.generate_msgdef(kind, ros_version=2)[0]
+                self._ids[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+            if each.topic not in self._ids:
+                self._ids[each.topic] = self._writer.register_channel(each.topic, "cdr", self._ids[kind])
+            sequence, channel = each.sequence % 2**32, self._ids[each.topic]
+            self._writer.add_message(channel, each.log_ns, data, publish_time=each.sent_ns, sequence=sequence)
+            self.messages += 1
+        self.size = self._file.tell()
+
+    def flush(self) -> None:
+        """Close the chunk in work, so that a reader gets it whatever happens next. Raises OSError: the disk is full or
+        broken."""
+        self._writer.flush()
+        os.fdatasync(self._file.fileno())
+        self.size = self._file.tell()
+        self._flushed = self.size, self.messages
+
+    def close(self, *, is_broken: bool = False) -> bool:
+        """Write index and end. is_broken: a write has failed; then it ends behind what was flushed, without an index.
+        Returns whether it has an end."""
+        try:
+            if not is_broken:
+                self._writer.finish()
+                self.flush()
+                self._file.close()
+                return True
+        except OSError as error:
+            _LOG.warning("%s: %s", self.path, error)
+        self.size, self.messages = self._flushed
+        builder = RecordBuilder()
+        DataEnd(data_section_crc=0).write(builder)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+        with suppress(OSError, ValueError), closing(self._file.raw):  # what is buffered has no place any more
+            os.ftruncate(self._file.fileno(), self.size)
+            return self.size > 0 and os.pwrite(self._file.fileno(), builder.end() + MCAP0_MAGIC, self.size) > 0
+        return False
 
 
 # Inputs and views.

@@ -10,7 +10,6 @@ import contextlib
 import functools
 import io
 import logging
-import re
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -191,13 +190,12 @@ class LogReader:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """What is read one after another: one file, or those of a folder, by their numbers. Raises SourceError."""
+    """What is read one after another: a file, or those of a folder by their numbers. Raises SourceError."""
     found: list[Path] = []
     try:
-        for suffix in _SUFFIXES:  # to open a pipe would wait for its writer
+        for suffix in _SUFFIXES:
             files = path.glob(f"*{suffix}") if path.is_dir() else (path,) if path.suffix == suffix else ()
-            found = found or [file for file in files if file.is_file()]
-        is_one = (path / "metadata.yaml").is_file() or len({re.sub(r"_?\d*$", "", each.stem) for each in found}) < 2
+            found = found or [file for file in files if file.is_file()]  # to open a pipe would wait for its writer
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SourceError(f"cannot read the log {path}: {reason}; check path and permissions") from error
@@ -206,8 +204,6 @@ def _files_of(path: Path) -> list[Path]:
             f"{path} is no log or missing; give a {', '.join(_SUFFIXES)} file, or the folder of a bag; unpack one that "
             "was recorded with --compression-mode file: zstd -d FOLDER/*.zstd"
         )
-    if not is_one:
-        raise SourceError(f"{path} is a folder of several logs; give one of them, such as {found[0].name}")
     return sorted(found, key=lambda file: (len(file.name), file.name))
 
 

@@ -29,7 +29,7 @@ _SURVEYED_NS = 5_000_000_000
 _LISTED, _SHOWN = 8, 100
 _LATEST_NS = 2**63 - 1  # in the year 2262
 _HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
-_WAIT_NS, _MOST_WAITING = 500_000_000, 30  # of the log's time, for what was recorded after the picture it belongs to
+_DELAY = 5  # pictures that are recorded before one goes without what belongs to it
 _MOST_DEPTH, _MOST_ODOMETRY = 32, 2048  # messages that are kept for the pictures that wait
 _LOWEST_FPS = 0.05
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -74,11 +74,11 @@ class LogSource(Recording):
             self._body_from_camera = survey.cameras.body_from_camera(odometry_topic, survey.frame_id)
 
     def _one_pass(self) -> Iterator[Frame]:
-        """A picture waits for its depth and odometry."""
+        """A picture whose depth or odometry is wanted waits for a few others, as these are recorded later."""
         reader, decoder, seq = LogReader(self._path, _SEARCH_S, self._stopped.is_set), ImageDecoder(), -1
         depth, odometry = _Latest(maxlen=_MOST_DEPTH), _Latest(maxlen=_MOST_ODOMETRY)
-        waiting = deque[tuple[int, Frame]]()  # and when each was recorded
-        wait_ns = 0 if self._depth_topic is None and self._odometry_topic is None else _WAIT_NS
+        waiting = deque[Frame]()
+        delay = 0 if self._depth_topic is None and self._odometry_topic is None else _DELAY
         for message in reader.messages():
             try:
                 if message.topic in (self._depth_topic, self._odometry_topic):
@@ -90,14 +90,14 @@ class LogSource(Recording):
                     decoded, stamp_ns = decoder.decode(message.kind, fields), self._stamp_ns(message, fields)
                     if decoded is not None:
                         seq = max(message.sequence, seq + 1)  # as recorded, or counted on: many recorders leave it 0
-                        waiting.append((message.log_ns, Frame(image=decoded[0], stamp_ns=stamp_ns, seq=seq)))
+                        waiting.append(Frame(image=decoded[0], stamp_ns=stamp_ns, seq=seq))
             except Exception as error:  # of a library, or SourceError: the message is damaged
                 self.corrupt += message.topic == self.topic
                 _LOG.debug("a message on %s is left out: %s", message.topic, line_of(error))
-            while waiting and (message.log_ns - waiting[0][0] >= wait_ns or len(waiting) > _MOST_WAITING):
-                yield self._complete(waiting.popleft()[1], depth, odometry)
+            if len(waiting) > delay:
+                yield self._complete(waiting.popleft(), depth, odometry)
                 reader.renew()  # what was done with it took its own time
-        for _, frame in waiting:
+        for frame in waiting:
             yield self._complete(frame, depth, odometry)
 
     def _stamp_ns(self, message: LogMessage, fields: Any) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
-from fakes import HEIGHT, WIDTH, Box, FakeSource, painting_traits
+from fakes import Box, FakeSource, painting_traits
 from recordings import (
     LENS,
     SECOND_NS,
@@ -28,18 +28,16 @@ from recordings import (
     replayed,
     said,
     salvaged,
-    summary,
 )
 from rig import LOCKSTEP, Rig
 from wire_messages import origin
 
 from gcd_client.control import Code
-from gcd_node import recorder as recorder_module
 from gcd_node import ros_messages
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.health import Level
-from gcd_node.recorder import McapFile, Recorder
-from gcd_node.ros_messages import note_messages
+from gcd_node.recorder import Recorder
+from gcd_node.ros_messages import McapFile, note_messages
 from gcd_node.sources.logs import LogSource
 
 pytestmark = pytest.mark.timeout(180)
@@ -57,17 +55,8 @@ def section(folder: Path, more: str = "") -> str:
     return f'record = {{folder = "{folder}", keep_free_mb = 0{more}}}'
 
 
-def ended(box: Box) -> dict[str, object]:
-    """The event that says how a recording ended."""
-    (fields,) = (dict(fields) for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED")
-    return fields
-
-
-# --- a node that lives -------------------------------------------------------------------------------------------
-
-
 def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> None:
-    camera, folder = Camera(), tmp_path / "recordings"
+    camera, folder, before_ns = Camera(), tmp_path / "recordings", time.time_ns()
     with Rig(tmp_path, Bench(camera), more=section(folder)) as rig:
         rig.await_state("active")
         camera.run(3)  # before anybody records
@@ -85,6 +74,7 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
         rig.ask("state")
         assert rig.ask("record_stop").code is Code.ACCEPTED
         stopped = rig.await_event("REC_STOPPED")
+        captured_ns = [stamp for each in rig.of() for stamp in each.header.t_capture_ns]
         assert rig.ask("record_start").code is Code.ACCEPTED
         rig.await_event("REC_STARTED", 2)
     first, second = files(folder)
@@ -94,7 +84,6 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
     assert (stopped["reason"], stopped["finished"], stopped["level"]) == ("ASKED", True, 0)
     heard = said(first)
     assert (stopped["bytes"], stopped["written"]) == (first.stat().st_size, len(heard))
-    assert [each.sequence for each in of(heard, "/src/image")][-28:] == list(range(3, 31))
     told = [(each.told["verb"], each.told["role"], each.told["code"]) for each in of(heard, "/gcd/command")]
     assert told == [  # no questions
         ("record_start", "operator", "ACCEPTED"),
@@ -106,25 +95,16 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
     assert "VIEW_SET" in [each.told["code"] for each in of(heard, "/gcd/event")]
     assert rig.events("REC_STOPPED")[1]["reason"] == "SHUTDOWN"
     assert said(second)
-
-
-def test_live_frames_are_stamped_with_the_time_of_their_capture(tmp_path: Path) -> None:
-    camera, folder = Camera(), tmp_path / "recordings"
-    before_ns = time.time_ns()
-    with Rig(tmp_path, Bench(camera), more=section(folder, ", autostart = true")) as rig:
-        rig.await_state("active")
-        camera.run(15)
-        rig.await_views(1)
-        captured_ns = rig.of()[0].header.t_capture_ns
-    after_ns = time.time_ns()
-    heard = said(files(folder)[0])
-    inputs, views = of(heard, "/src/image"), of(heard, "/view/main/image")
-    assert all(before_ns <= each.stamp_ns == each.log_ns <= after_ns for each in inputs)
-    steps = {later.stamp_ns - earlier.stamp_ns for earlier, later in pairwise(inputs)}
-    assert all(abs(step - SECOND_NS / FPS) <= 1_000_000 for step in steps)
-    assert [each.stamp_ns for each in views] == list(captured_ns)
-    by_number = {each.sequence: each.stamp_ns for each in inputs}
-    assert all(abs(each.stamp_ns - by_number[each.sequence]) <= 2_000_000 for each in views)  # two looks at the clock
+    # stamps are the time of the capture, UTC
+    inputs, views = of(heard, "/src/image")[-28:], of(heard, "/view/main/image")
+    assert [each.sequence for each in inputs] == list(range(3, 31))
+    assert all(before_ns <= each.stamp_ns == each.log_ns <= time.time_ns() for each in inputs)
+    assert all(abs(b.stamp_ns - a.stamp_ns - SECOND_NS / FPS) <= 1_000_000 for a, b in pairwise(inputs))
+    assert views
+    assert {each.stamp_ns for each in views} <= set(captured_ns)
+    by_number = {each.sequence: each.stamp_ns for each in of(heard, "/src/image")}
+    near = [abs(each.stamp_ns - by_number[each.sequence]) for each in views if each.sequence in by_number]
+    assert max(near) <= 2_000_000  # two looks at the clock
 
 
 # --- files, and playing them again -------------------------------------------------------------------------------
@@ -147,8 +127,8 @@ def test_a_recording_that_rotated_is_read_part_by_part_and_plays_as_the_source_g
         numbers += images
         assert len(of(heard, "/view/main/image")) == 14 * len(of(heard, "/view/main/header"))  # windows whole
     assert numbers == list(range(45))
-    told = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_ROTATED"]
-    assert [fields["file"] for fields in told] == [f"{path.parent.name}/{path.name}" for path in found[1:]]
+    told = [fields["file"] for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_ROTATED"]
+    assert told == [f"{path.parent.name}/{path.name}" for path in found[1:]]
     source, again = replayed(found[0].parent, painting_traits())
     for kind in ("win", "cls"):
         assert hashes(again, kind) == hashes(box, kind)
@@ -167,7 +147,7 @@ def test_the_input_is_played_though_there_are_views_and_a_view_where_it_is_named
     assert replayed(files(tmp_path / "b")[0])[0].info.width == 96  # the only pictures there are
 
 
-# --- kill -9, full disks -----------------------------------------------------------------------------------------
+# --- kill -9, full and slow disks --------------------------------------------------------------------------------
 
 
 def record_for_ever(folder: Path) -> None:
@@ -176,7 +156,7 @@ def record_for_ever(folder: Path) -> None:
     recorder.source(LIVE, None)
     recorder.start()
     for seq in count():
-        image = draw.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+        image = draw.integers(0, 256, (64, 96, 3), np.uint8)
         recorder.frame(Frame(image=image, stamp_ns=time.monotonic_ns(), seq=seq))
         time.sleep(0.01)
 
@@ -185,13 +165,12 @@ def test_after_kill_9_everything_written_is_readable_and_plays(tmp_path: Path) -
     recorder = multiprocessing.get_context("spawn").Process(target=record_for_ever, args=(tmp_path,))
     recorder.start()
     try:
-        until(lambda: files(tmp_path) and len(salvaged(files(tmp_path)[0], "/src/image")) >= 40, START_S)
+        until(lambda: len(files(tmp_path)) > 0 and len(salvaged(files(tmp_path)[0], "/src/image")) >= 40, START_S)
     finally:
         recorder.kill()
         recorder.join()
     (path,) = files(tmp_path)
     found = salvaged(path, "/src/image")
-    assert len(found) >= 40
     assert found == list(range(len(found)))  # nothing is missing before the end
     for place in (path, path.parent):
         assert [frame.seq for frame in LogSource(place).frames()][: len(found)] == found
@@ -212,24 +191,24 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_f22_a_full_disk_ends_the_recording_with_a_readable_file_and_the_stream_goes_on(
     tmp_path: Path, small_disk: Path
 ) -> None:
-    more = section(small_disk / "here", ', autostart = true, input_encoding = "raw"')
+    more = section(small_disk / "here", f", autostart = true, {RAW}")
     with Rig(tmp_path, lambda _: Calibrated(10_000_000), config=LOCKSTEP, more=more, keep=False) as rig:
         stopped = rig.await_event("REC_STOPPED")
         status = rig.await_status(lambda status: "REC_FAILED" in status["reasons"])
         rig.await_views(len(rig.of()) + 2)
         assert rig.node.state.label == "active"
         (path,) = files(small_disk)
-        numbers = salvaged(path, "/src/image")
-        played = len(list(LogSource(path).frames()))
+        heard = said(path)
         path.unlink()
         assert rig.ask("record_start").code is Code.ACCEPTED  # there is room again
         rig.await_event("REC_STARTED", 2)
         rig.await_status(lambda later: later["heartbeat_seq"] > status["heartbeat_seq"] and later["level"] == 0)
-    assert (stopped["reason"], stopped["finished"], stopped["level"]) == ("DISK_FULL", False, Level.WARN)
+    assert (stopped["reason"], stopped["finished"], stopped["level"]) == ("DISK_FULL", True, Level.WARN)
     assert "No space left" in stopped["message"]
+    assert stopped["written"] == len(heard)
     assert (status["level"], status["rec"]["state"]) == (1, "failed")
+    numbers = [each.sequence for each in of(heard, "/src/image")]
     assert numbers == list(range(len(numbers)))
-    assert played == len(numbers) > 20
 
 
 def test_a_file_on_a_broken_disk_is_whole_up_to_its_last_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,7 +219,9 @@ def test_a_file_on_a_broken_disk_is_whole_up_to_its_last_flush(tmp_path: Path, m
     for number in range(100):
         file.write(note_messages("event", origin(), {"code": "E" * 3000, "number": number}, number))
     file.flush()
-    monkeypatch.setattr(os, "fdatasync", broken)
+    file.write(note_messages("event", origin(), {"code": "lost"}, 100))
+    for name in ("fdatasync", "pwrite"):
+        monkeypatch.setattr(os, name, broken)
     assert not file.close()
     assert not file.close(is_broken=True)  # as when the next one cannot be opened
     assert len(salvaged(tmp_path / "a.mcap", "/gcd/event")) == file.messages == 100
@@ -253,57 +234,32 @@ def test_a_recording_stops_before_the_room_is_gone_that_it_must_leave(tmp_path: 
         (folder / "older.mcap").write_bytes(bytes(600_000))
         config = recorder_config(folder, record=f"max_total_mb = {most_mb}", keep_free_mb=keep_free_mb)
         _, box = recorded(config, FakeSource(14))
-        done = ended(box)
+        (done,) = (fields for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED")
         assert (done["reason"], done["file"], done["level"]) == (code, None, 1)
         assert (done["finished"], done["written"]) == (False, 0)  # it never began
         assert [each.name for each in folder.iterdir()] == ["older.mcap"]
         assert box.of("win")
 
 
-# --- slow disks --------------------------------------------------------------------------------------------------
-
-
-class Hanging:
-    """A recorder whose disk hangs until it is released."""
-
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
-        self.released, write = threading.Event(), McapFile.write
-        monkeypatch.setattr(McapFile, "write", lambda file, each: (self.released.wait(100.0), write(file, each))[1])
-        config = recorder_config(folder, source=source, record=RAW)
-        self.told: list[str] = []
-        self.recorder = Recorder(config, "0" * 32, lambda: config, lambda code, *_: self.told.append(code), Box())
-        self.recorder.source(LIVE, None)
-        self.recorder.start()
-        until(lambda: "REC_STARTED" in self.told)
-
-    def frame(self, seq: int, side: int = 1000) -> None:
-        self.recorder.frame(Frame(image=np.zeros((side, side, 3), np.uint8), stamp_ns=seq, seq=seq))
-
-
 def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    disk = Hanging(tmp_path, monkeypatch, 'kind = "v4l2"')
+    released, write, told = threading.Event(), McapFile.write, list[str]()
+    monkeypatch.setattr(McapFile, "write", lambda file, each: (released.wait(100.0), write(file, each))[1])
+    config = recorder_config(tmp_path, source='kind = "v4l2"', record=RAW)
+    recorder = Recorder(config, "0" * 32, lambda: config, lambda code, *_: told.append(code), Box())
+    recorder.source(LIVE, None)
+    recorder.start()
+    until(lambda: "REC_STARTED" in told)
     for seq in range(60):  # 3 MB each; nobody waits, or this would never end
-        disk.frame(seq)
-        disk.recorder.note("event", origin(), {"code": f"E{seq}"})
-    lost = disk.recorder.report().dropped
+        recorder.frame(Frame(image=np.zeros((1000, 1000, 3), np.uint8), stamp_ns=seq, seq=seq))
+        recorder.note("event", origin(), {"code": f"E{seq}"})
+    lost = recorder.report().dropped
     assert 30 <= lost["/src/image"] < 60
     assert set(lost) == {"/src/image"}  # notes have room of their own
-    disk.recorder.close(0.2)
-    assert disk.recorder.busy
-    disk.released.set()
-    until(lambda: not disk.recorder.busy)
-    assert disk.told == ["REC_STARTED", "REC_STOPPED"]
-
-
-def test_in_lockstep_the_source_waits_for_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "_QUEUED_BYTES", 3 * 100 * 100 * 4)
-    disk = Hanging(tmp_path, monkeypatch, LOCKSTEP)
-    threading.Timer(0.5, disk.released.set).start()
-    for seq in range(10):
-        disk.frame(seq, 100)
-    disk.recorder.close(60.0)
-    assert [each.sequence for each in of(said(files(tmp_path)[0]), "/src/image")] == list(range(10))
-    assert disk.recorder.report().dropped == {}
+    recorder.close(0.2)
+    assert recorder.busy
+    released.set()
+    until(lambda: not recorder.busy)
+    assert told == ["REC_STARTED", "REC_STOPPED"]
 
 
 def test_what_cannot_be_written_is_counted_and_the_rest_goes_on(
@@ -322,4 +278,3 @@ def test_what_cannot_be_written_is_counted_and_the_rest_goes_on(
     assert [each.sequence for each in of(heard, "/src/image")] == [0, 1, 2, 3, 4, *range(6, 14)]
     assert node.recorder.report().dropped == {"/src/image": 1}
     assert "no such picture" in caplog.text
-    assert summary(files(tmp_path)[0]).statistics.message_count == len(heard)

@@ -37,7 +37,6 @@ from robot_logs import (
     transform,
     write_bag,
     write_foxglove,
-    write_log,
 )
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
@@ -91,9 +90,6 @@ def test_the_split_files_of_a_bag_are_played_by_their_numbers(tmp_path: Path) ->
         of_pictures(tmp_path / name, [compressed(BLACK, at(2 * part + i)) for i in range(2)])
     (tmp_path / "bag_2.mcap").write_bytes(b"")  # a recorder was killed before it wrote
     assert stamps(list(LogSource(tmp_path).frames())) == [at(i) for i in range(6)]
-    write_log(tmp_path / "other.mcap", ramp(2))
-    with pytest.raises(SourceError):
-        LogSource(tmp_path)
 
 
 def test_numbers_rise_and_without_stamps_the_time_of_sending_counts(tmp_path: Path) -> None:
