@@ -38,8 +38,8 @@ AnswerSink: TypeAlias = Callable[[bytes, bytes, Client], None]
 
 
 CommandHandler: TypeAlias = Callable[[Command, Role], Outcome]
-"""Carries a command out, or begins it and says ACCEPTED: Node.handle. Called in the control thread, so it takes a few
-ms at most. The role may use the verb, that is checked; `time` never comes here, and no repeat of a request."""
+"""Carries a command out, or begins it and says ACCEPTED: NodeCommands.handle. Called in the control thread, so it takes
+a few ms at most. The role may use the verb, that is checked; `time` never comes here, and no repeat of a request."""
 
 
 class ControlServer:

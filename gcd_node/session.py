@@ -106,7 +106,7 @@ def open_session(
         control: ControlServer | None = None
         if config.control.endpoint is not None:
             control = stack.enter_context(_control_server(config.control.endpoint, node, emit, security))
-            node.watchdog.threads.append(control.thread)
+            node.needed.append(control.thread)
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
@@ -120,7 +120,7 @@ def open_session(
 def _control_server(endpoint: str, node: Node, emit: EventSink, security: ServerSecurity | None) -> ControlServer:
     return ControlServer(
         endpoint,
-        node.handle,
+        node.commands.handle,
         state=lambda: node.state.label,
         on_event=emit,
         on_answer=node.recorder.command,
