@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias, get_args
 
 import msgspec
 import zmq
@@ -54,7 +54,6 @@ Role: TypeAlias = Literal["viewer", "operator"]
 """What a client may do: look, or also command. A viewer's verbs change nothing."""
 ClientName: TypeAlias = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")]
 
-_CHANNELS: tuple[Channel, ...] = ("data", "status", "control", "frames")
 _MOST_EVENTS = 64  # of one socket at once: a flood of failing clients must not hold up the others
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _DENIAL_SPAN_S, _MOST_DENIALS = 10.0, 8
@@ -68,8 +67,8 @@ def log_event(code: str, _: Level, fields: Mapping[str, object]) -> None:
 # Endpoints.
 
 
-def _own_runtime_folder() -> None:
-    """Make it, with mode 0700. Raises EndpointError: it cannot be made, or belongs to another user."""
+def _make_runtime_folder() -> None:
+    """With mode 0700. Raises EndpointError: it cannot be made, or belongs to another user."""
     folder = runtime_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -90,11 +89,8 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def _free_ipc_path(path: Path) -> None:
-    """Remove the file that a dead process left; ZeroMQ itself would take a live endpoint away without a word.
-
-    Raises:
-        EndpointError: a process answers there, or it is no socket.
-    """
+    """Remove the file that a dead process left; ZeroMQ itself would take a live endpoint away without a word. Raises
+    EndpointError: a process answers there, or it is no socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(0.5)
         try:
@@ -158,11 +154,8 @@ def new_key_pair() -> KeyPair:
 
 
 def write_key_pair(folder: Path, pair: KeyPair) -> None:
-    """Write a new key folder, mode 0700, with its secret file of mode 0600.
-
-    Raises:
-        OutputError: there are keys already, which are never overwritten, or the folder cannot be written.
-    """
+    """Write a new key folder, mode 0700, with its secret file of mode 0600. Raises OutputError: there are keys already,
+    which are never overwritten, or the folder cannot be written."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         for name, text, mode in ((SECRET_FILE, pair.secret, 0o600), (PUBLIC_FILE, pair.public, 0o644)):
@@ -189,9 +182,7 @@ class AllowList:
 
     on_event gets ALLOW_CHANGED with the names that were `added` and `removed` (a new key or role is both), or
     ALLOW_REFUSED with a `message`, once for each broken file; then the list stays as it was.
-
-    Raises:
-        ConfigError: as load_server_security(); or nobody is on the list.
+    Raises ConfigError: as load_server_security(); or nobody is on the list.
     """
 
     def __init__(self, path: Path, on_event: EventSink = log_event) -> None:
@@ -268,20 +259,19 @@ class SocketGuard:
         self._suppressed = 0
         self._authenticator: _Authenticator | None = None
         if security is not None:
-            self._authenticator = _Authenticator(self.context, security.find_client, self._deny)
+            self._authenticator = _Authenticator(self, security)
             self._authenticator.start()
 
     def bind(self, unbound: Socket, endpoint: str, channel: Channel) -> str:
-        """Bind a socket: tcp with keys if there are any, ipc for this user, and for his group if the umask lets it.
+        """Bind a socket: tcp with keys if there are any, ipc for this user, and his group if the umask lets it. Gives
+        its endpoint, with the port that was chosen if 0 was asked for.
 
-        Returns:
-            The endpoint, with the port that was chosen if 0 was asked for.
         Raises:
             SetupError: no endpoint. ConfigError: others than this machine could reach it without keys. EndpointError:
                 in use, or impossible.
         """
         if endpoint == "ipc":
-            _own_runtime_folder()
+            _make_runtime_folder()
         endpoint = resolve_endpoint(endpoint, channel)
         if endpoint.startswith("ipc://"):
             _free_ipc_path(Path(endpoint.removeprefix("ipc://")))
@@ -301,8 +291,7 @@ class SocketGuard:
         try:
             unbound.bind(endpoint)
         except zmq.ZMQError as error:
-            message = f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another"
-            raise EndpointError(message) from error
+            raise EndpointError(f"cannot bind {endpoint}: {error.strerror}; choose another") from error
         bound = unbound.getsockopt_string(zmq.LAST_ENDPOINT)
         if bound.startswith("ipc://"):
             path = Path(bound.removeprefix("ipc://"))
@@ -316,7 +305,7 @@ class SocketGuard:
                 if not monitor.poll(0):
                     break
                 if int(parse_monitor_message(monitor.recv_multipart())["event"]) & _FAILED:
-                    self._deny(None, f"gcd.{channel}", "")
+                    self.deny(None, f"gcd.{channel}", "")
 
     def close(self) -> None:
         """Let nobody in any more, close what is still open, and wait until what was sent has left. A second call does
@@ -328,7 +317,7 @@ class SocketGuard:
             self._authenticator.stop()
         self.context.destroy()
 
-    def _deny(self, key: str | None, domain: str, address: str) -> None:
+    def deny(self, key: str | None, domain: str, address: str) -> None:
         """Report a refusal, or count it; key: None if the handshake came to none. From any thread."""
         with self._lock:
             now_s = time.monotonic()
@@ -345,15 +334,10 @@ class SocketGuard:
 class _Authenticator(ThreadAuthenticator):
     """Lets clients of the allow-list in; their messages carry the public key as `User-Id`."""
 
-    def __init__(
-        self,
-        context: Context,
-        find_client: Callable[[str], Client | None],
-        deny: Callable[[str, str, str], None],
-    ) -> None:
-        super().__init__(context)
-        self._find_client, self._deny, self._address = find_client, deny, ""
-        for channel in _CHANNELS:  # exactly these: a provider for "*" does not apply to a socket with a domain
+    def __init__(self, guard: SocketGuard, security: ServerSecurity) -> None:
+        super().__init__(guard.context)
+        self._find_client, self._deny, self._address = security.find_client, guard.deny, ""
+        for channel in get_args(Channel):  # exactly these: a provider for "*" does not apply to a socket with a domain
             self.configure_curve_callback(f"gcd.{channel}", self)
 
     def callback(self, domain: str, key: bytes) -> bool:

@@ -15,7 +15,7 @@ from gcd_node.config import NodeConfig
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import THREAD_DIED, Health, Level
 from gcd_node.inference import WindowReport
-from gcd_node.lifecycle import Lifecycle, Parts, State, Transitions, Verb
+from gcd_node.lifecycle import PATHS, Lifecycle, Parts, State, Transitions, Verb
 from gcd_node.messages import MessageSink
 from gcd_node.pipeline import Summary
 from gcd_node.recorder import Recorder
@@ -228,20 +228,20 @@ class Node:
 
     def _fail(self, verb: Verb, error: Exception) -> None:
         if verb in ("configure", "activate") and isinstance(error, NodeError | ModelError):
-            self._life.fail()
+            (self._life.state,) = PATHS[verb][0]  # nothing has changed
         else:
-            self._life.error()
+            self._life.state = State.ERRORPROCESSING
             _LOG.error("%s broke", verb, exc_info=error)
-            self._transitions.close(_PATIENCE_S)
+            self._transitions.close(_PATIENCE_S)  # what still stands is unknown: everything is let go
             self.health.model = "absent"
-            self._life.recover()
+            self._life.state = State.FINALIZED if verb == "shutdown" else State.UNCONFIGURED
         self._publish_state()
         self._announcer.event(_code(error).value, Level.ERROR, {"verb": verb, "message": str(error)})
         self._after_failure(error, verb)
 
     def _succeed(self, verb: Verb, requested: bool) -> None:
         """And what follows by itself."""
-        self._life.succeed()
+        self._life.state = PATHS[verb][2]
         self._publish_state()
         if requested:
             self._announcer.event("STATE", Level.OK, {"verb": verb, "state": self.state.label})
