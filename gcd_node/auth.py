@@ -10,6 +10,7 @@ Encryption alone lets everybody in, so every secured socket also asks the allow-
 mode of their folder guards them.
 """
 
+import contextlib
 import ipaddress
 import logging
 import os
@@ -17,6 +18,7 @@ import socket
 import stat
 import threading
 import time
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -244,7 +246,8 @@ def _version(path: Path) -> tuple[int, int, int] | None:
 
 
 class SocketGuard:
-    """Has the ZeroMQ context of a thread's sockets, binds them, and answers who may connect to those that are secured.
+    """Has the ZeroMQ context of a thread's sockets, binds them, waits for them, and answers who may connect to those
+    that are secured. `bind`, `wait` and `close` belong to that thread, or to whoever makes and ends it.
 
     on_event gets AUTH_DENIED: once for each key and socket in 10 s and at most 8 in all in that time, so that a hostile
     client cannot flood with it.
@@ -252,8 +255,11 @@ class SocketGuard:
 
     def __init__(self, security: ServerSecurity | None, on_event: EventSink | None = None) -> None:
         self.context: Context = zmq.Context()
-        self.monitors: dict[Socket, Channel] = {}
-        """monitors: readable once there is something for report_failures()."""
+        self._monitors: dict[Socket, Channel] = {}
+        self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self._wake_fd)  # no sooner: then it may mean another file to who wakes late
+        self._poller = zmq.Poller()
+        self._poller.register(self._wake_fd, zmq.POLLIN)
         self._security, self._on_event, self._lock = security, on_event or log_event, threading.Lock()
         self._reported_s: dict[tuple[str | None, str], float] = {}
         self._suppressed = 0
@@ -280,7 +286,9 @@ class SocketGuard:
             unbound.set(zmq.CURVE_SECRETKEY, self._security.keys.secret.encode())
             unbound.set(zmq.ZAP_DOMAIN, f"gcd.{channel}".encode())
             unbound.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without an authenticator: closed to all, not open to all
-            self.monitors[unbound.get_monitor_socket(_FAILED)] = channel
+            monitor = unbound.get_monitor_socket(_FAILED)
+            self._monitors[monitor] = channel
+            self._poller.register(monitor, zmq.POLLIN)
         elif not is_loopback(endpoint):
             raise ConfigError(
                 f"{endpoint} can be reached from other machines, which needs CURVE keys and a list of allowed clients: "
@@ -292,15 +300,24 @@ class SocketGuard:
             unbound.bind(endpoint)
         except zmq.ZMQError as error:
             raise EndpointError(f"cannot bind {endpoint}: {error.strerror}; choose another") from error
+        self._poller.register(unbound, zmq.POLLIN)
         bound = unbound.getsockopt_string(zmq.LAST_ENDPOINT)
         if bound.startswith("ipc://"):
             path = Path(bound.removeprefix("ipc://"))
             path.chmod(path.stat().st_mode & 0o770)  # whatever folder and umask say: not for everybody
         return bound
 
-    def report_failures(self) -> None:
-        """Report handshakes that failed before there was a key to judge; call it often, in the sockets' own thread."""
-        for monitor, channel in self.monitors.items():
+    def wake(self) -> None:
+        """End the wait() under way, or the next one; from any thread."""
+        os.eventfd_write(self._wake_fd, 1)
+
+    def wait(self, timeout_ms: int | None = None) -> None:
+        """Until one of the sockets can be read, or wake(). Reports handshakes that failed before there was a key to
+        judge."""
+        self._poller.poll(timeout_ms)
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake_fd)
+        for monitor, channel in self._monitors.items():
             for _ in range(_MOST_EVENTS):
                 if not monitor.poll(0):
                     break
@@ -310,9 +327,9 @@ class SocketGuard:
     def close(self) -> None:
         """Let nobody in any more, close what is still open, and wait until what was sent has left. A second call does
         nothing."""
-        for monitor in self.monitors:
+        for monitor in self._monitors:
             monitor.close(0)
-        self.monitors.clear()
+        self._monitors.clear()
         if self._authenticator is not None:
             self._authenticator.stop()
         self.context.destroy()
