@@ -10,6 +10,7 @@ Encryption alone lets everybody in, so every secured socket also asks the allow-
 mode of their folder guards them.
 """
 
+import contextlib
 import ipaddress
 import logging
 import os
@@ -17,10 +18,11 @@ import socket
 import stat
 import threading
 import time
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias, get_args
 
 import msgspec
 import zmq
@@ -54,7 +56,6 @@ Role: TypeAlias = Literal["viewer", "operator"]
 """What a client may do: look, or also command. A viewer's verbs change nothing."""
 ClientName: TypeAlias = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")]
 
-_CHANNELS: tuple[Channel, ...] = ("data", "status", "control", "frames")
 _MOST_EVENTS = 64  # of one socket at once: a flood of failing clients must not hold up the others
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _DENIAL_SPAN_S, _MOST_DENIALS = 10.0, 8
@@ -68,8 +69,8 @@ def log_event(code: str, _: Level, fields: Mapping[str, object]) -> None:
 # Endpoints.
 
 
-def _own_runtime_folder() -> None:
-    """Make it, with mode 0700. Raises EndpointError: it cannot be made, or belongs to another user."""
+def _make_runtime_folder() -> None:
+    """With mode 0700. Raises EndpointError: it cannot be made, or belongs to another user."""
     folder = runtime_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -90,11 +91,8 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def _free_ipc_path(path: Path) -> None:
-    """Remove the file that a dead process left; ZeroMQ itself would take a live endpoint away without a word.
-
-    Raises:
-        EndpointError: a process answers there, or it is no socket.
-    """
+    """Remove the file that a dead process left; ZeroMQ itself would take a live endpoint away without a word. Raises
+    EndpointError: a process answers there, or it is no socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(0.5)
         try:
@@ -158,11 +156,8 @@ def new_key_pair() -> KeyPair:
 
 
 def write_key_pair(folder: Path, pair: KeyPair) -> None:
-    """Write a new key folder, mode 0700, with its secret file of mode 0600.
-
-    Raises:
-        OutputError: there are keys already, which are never overwritten, or the folder cannot be written.
-    """
+    """Write a new key folder, mode 0700, with its secret file of mode 0600. Raises OutputError: there are keys already,
+    which are never overwritten, or the folder cannot be written."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         for name, text, mode in ((SECRET_FILE, pair.secret, 0o600), (PUBLIC_FILE, pair.public, 0o644)):
@@ -189,9 +184,7 @@ class AllowList:
 
     on_event gets ALLOW_CHANGED with the names that were `added` and `removed` (a new key or role is both), or
     ALLOW_REFUSED with a `message`, once for each broken file; then the list stays as it was.
-
-    Raises:
-        ConfigError: as load_server_security(); or nobody is on the list.
+    Raises ConfigError: as load_server_security(); or nobody is on the list.
     """
 
     def __init__(self, path: Path, on_event: EventSink = log_event) -> None:
@@ -253,7 +246,8 @@ def _version(path: Path) -> tuple[int, int, int] | None:
 
 
 class SocketGuard:
-    """Has the ZeroMQ context of a thread's sockets, binds them, and answers who may connect to those that are secured.
+    """Has the ZeroMQ context of a thread's sockets, binds them, waits for them, and answers who may connect to those
+    that are secured. `bind`, `wait` and `close` belong to that thread, or to whoever makes and ends it.
 
     on_event gets AUTH_DENIED: once for each key and socket in 10 s and at most 8 in all in that time, so that a hostile
     client cannot flood with it.
@@ -261,27 +255,29 @@ class SocketGuard:
 
     def __init__(self, security: ServerSecurity | None, on_event: EventSink | None = None) -> None:
         self.context: Context = zmq.Context()
-        self.monitors: dict[Socket, Channel] = {}
-        """monitors: readable once there is something for report_failures()."""
+        self._monitors: dict[Socket, Channel] = {}
+        self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self._wake_fd)  # no sooner: then it may mean another file to who wakes late
+        self._poller = zmq.Poller()
+        self._poller.register(self._wake_fd, zmq.POLLIN)
         self._security, self._on_event, self._lock = security, on_event or log_event, threading.Lock()
         self._reported_s: dict[tuple[str | None, str], float] = {}
         self._suppressed = 0
         self._authenticator: _Authenticator | None = None
         if security is not None:
-            self._authenticator = _Authenticator(self.context, security.find_client, self._deny)
+            self._authenticator = _Authenticator(self, security)
             self._authenticator.start()
 
     def bind(self, unbound: Socket, endpoint: str, channel: Channel) -> str:
-        """Bind a socket: tcp with keys if there are any, ipc for this user, and for his group if the umask lets it.
+        """Bind a socket: tcp with keys if there are any, ipc for this user, and his group if the umask lets it. Gives
+        its endpoint, with the port that was chosen if 0 was asked for.
 
-        Returns:
-            The endpoint, with the port that was chosen if 0 was asked for.
         Raises:
             SetupError: no endpoint. ConfigError: others than this machine could reach it without keys. EndpointError:
                 in use, or impossible.
         """
         if endpoint == "ipc":
-            _own_runtime_folder()
+            _make_runtime_folder()
         endpoint = resolve_endpoint(endpoint, channel)
         if endpoint.startswith("ipc://"):
             _free_ipc_path(Path(endpoint.removeprefix("ipc://")))
@@ -290,7 +286,9 @@ class SocketGuard:
             unbound.set(zmq.CURVE_SECRETKEY, self._security.keys.secret.encode())
             unbound.set(zmq.ZAP_DOMAIN, f"gcd.{channel}".encode())
             unbound.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without an authenticator: closed to all, not open to all
-            self.monitors[unbound.get_monitor_socket(_FAILED)] = channel
+            monitor = unbound.get_monitor_socket(_FAILED)
+            self._monitors[monitor] = channel
+            self._poller.register(monitor, zmq.POLLIN)
         elif not is_loopback(endpoint):
             raise ConfigError(
                 f"{endpoint} can be reached from other machines, which needs CURVE keys and a list of allowed clients: "
@@ -301,34 +299,42 @@ class SocketGuard:
         try:
             unbound.bind(endpoint)
         except zmq.ZMQError as error:
-            message = f"cannot bind {endpoint}: {error.strerror}; stop who uses it or choose another"
-            raise EndpointError(message) from error
+            raise EndpointError(f"cannot bind {endpoint}: {error.strerror}; choose another") from error
+        self._poller.register(unbound, zmq.POLLIN)
         bound = unbound.getsockopt_string(zmq.LAST_ENDPOINT)
         if bound.startswith("ipc://"):
             path = Path(bound.removeprefix("ipc://"))
             path.chmod(path.stat().st_mode & 0o770)  # whatever folder and umask say: not for everybody
         return bound
 
-    def report_failures(self) -> None:
-        """Report handshakes that failed before there was a key to judge; call it often, in the sockets' own thread."""
-        for monitor, channel in self.monitors.items():
+    def wake(self) -> None:
+        """End the wait() under way, or the next one; from any thread."""
+        os.eventfd_write(self._wake_fd, 1)
+
+    def wait(self, timeout_ms: int | None = None) -> None:
+        """Until one of the sockets can be read, or wake(). Reports handshakes that failed before there was a key to
+        judge."""
+        self._poller.poll(timeout_ms)
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake_fd)
+        for monitor, channel in self._monitors.items():
             for _ in range(_MOST_EVENTS):
                 if not monitor.poll(0):
                     break
                 if int(parse_monitor_message(monitor.recv_multipart())["event"]) & _FAILED:
-                    self._deny(None, f"gcd.{channel}", "")
+                    self.deny(None, f"gcd.{channel}", "")
 
     def close(self) -> None:
         """Let nobody in any more, close what is still open, and wait until what was sent has left. A second call does
         nothing."""
-        for monitor in self.monitors:
+        for monitor in self._monitors:
             monitor.close(0)
-        self.monitors.clear()
+        self._monitors.clear()
         if self._authenticator is not None:
             self._authenticator.stop()
         self.context.destroy()
 
-    def _deny(self, key: str | None, domain: str, address: str) -> None:
+    def deny(self, key: str | None, domain: str, address: str) -> None:
         """Report a refusal, or count it; key: None if the handshake came to none. From any thread."""
         with self._lock:
             now_s = time.monotonic()
@@ -345,15 +351,10 @@ class SocketGuard:
 class _Authenticator(ThreadAuthenticator):
     """Lets clients of the allow-list in; their messages carry the public key as `User-Id`."""
 
-    def __init__(
-        self,
-        context: Context,
-        find_client: Callable[[str], Client | None],
-        deny: Callable[[str, str, str], None],
-    ) -> None:
-        super().__init__(context)
-        self._find_client, self._deny, self._address = find_client, deny, ""
-        for channel in _CHANNELS:  # exactly these: a provider for "*" does not apply to a socket with a domain
+    def __init__(self, guard: SocketGuard, security: ServerSecurity) -> None:
+        super().__init__(guard.context)
+        self._find_client, self._deny, self._address = security.find_client, guard.deny, ""
+        for channel in get_args(Channel):  # exactly these: a provider for "*" does not apply to a socket with a domain
             self.configure_curve_callback(f"gcd.{channel}", self)
 
     def callback(self, domain: str, key: bytes) -> bool:

@@ -5,7 +5,6 @@ Elsewhere the key decides. The client: gcd_client.control.
 """
 
 import logging
-import os
 import threading
 import time
 from collections import OrderedDict
@@ -38,8 +37,8 @@ AnswerSink: TypeAlias = Callable[[bytes, bytes, Client], None]
 
 
 CommandHandler: TypeAlias = Callable[[Command, Role], Outcome]
-"""Carries a command out, or begins it and says ACCEPTED: Node.handle. Called in the control thread, so it takes a few
-ms at most. The role may use the verb, that is checked; `time` never comes here, and no repeat of a request."""
+"""Carries a command out, or begins it and says ACCEPTED: NodeCommands.handle. Called in the control thread, so it takes
+a few ms at most. The role may use the verb, that is checked; `time` never comes here, and no repeat of a request."""
 
 
 class ControlServer:
@@ -71,7 +70,7 @@ class ControlServer:
             "operator": ReplyCache(_KEEP_S, most_bytes=16 * 1024 * 1024),
             "viewer": ReplyCache(_KEEP_S, most_bytes=4 * 1024 * 1024),
         }
-        self._closing, self._wake_fd = threading.Event(), os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._closing = threading.Event()
         self._guard = SocketGuard(security, on_event)
         try:
             self._socket = self._guard.context.socket(zmq.ROUTER)
@@ -83,7 +82,6 @@ class ControlServer:
             self.endpoint = self._guard.bind(self._socket, endpoint, "control")
         except BaseException:
             self._guard.close()
-            os.close(self._wake_fd)
             raise
         self._security = security if self.endpoint.startswith("tcp://") else None
         self.thread = threading.Thread(target=self._serve, name="control", daemon=True)
@@ -94,10 +92,9 @@ class ControlServer:
         if self._closing.is_set():
             return
         self._closing.set()
-        os.eventfd_write(self._wake_fd, 1)
+        self._guard.wake()
         self.thread.join()
         self._guard.close()
-        os.close(self._wake_fd)
 
     def __enter__(self) -> "ControlServer":
         return self
@@ -108,13 +105,9 @@ class ControlServer:
     # What follows runs in the control thread alone.
 
     def _serve(self) -> None:
-        poller = zmq.Poller()
-        for source in (self._wake_fd, self._socket, *self._guard.monitors):
-            poller.register(source, zmq.POLLIN)
         try:
             while not self._closing.is_set():
-                poller.poll()
-                self._guard.report_failures()
+                self._guard.wait()
                 if self._socket.poll(0) and not self._closing.is_set():
                     try:
                         self._receive()

@@ -76,12 +76,10 @@ PATHS: Mapping[Verb, tuple[frozenset[State], State, State]] = types.MappingProxy
 
 
 class Lifecycle:
-    """Where a node stands. One transition at a time: `begin`, from any thread, then one of the others."""
+    """Where a node stands, and one transition at a time: `begin`, from any thread; who began sets `state` at last."""
 
     def __init__(self) -> None:
-        self.state = self._from = State.UNCONFIGURED
-        """state: where it stands now; changed here alone."""
-        self._verb: Verb = "configure"
+        self.state = State.UNCONFIGURED
         self._order = threading.Lock()
 
     def refusal(self, verb: Verb) -> str | None:
@@ -100,32 +98,13 @@ class Lifecycle:
         with self._order:
             refusal = self.refusal(verb)
             if refusal is None:
-                self._from, self._verb, self.state = self.state, verb, PATHS[verb][1]
+                self.state = PATHS[verb][1]
             return refusal
-
-    def succeed(self) -> None:
-        """The work was done: go where the transition leads."""
-        self.state = PATHS[self._verb][2]
-
-    def fail(self) -> None:
-        """It could not be done, and nothing has changed: back to where it was begun."""
-        self.state = self._from
-
-    def error(self) -> None:
-        """Something broke on the way: what still stands is unknown."""
-        self.state = State.ERRORPROCESSING
-
-    def recover(self) -> None:
-        """After `error`: everything was let go, so that configuring can start anew; or the end has come."""
-        self.state = State.FINALIZED if self._verb == "shutdown" else State.UNCONFIGURED
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Parts:
-    """What a node is made of; tests give others.
-
-    open_source: see sources.open_source(). load_model: see session.load_model().
-    """
+    """What a node is made of: see sources.open_source() and session.load_model(); tests give others."""
 
     open_source: Callable[[SourceConfig], FrameSource]
     load_model: LoadModel
@@ -150,7 +129,7 @@ class Transitions:
         self._live, self._announcer, self._health = live, announcer, announcer.health
         self._parts, self._recorder, self._on_window = parts, recorder, on_window
         self._model: ModelSlot | None = None
-        self._source: FrameSource | None = None
+        self._source: FrameSource | None = None  # open already, for the next activation
         self._info: SourceInfo | None = None
         self._first = (0, 0)
         self._interrupted = False
@@ -178,11 +157,8 @@ class Transitions:
         return bool(self._stuck)
 
     def configure(self) -> None:
-        """Load the model, and check the views. A recording is opened, so that a bad one is known at once.
-
-        Raises:
-            SourceError, CheckpointError, ConfigError, OptionError, PoseError: see there.
-        """
+        """Load the model, and check the views. A recording is opened, so that a bad one is known at once. Raises
+        SourceError, CheckpointError, ConfigError, OptionError, PoseError."""
         if self._live.config.source.kind not in LIVE_KINDS:
             self._source = self._open()
         try:
@@ -195,11 +171,8 @@ class Transitions:
         self._health.model = "ready"
 
     def activate(self) -> None:
-        """Open the source, and let views come once the model is warm.
-
-        Raises:
-            SourceAbsentError: there is no such camera. SourceError, ConfigError, OptionError, PoseError: see there.
-        """
+        """Open the source, and let views come once the model is warm. Raises SourceAbsentError: there is no such
+        camera; SourceError, ConfigError, OptionError, PoseError."""
         assert self._model is not None, "the lifecycle configures before it activates"
         self._health.forget_reasons()
         self._health.source("connecting")
@@ -286,11 +259,8 @@ class Transitions:
 
 
 def same_camera(config: SourceConfig, before: SourceInfo) -> SourceConfig:
-    """Settings that open the camera again that was open before.
-
-    An OAK that was taken because it was the only one is asked for by its id from then on: another one, plugged in
-    meanwhile, stands elsewhere and has another lens. Everything else is found where it was.
-    """
+    """Settings that open the camera again that was open before. An OAK that was taken because it was the only one is
+    asked for by its id: another one, plugged in meanwhile, stands elsewhere and has another lens."""
     if isinstance(config, OakSource) and config.device is None:
         return replace(config, device=before.id)
     return config

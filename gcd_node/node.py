@@ -10,21 +10,20 @@ from collections.abc import Callable, Mapping
 
 from gcd_client.control import Code
 from gcd_model import ModelError, Traits
-from gcd_node.auth import Role
 from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig
 from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
-from gcd_node.health import Health, Level
+from gcd_node.health import THREAD_DIED, Health, Level
 from gcd_node.inference import WindowReport
-from gcd_node.lifecycle import Lifecycle, Parts, State, Transitions, Verb
+from gcd_node.lifecycle import PATHS, Lifecycle, Parts, State, Transitions, Verb
 from gcd_node.messages import MessageSink
 from gcd_node.pipeline import Summary
 from gcd_node.recorder import Recorder
-from gcd_node.service import ServiceManager, Watchdog
+from gcd_node.service import ServiceManager
 from gcd_node.sources import LIVE_KINDS
 from gcd_node.sources.live import backoff_s
 from gcd_node.status import Announcer
-from gcd_node.verbs import Command, Outcome
+from gcd_node.verbs import Outcome
 from gcd_node.views import LiveConfig
 
 _LOG = logging.getLogger(__name__)
@@ -32,12 +31,15 @@ _TICK_S = 0.1
 _PATIENCE_S = 3.0  # of the 5 s an end may take; the rest is for what is still to be sent
 _LEAST_PATIENCE_S = 0.1
 _LEAST_RECORD_S = 0.5
+_CLOCK_STEP_NS = 100_000_000
 
 
 class Node:
-    """A camera, a model and the views between them. `run` blocks; `stop` and `handle` may be called from other threads,
-    `stop` from a signal handler too. Each transition is worked through in a thread of its own, so that status and
-    commands go on."""
+    """A camera, a model and the views between them. `run` blocks; all else may be called from other threads, `stop` in
+    a signal handler too. Each transition is worked through in a thread of its own, so that status and commands go on.
+
+    needed: threads that the node is not ready without.
+    """
 
     def __init__(
         self,
@@ -61,17 +63,19 @@ class Node:
         self.recorder = Recorder(config, boot_id, lambda: live.config, self.event, sink)
         self._announcer = Announcer(config.node_id, boot_id, self.recorder, self.health)
         self._transitions = Transitions(live, self._announcer, parts, self.recorder, on_window)
-        self._commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self.request)
+        self.commands = NodeCommands(live, self._announcer, self._transitions, self.recorder, self._request)
+        self.needed: list[threading.Thread] = []
         self._life = Lifecycle()
         self._work: threading.Thread | None = None
         self._service = service or ServiceManager({})
-        self.watchdog = Watchdog(self.event, self.health, config.life.hang_s)
         self._failures = 0  # of attempts to activate, in a row
         self._ends: queue.SimpleQueue[None] = queue.SimpleQueue()  # something in it: the life loop is to end
         self._stop_s: float | None = None
         self._retry_s: float | None = None
         self._on_its_own = config.life.autostart
         self._failure: Exception | None = None
+        self._dead: set[str] = set()
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     @property
     def state(self) -> State:
@@ -88,34 +92,9 @@ class Node:
         self.recorder.stop_waiting()
         self._ends.put(None)
 
-    def handle(self, command: Command, role: Role) -> Outcome:
-        """Carry a command out, or begin to; see CommandHandler."""
-        return self._commands.handle(command, role)
-
     def event(self, code: str, level: Level, fields: Mapping[str, object]) -> None:
         """Publish what any part of the process has noticed; see EventSink."""
         self._announcer.event(code, level, fields)
-
-    def request(self, verb: Verb, dry_run: bool) -> Outcome:
-        """Begin a transition; an event tells how it ends."""
-        if verb == "activate" and self._transitions.model_failed:
-            return Outcome(code=Code.NOT_READY, message="the model has failed; cleanup and configure load it anew")
-        if verb == "activate" and self._transitions.left_behind:
-            return Outcome(code=Code.NOT_READY, message="a thread of the last activation hangs; restart the process")
-        is_busy = not self.state.settled
-        if verb == "shutdown":
-            refusal = None if is_busy else self._life.refusal(verb)
-        else:
-            refusal = self._life.refusal(verb) if dry_run else self._begin(verb, requested=True)
-        if refusal is not None:
-            return Outcome(code=Code.BUSY if is_busy else Code.WRONG_STATE, message=refusal)
-        if dry_run:
-            return Outcome(message=f"{verb} would begin")
-        if verb == "shutdown":
-            self.stop()
-            return Outcome(code=Code.ACCEPTED, message="ending in order")
-        self._on_its_own &= verb not in ("deactivate", "cleanup")
-        return Outcome(code=Code.ACCEPTED, message=f"{verb} has begun; an event tells how it ends")
 
     def run(self) -> Summary:
         """Live until shutdown.
@@ -154,8 +133,7 @@ class Node:
         state, stream = self.state, self._transitions.stream
         if stream is not None:
             stream.tick()
-        if self.watchdog.check(0.0 if stream is None else stream.renderer.pulse.silent_s):
-            self._service.alive()
+        self._look_after(0.0 if stream is None else stream.renderer.pulse.silent_s)
         self.health.recording = self.recorder.report()
         if self._stop_s is not None:
             self._begin("shutdown")
@@ -165,6 +143,28 @@ class Node:
             self._retry_s = None
             self._begin("activate")
         self._announcer.status_if_due()
+
+    def _look_after(self, silent_s: float) -> None:
+        """Feed the service manager's watchdog, unless the model hangs or a thread has died; notice that a clock was set
+        (docs/node.md, F24). silent_s: how long the model has been at one step."""
+        is_hung = silent_s > self._config.life.hang_s
+        if not is_hung:
+            self.health.clear_reason("MODEL_HUNG")
+        elif self.health.raise_reason("MODEL_HUNG", Level.ERROR):
+            self._announcer.event("MODEL_HUNG", Level.ERROR, {"silent_s": round(silent_s, 1)})
+        was_dead, self._dead = self._dead, {each.name for each in self.needed if not each.is_alive()}
+        for name in self._dead - was_dead:
+            self._announcer.event(THREAD_DIED, Level.ERROR, {"thread": name, "message": "restart the node"})
+            self.health.raise_reason(THREAD_DIED, Level.ERROR)
+        if not is_hung and not self._dead:
+            self._service.alive()
+        before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after_ns - before_ns < _CLOCK_STEP_NS // 20:  # else interrupted between the two clocks
+            last_ns, self._offset_ns = self._offset_ns, utc_ns - before_ns
+            step_ns = self._offset_ns - last_ns  # much where somebody set UTC, next to nothing where it is slewed
+            if abs(step_ns) >= _CLOCK_STEP_NS:
+                fields = {"clock": "utc", "step_ms": round(step_ns / 1e6)}
+                self._announcer.event("CLOCK_STEP", Level.WARN, fields)
 
     def _prepare_stop(self) -> None:
         if self._stop_s is None:
@@ -182,6 +182,27 @@ class Node:
         self._announcer.status()
 
     # Transitions.
+
+    def _request(self, verb: Verb, dry_run: bool) -> Outcome:
+        """Begin a transition; an event tells how it ends."""
+        if verb == "activate" and self._transitions.model_failed:
+            return Outcome(code=Code.NOT_READY, message="the model has failed; cleanup and configure load it anew")
+        if verb == "activate" and self._transitions.left_behind:
+            return Outcome(code=Code.NOT_READY, message="a thread of the last activation hangs; restart the process")
+        is_busy = not self.state.settled
+        if verb == "shutdown":
+            refusal = None if is_busy else self._life.refusal(verb)
+        else:
+            refusal = self._life.refusal(verb) if dry_run else self._begin(verb, requested=True)
+        if refusal is not None:
+            return Outcome(code=Code.BUSY if is_busy else Code.WRONG_STATE, message=refusal)
+        if dry_run:
+            return Outcome(message=f"{verb} would begin")
+        if verb == "shutdown":
+            self.stop()
+            return Outcome(code=Code.ACCEPTED, message="ending in order")
+        self._on_its_own &= verb not in ("deactivate", "cleanup")
+        return Outcome(code=Code.ACCEPTED, message=f"{verb} has begun; an event tells how it ends")
 
     def _begin(self, verb: Verb, *, requested: bool = False) -> str | None:
         """Begin a transition, or say why that cannot be. requested: by a command, rather than by the node itself."""
@@ -207,20 +228,20 @@ class Node:
 
     def _fail(self, verb: Verb, error: Exception) -> None:
         if verb in ("configure", "activate") and isinstance(error, NodeError | ModelError):
-            self._life.fail()
+            (self._life.state,) = PATHS[verb][0]  # nothing has changed
         else:
-            self._life.error()
+            self._life.state = State.ERRORPROCESSING
             _LOG.error("%s broke", verb, exc_info=error)
-            self._transitions.close(_PATIENCE_S)
+            self._transitions.close(_PATIENCE_S)  # what still stands is unknown: everything is let go
             self.health.model = "absent"
-            self._life.recover()
+            self._life.state = State.FINALIZED if verb == "shutdown" else State.UNCONFIGURED
         self._publish_state()
         self._announcer.event(_code(error).value, Level.ERROR, {"verb": verb, "message": str(error)})
         self._after_failure(error, verb)
 
     def _succeed(self, verb: Verb, requested: bool) -> None:
         """And what follows by itself."""
-        self._life.succeed()
+        self._life.state = PATHS[verb][2]
         self._publish_state()
         if requested:
             self._announcer.event("STATE", Level.OK, {"verb": verb, "state": self.state.label})

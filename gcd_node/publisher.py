@@ -6,11 +6,9 @@ sleeps until a message, a subscription or the end comes.
 
 import contextlib
 import logging
-import os
 import queue
 import threading
 import time
-import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping
 from itertools import cycle
@@ -88,8 +86,6 @@ class Publisher:
         self._last_notes: dict[bytes, bytes] = {}
         self._topics: Counter[bytes] = Counter()  # subscriptions on the data socket; of the publisher's thread alone
         self._readers = (0, 0, 0)  # all, of views, of previews; never changed, only replaced
-        self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        weakref.finalize(self, os.close, self._wake_fd)  # no sooner: then it may mean another file to who wakes late
         self._guard = SocketGuard(security, on_event)
         try:
             self._data = _xpub(self._guard.context, _DATA_HWM, no_drop=lockstep)
@@ -99,9 +95,6 @@ class Publisher:
         except BaseException:
             self._guard.close()
             raise
-        self._poller = zmq.Poller()
-        for source in (self._wake_fd, self._data, self._status, *self._guard.monitors):
-            self._poller.register(source, zmq.POLLIN)
         self._thread = threading.Thread(target=self._serve, name="publisher", daemon=True)
         self._thread.start()
 
@@ -131,7 +124,7 @@ class Publisher:
         """
         self.check()
         self._preview = made
-        self._wake()
+        self._guard.wake()
 
     def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
         """Queue an end-of-stream message, to leave `delay_ms` (else end_delay_ms) after the last window; never dropped.
@@ -151,7 +144,7 @@ class Publisher:
         with self._note_order:
             self.check()
             self._notes.put(self._encoded(StatusMessage(topic=topic, header=header, fields=fields)))
-        self._wake()
+        self._guard.wake()
 
     def stop_waiting(self) -> None:
         """Stop waiting for readers, for a node that is stopping: what does not leave in `linger_ms` is lost."""
@@ -190,7 +183,7 @@ class Publisher:
         self._is_abandoned |= not orderly
         if is_first:
             self._closing_s = time.monotonic()
-        self._wake()
+        self._guard.wake()
         if not is_first:
             return
         self._thread.join()
@@ -225,7 +218,7 @@ class Publisher:
             except queue.Full:
                 self.check()
             else:
-                self._wake()
+                self._guard.wake()
                 return
         if follow_s is not None:
             self._queue.maxsize += 1  # room of its own: an end is never lost to a full queue
@@ -233,10 +226,7 @@ class Publisher:
             self._queue.put_nowait((part, follow_s))
         except queue.Full:
             self._dropped += 1
-        self._wake()
-
-    def _wake(self) -> None:
-        os.eventfd_write(self._wake_fd, 1)
+        self._guard.wake()
 
     # What follows runs in the publisher thread alone.
 
@@ -265,7 +255,7 @@ class Publisher:
             if queued is None:
                 if closing:
                     return
-                self._wait(None)
+                self._guard.wait(None)
                 progress = time.monotonic()
             elif self._send(*queued):
                 queued, progress = None, time.monotonic()
@@ -279,7 +269,7 @@ class Publisher:
                 )
             else:
                 progress = progress if closing else time.monotonic()
-                self._wait(_RETRY_MS)
+                self._guard.wait(_RETRY_MS)
 
     def _send(self, part: bytes, follow_s: float | None) -> bool:
         """Whether it left; if not, try again later."""
@@ -307,12 +297,6 @@ class Publisher:
         self._bytes += len(part)
         return True
 
-    def _wait(self, timeout_ms: int | None) -> None:
-        """Until a message, a subscription or the end comes."""
-        self._poller.poll(timeout_ms)
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self._wake_fd)
-
     def _see_off(self) -> None:
         """Wait until readers have left. ZeroMQ's linger ends when its last batch of bytes is on its way, and loses it
         to a reader too slow to take it at once; who leaves has the end-of-stream message. The ends are sent again
@@ -321,7 +305,7 @@ class Publisher:
         until += self._left_s(until)
         while self._ends and self._readers[0] and time.monotonic() < until:
             self._serve_sockets()
-            self._wait(_REPEAT_MS)
+            self._guard.wait(_REPEAT_MS)
             self._try_send(next(ends))
             if self._is_abandoned:
                 return
@@ -334,7 +318,6 @@ class Publisher:
         return begun_s + patience_ms / 1000 - time.monotonic()
 
     def _serve_sockets(self) -> None:
-        self._guard.report_failures()
         for event in _pending_events(self._data):
             self._count_reader(event)
         made, self._preview = self._preview, None

@@ -1,4 +1,4 @@
-"""How the process fits into its machine: service manager, watchdog, addresses of its HTTP pages, log lines."""
+"""How the process fits into its machine: service manager, addresses of its HTTP pages, log lines."""
 
 import contextlib
 import json
@@ -16,13 +16,11 @@ from datetime import UTC, datetime
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any
 
-from gcd_node.auth import EventSink, is_loopback
+from gcd_node.auth import is_loopback
 from gcd_node.errors import ConfigError, EndpointError
-from gcd_node.health import THREAD_DIED, Health, Level
 
 _LOG = logging.getLogger(__name__)
 _SEND_TIMEOUT_S = 0.5
-_CLOCK_STEP_NS = 100_000_000
 _WAITING_LINES = 1000
 _LAST_LINES_S = 1.0
 _LONGEST = 16_000
@@ -69,43 +67,6 @@ class ServiceManager:
             self._failed = True
             return False
         return True
-
-
-class Watchdog:
-    """Looks after a running node: a model that hangs, a thread that died, a clock that was set. Called by the node's
-    life loop alone."""
-
-    def __init__(self, report: EventSink, health: Health, hang_s: float) -> None:
-        """hang_s: how long a step of the model may take."""
-        self._report, self._health, self._hang_s = report, health, hang_s
-        self.threads: list[threading.Thread] = []
-        """threads: what the node is not ready without."""
-        self._dead: set[str] = set()
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
-
-    def check(self, silent_s: float) -> bool:
-        """Whether all is well; call it often. silent_s: how long the model has been at one step."""
-        is_hung = silent_s > self._hang_s
-        if not is_hung:
-            self._health.clear_reason("MODEL_HUNG")
-        elif self._health.raise_reason("MODEL_HUNG", Level.ERROR):
-            self._report("MODEL_HUNG", Level.ERROR, {"silent_s": round(silent_s, 1)})
-        was_dead, self._dead = self._dead, {each.name for each in self.threads if not each.is_alive()}
-        for name in self._dead - was_dead:
-            self._report(THREAD_DIED, Level.ERROR, {"thread": name, "message": "restart the node"})
-            self._health.raise_reason(THREAD_DIED, Level.ERROR)
-        if abs(step_ns := self._clock_step_ns()) >= _CLOCK_STEP_NS:
-            self._report("CLOCK_STEP", Level.WARN, {"clock": "utc", "step_ms": round(step_ns / 1e6)})
-        return not is_hung and not self._dead
-
-    def _clock_step_ns(self) -> int:
-        """How far UTC has moved against the monotonic clock since the last check, forwards positive (docs/node.md,
-        F24): much where somebody set it, next to nothing where it is slewed."""
-        before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        if after_ns - before_ns > _CLOCK_STEP_NS // 20:
-            return 0  # interrupted between the two clocks
-        last_ns, self._offset_ns = self._offset_ns, utc_ns - before_ns
-        return self._offset_ns - last_ns
 
 
 def listen(address: str, setting: str) -> socket.socket:

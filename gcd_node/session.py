@@ -15,7 +15,7 @@ import torch
 
 from gcd_client.endpoints import read_key_pair
 from gcd_model import OptionError, Traits, ViewSynthesizer, load_synthesizer
-from gcd_node.auth import EventSink, ServerSecurity, load_server_security, log_event
+from gcd_node.auth import ServerSecurity, load_server_security, log_event
 from gcd_node.config import ModelSection, NodeConfig, ViewerConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
@@ -105,8 +105,16 @@ def open_session(
         )
         control: ControlServer | None = None
         if config.control.endpoint is not None:
-            control = stack.enter_context(_control_server(config.control.endpoint, node, emit, security))
-            node.watchdog.threads.append(control.thread)
+            control = ControlServer(
+                config.control.endpoint,
+                node.commands.handle,
+                state=lambda: node.state.label,
+                on_event=emit,
+                on_answer=node.recorder.command,
+                security=security,
+            )
+            stack.enter_context(control)
+            node.needed.append(control.thread)
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:
@@ -115,17 +123,6 @@ def open_session(
             if viewer:
                 stack.enter_context(_viewer_process([*arguments, *(["--open"] if show_page else [])]))
         yield node, publisher, control
-
-
-def _control_server(endpoint: str, node: Node, emit: EventSink, security: ServerSecurity | None) -> ControlServer:
-    return ControlServer(
-        endpoint,
-        node.handle,
-        state=lambda: node.state.label,
-        on_event=emit,
-        on_answer=node.recorder.command,
-        security=security,
-    )
 
 
 def _viewer_arguments(
@@ -159,10 +156,7 @@ def _viewer_process(arguments: list[str]) -> Generator[None]:
 
 
 def metrics_server(address: str, health: Health) -> AbstractContextManager[object]:
-    """The pages of a node's health, served until left.
-
-    Raises ConfigError, EndpointError: see MetricsServer; ConfigError without the extra `metrics`.
-    """
+    """The pages of a node's health. Raises ConfigError, EndpointError: see MetricsServer; or without the extra."""
     try:
         from gcd_node.metrics import MetricsServer  # needs prometheus_client, which not every node has
     except ImportError as error:

@@ -63,8 +63,8 @@ class _PushDriver:
             raise
 
     def read(self) -> Frame | None:
-        self._guard.report_failures()
-        if not self._socket.poll(_WAIT_MS):
+        self._guard.wait(_WAIT_MS)
+        if not self._socket.poll(0):
             return None
         parts = self._socket.recv_multipart(copy=False)
         try:

@@ -4,7 +4,6 @@ F5, F6 and F25 are in test_fault_exits.py, F7 in test_camera_changes.py, F9 and 
 F16 to F19 with control and security, F20 in test_publisher.py and test_fault_exits.py, F22 in test_recorder.py.
 """
 
-import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -326,8 +325,8 @@ def test_a_control_thread_that_died_is_an_error_and_the_watchdog_is_not_fed(
         service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"})
         with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, service=service) as rig:
             rig.await_status(lambda status: status["ready"])
-            monkeypatch.setattr(rig.control._guard, "report_failures", lambda: 1 / 0)
-            os.eventfd_write(rig.control._wake_fd, 1)
+            monkeypatch.setattr(rig.control._guard, "wait", lambda: 1 / 0)
+            rig.control._guard.wake()
             assert rig.await_event("THREAD_DIED")["thread"] == "control"
             status = rig.await_status(lambda status: "THREAD_DIED" in status["reasons"])
             heard()

@@ -47,6 +47,10 @@ def get(server: MetricsServer, path: str) -> tuple[int, Any]:
     return code, body.decode() if path == "/metrics" else json.loads(body)
 
 
+def connected(server: MetricsServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", server.server_port), timeout=20)
+
+
 def samples(server: MetricsServer) -> dict[tuple[str, ...], float]:
     """Every sample by its name and its labels' values."""
     families = text_string_to_metric_families(get(server, "/metrics")[1])
@@ -66,18 +70,23 @@ def make_ready(health: Health) -> None:
 
 
 def test_a_node_is_ready_only_once_views_come(server: MetricsServer, health: Health) -> None:
-    missing = ["NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY", "VIEWS_NOT_FRESH"]
-    assert get(server, "/readyz") == (503, {"ready": False, "not_ready": missing, "level": 0, "reasons": []})
+    def ready(*missing: str, level: int = 0, reasons: tuple[str, ...] = ()) -> tuple[int, Any]:
+        fields = {"ready": not missing, "not_ready": list(missing), "level": level, "reasons": list(reasons)}
+        return (503 if missing else 200), fields
+
+    everything = ("NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY", "VIEWS_NOT_FRESH")
+    assert get(server, "/readyz") == ready(*everything)
     make_ready(health)
-    assert get(server, "/readyz") == (200, {"ready": True, "not_ready": [], "level": 0, "reasons": []})
+    assert get(server, "/readyz") == ready()
     health.source("lost")
-    missing = ["SRC_NOT_STREAMING"]
-    assert get(server, "/readyz") == (503, {"ready": False, "not_ready": missing, "level": 2, "reasons": ["SRC_LOST"]})
+    assert get(server, "/readyz") == ready("SRC_NOT_STREAMING", level=2, reasons=("SRC_LOST",))
     assert get(server, "/healthz") == (200, {"live": True})
     assert get(server, "/")[0] == 404
 
 
-def test_metrics_hold_what_the_health_was_told(server: MetricsServer, health: Health) -> None:
+def test_metrics_hold_what_the_health_was_told_and_are_explained_in_the_docs(
+    server: MetricsServer, health: Health, request: pytest.FixtureRequest
+) -> None:
     make_ready(health)
     for seconds in (0.1, 0.2, 0.3):
         health.stage("render", seconds)
@@ -117,17 +126,10 @@ def test_metrics_hold_what_the_health_was_told(server: MetricsServer, health: He
     assert found["gcd_stage_seconds_sum", "render"] == pytest.approx(0.6)
     assert 0 <= found["gcd_view_last_published_seconds", "topdown"] < 60
     assert found["process_resident_memory_bytes",] > 1e6
-
-
-def test_every_metric_is_explained_in_the_docs(
-    server: MetricsServer, health: Health, request: pytest.FixtureRequest
-) -> None:
-    make_ready(health)
-    health.gpu_mem_mb = 1.0
     families = text_string_to_metric_families(get(server, "/metrics")[1])
     ours = {family.name for family in families if family.name.startswith("gcd_")}
     text = (request.config.rootpath / "docs" / "deploy.md").read_text()
-    assert len(ours) > 20
+    assert len(ours) == 22
     assert [name for name in sorted(ours) if f"`{name}" not in text] == []
 
 
@@ -135,9 +137,8 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
     server: MetricsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gcd_node.metrics._Handler.timeout", 0.5)
-    host, _, port = server.url.removeprefix("http://").rpartition(":")
     before = threading.active_count()
-    silent = [socket.create_connection((host, int(port)), timeout=20) for _ in range(30)]
+    silent = [connected(server) for _ in range(30)]
     try:
         for caller in silent[8:]:
             assert caller.recv(1) == b""  # turned away
@@ -161,8 +162,7 @@ def test_without_the_extra_a_launch_file_that_asks_for_it_is_refused(
 
 @pytest.mark.parametrize("sent", [b"\x00\xff" * 40, b"GET " + b"/" * 70_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n"])
 def test_junk_is_refused_and_the_next_caller_served(server: MetricsServer, sent: bytes) -> None:
-    host, _, port = server.url.removeprefix("http://").rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=20) as caller:
+    with connected(server) as caller:
         caller.sendall(sent)
         caller.shutdown(socket.SHUT_WR)
         with contextlib.suppress(ConnectionResetError):

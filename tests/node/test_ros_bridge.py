@@ -292,7 +292,7 @@ class Life:
         if self.life.refusal(command.verb) is not None:
             return Outcome(code=Code.WRONG_STATE)
         self.life.begin(command.verb)
-        threading.Timer(0.2, self.life.succeed).start()
+        threading.Timer(0.2, setattr, (self.life, "state", PATHS[command.verb][2])).start()
         return Outcome(code=Code.ACCEPTED)
 
 

@@ -54,20 +54,6 @@ def test_a_socket_that_cannot_be_reached_is_logged_once_and_the_node_goes_on(
 # Log lines
 
 
-@pytest.fixture
-def stream() -> io.StringIO:
-    return io.StringIO()
-
-
-@pytest.fixture
-def log(stream: io.StringIO) -> logging.Logger:
-    """A logger of its own that writes JSON lines to `stream`."""
-    logger, handler = logging.Logger("gcd_node.test", level=logging.DEBUG), logging.StreamHandler(stream)
-    handler.setFormatter(JsonLines())
-    logger.addHandler(handler)
-    return logger
-
-
 def lines(text: str) -> list[dict[str, Any]]:
     def refuse(name: str) -> None:
         raise AssertionError(f"{name} is not JSON")
@@ -75,10 +61,20 @@ def lines(text: str) -> list[dict[str, Any]]:
     return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
 
 
-def test_a_line_says_when_where_and_what(log: logging.Logger, stream: io.StringIO) -> None:
-    before, event = datetime.now(UTC), {"code": "SRC_LOST", "level": 2, "view": None}
-    log.warning("window %d took %.1f s", 7, 2.5, extra={"event": event, "level": "forged"})
+def logged(*arguments: Any, **event: object) -> dict[str, Any]:
+    """The line of a warning."""
+    stream = io.StringIO()
+    logger, handler = logging.Logger("gcd_node.test"), logging.StreamHandler(stream)
+    handler.setFormatter(JsonLines())
+    logger.addHandler(handler)
+    logger.warning(*arguments, extra={"event": event, "level": "forged"})
     (line,) = lines(stream.getvalue())
+    return line
+
+
+def test_a_line_says_when_where_and_what() -> None:
+    before, event = datetime.now(UTC), {"code": "SRC_LOST", "level": 2, "view": None}
+    line = logged("window %d took %.1f s", 7, 2.5, **event)
     assert before <= datetime.fromisoformat(line.pop("time")) <= datetime.now(UTC)
     assert line == {
         "pid": os.getpid(),
@@ -90,13 +86,9 @@ def test_a_line_says_when_where_and_what(log: logging.Logger, stream: io.StringI
     }
 
 
-@pytest.mark.parametrize("value", [b"\xff", {1: {2}}, "\ud800", 'a\n{"level": 1}'])
-def test_whatever_is_logged_is_one_line_of_json(log: logging.Logger, stream: io.StringIO, value: object) -> None:
-    log.error("it is %s", value, extra={"event": {"value": value}})
-    log.error("x" * 1_000_000)
-    line, long = lines(stream.getvalue())
-    assert line["message"] == f"it is {value}"
-    assert len(long["message"]) == 16_000
+@pytest.mark.parametrize("value", [b"\xff", {1: {2}}, "\ud800", 'a\n{"level": 1}', "x" * 1_000_000])
+def test_whatever_is_logged_is_one_line_of_json(value: object) -> None:
+    assert logged("it is %s", value, value=value)["message"] == f"it is {value}"[-16_000:]
 
 
 def in_a_process(code: str, **options: Any) -> "subprocess.Popen[str]":

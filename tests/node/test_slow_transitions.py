@@ -75,7 +75,7 @@ def test_f23_whatever_part_of_the_model_is_at_work_it_is_abandoned(
         assert model.begun.wait(30)
         rig.node.stop()
         rig.await_state("finalized")
-        assert not rig.node.left_behind
+    assert not rig.node.left_behind
     assert rig.failure is None
     assert rig.views == []
     assert "does not end" not in caplog.text
@@ -99,6 +99,21 @@ def test_while_a_transition_is_under_way_the_node_is_busy_and_can_still_be_ended
         loaded.set()
         rig.await_state("finalized")
     assert rig.failure is None
+
+
+def test_what_breaks_in_a_transition_is_internal_and_the_node_can_begin_anew(tmp_path: Path) -> None:
+    broken = [ZeroDivisionError("ours")]
+
+    def load(_: ModelSection) -> ViewSynthesizer:
+        if broken:
+            raise broken.pop()
+        return FakeSynthesizer(traits())
+
+    with Rig(tmp_path, Bench(), load, more=WAITING) as rig:
+        for event, state in (("INTERNAL", "unconfigured"), ("STATE", "inactive")):
+            assert rig.ask("configure").code is Code.ACCEPTED
+            assert rig.await_event(event)["verb"] == "configure"
+            rig.await_state(state)
 
 
 def test_a_thread_left_behind_keeps_the_node_from_starting_only_until_it_ends(tmp_path: Path) -> None:
