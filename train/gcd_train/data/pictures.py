@@ -118,7 +118,6 @@ class SplatPictures:
         smaller = render_lens(lens, self._width, self._height)
         labels, device = self._ids(views), self._options.device
         drawn = splat(views, world_from_target, smaller, labels=labels, options=self._points, device=device)
-        assert drawn.labels is not None
         return drawn.labels.masked_fill(~drawn.covered, VOID).byte().cpu().numpy()
 
     def _ids(self, views: Sequence[SceneView]) -> list[Bytes]:

@@ -33,19 +33,14 @@ class SplatOptions:
 
     radius: each point also shows in the pixels from -(radius // 2) to (radius + 1) // 2 about its own, both ways: 0 its
         own alone, 1 also right, below and below right, 2 all eight neighbours.
-    negligible: relative weight below which a point is left out before colours are gathered; 0 keeps all.
     published: pixels are whole numbers without the half that leads to their middles, in the source as in the target,
         and what lies up to a pixel beyond the left or upper edge falls on it. For comparing with the published clouds
         only: it shifts pictures that differ in size by part of a pixel.
-    compact: forget points outside the picture at once, which on a GPU means to wait for it; None does so on the CPU
-        only.
     Source: Generative Camera Dolly, point renderer as released.
     """
 
     radius: int = 1
-    negligible: float = 4e-8
     published: bool = False
-    compact: bool | None = None
 
     @property
     def pixel_centre(self) -> float:
@@ -160,17 +155,15 @@ class Tiles:
     row: NDArray[np.intp]
     column: NDArray[np.intp]
 
-    def __len__(self) -> int:
-        return len(self.row)
-
-    def cut(self, picture: NDArray[Number]) -> NDArray[Number]:
+    def cut(self, picture: NDArray[Number], device: torch.device) -> Tensor:
         """These tiles of a picture [H, W, ...], as [K, side, side, ...]; 0 beyond its edges."""
-        return _tiled(picture)[self.row, :, self.column]
+        return _to_device(_tiled(picture)[self.row, :, self.column], device)
 
-    def lines(self, pixels: PixelMap) -> tuple[Doubles, Doubles]:
+    def lines(self, pixels: PixelMap, device: torch.device) -> tuple[Tensor, Tensor]:
         """The map's columns and rows in these tiles: across [3, K, 1, side] and along [3, K, side, 1]."""
         across, along = _tiled_line(pixels.across)[self.column], _tiled_line(pixels.along)[self.row]  # [K, side, 3]
-        return across.transpose(2, 0, 1)[:, :, None, :], along.transpose(2, 0, 1)[..., None]
+        lines = across.transpose(2, 0, 1)[:, :, None, :], along.transpose(2, 0, 1)[..., None]
+        return _to_device(lines[0], device), _to_device(lines[1], device)
 
 
 def contributing(depth: NDArray[np.float32], pixels: PixelMap, lens: Intrinsics) -> Tiles:
@@ -180,42 +173,39 @@ def contributing(depth: NDArray[np.float32], pixels: PixelMap, lens: Intrinsics)
 
     depth: f32 [H, W] of the source, metres. pixels: from there to the target. lens: of the target.
     """
-    frustum = _Frustum(pixels=pixels, lens=lens)
     none, all_depths = np.zeros((1, 1)), np.full((1, 1), FARTHEST_M)
-    if frustum.misses(pixels.across[None], pixels.along[None], none, all_depths).all():
+    if _outside(pixels, lens, pixels.across[None], pixels.along[None], none, all_depths).all():
         return Tiles(row=np.zeros(0, np.intp), column=np.zeros(0, np.intp))
     tiled = _tiled(depth)
     # One axis after the other, the long one last: six times as fast as both at once.
     low, high = tiled.min(axis=1).min(axis=-1), tiled.max(axis=1).max(axis=-1)
     low, high = np.maximum(low, 0.0), np.minimum(high, FARTHEST_M)
-    missed = frustum.misses(_tiled_line(pixels.across), _tiled_line(pixels.along), low, high)
+    missed = _outside(pixels, lens, _tiled_line(pixels.across), _tiled_line(pixels.along), low, high)
     row, column = np.nonzero(~(missed | (high <= 0.0)))
     return Tiles(row=row, column=column)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Frustum:
-    """What the target camera sees."""
+def _outside(
+    pixels: PixelMap,
+    lens: Intrinsics,
+    across: Doubles,
+    along: Doubles,
+    low: NDArray[np.floating],
+    high: NDArray[np.floating],
+) -> NDArray[np.bool_]:
+    """Which tiles are wholly beyond one side of what the target camera sees: bool [rows, columns].
 
-    pixels: PixelMap
-    lens: Intrinsics
-
-    def misses(
-        self, across: Doubles, along: Doubles, low: NDArray[np.floating], high: NDArray[np.floating]
-    ) -> NDArray[np.bool_]:
-        """Which tiles are wholly beyond one of its sides: bool [rows, columns].
-
-        across: [columns, side, 3], along: [rows, side, 3]; low, high: [rows, columns], the depths in each tile. A
-        tile's points lie between eight corners. Whatever is not a number is never beyond anything.
-        """
-        ray = along[:, None, [0, -1], None] + across[None, :, None, [0, -1]]  # [rows, columns, 2, 2, 3]
-        depths = np.stack([low, high], axis=-1)[..., None, None, None]  # [rows, columns, 2, 1, 1, 1]
-        with np.errstate(invalid="ignore"):  # of depths that are no numbers
-            x, y, ahead = np.moveaxis(depths * ray[:, :, None] + self.pixels.offset, -1, 0)  # [rows, columns, 2, 2, 2]
-        beyond = [ahead <= NEAREST_M]
-        for place, centre, size in ((x, self.lens.cx, self.lens.width), (y, self.lens.cy, self.lens.height)):
-            beyond += [place + (centre + 1.0 + _MARGIN) * ahead < 0.0, place + (centre - size - _MARGIN) * ahead > 0.0]
-        return np.any([side.all(axis=(2, 3, 4)) for side in beyond], axis=0)
+    across: [columns, side, 3], along: [rows, side, 3]; low, high: [rows, columns], the depths in each tile. A tile's
+    points lie between eight corners. Whatever is not a number is never beyond anything.
+    """
+    ray = along[:, None, [0, -1], None] + across[None, :, None, [0, -1]]  # [rows, columns, 2, 2, 3]
+    depths = np.stack([low, high], axis=-1)[..., None, None, None]  # [rows, columns, 2, 1, 1, 1]
+    with np.errstate(invalid="ignore"):  # of depths that are no numbers
+        x, y, ahead = np.moveaxis(depths * ray[:, :, None] + pixels.offset, -1, 0)  # [rows, columns, 2, 2, 2]
+    beyond = [ahead <= NEAREST_M]
+    for place, centre, size in ((x, lens.cx, lens.width), (y, lens.cy, lens.height)):
+        beyond += [place + (centre + 1.0 + _MARGIN) * ahead < 0.0, place + (centre - size - _MARGIN) * ahead > 0.0]
+    return np.any([side.all(axis=(2, 3, 4)) for side in beyond], axis=0)
 
 
 def _tiled(picture: NDArray[Number]) -> NDArray[Number]:
@@ -237,15 +227,17 @@ class Hits:
     """Points of one view that fall into the picture.
 
     pixel: int64 [M], flat. depth: float32 [M], metres ahead of the target camera. tiles: parts of the view that were
-    looked at. source: int64 [M], flat numbers of the pixels in them; None where M is all of them in order, and then
-    depth is inf for those that do not fall into the picture. farthest: scalar, the largest finite depth, or 0.
+    looked at. source: int64 [M], flat numbers of the pixels in them.
     """
 
     pixel: Tensor
     depth: Tensor
     tiles: Tiles
-    source: Tensor | None
-    farthest: Tensor
+    source: Tensor
+
+    def pick(self, picture: NDArray[np.generic], source: Tensor) -> Tensor:
+        """What points of these source numbers show of a picture [H, W, C] of the view: [M, C]."""
+        return self.tiles.cut(picture, source.device).flatten(0, 2).index_select(0, source)
 
 
 def project(
@@ -255,16 +247,12 @@ def project(
     options: SplatOptions,
     device: torch.device,
 ) -> Hits | None:
-    """The pixels of a view where they fall in a camera's picture; None where it cannot see any of them.
-
-    All others are left out, or stay, out of the way: see SplatOptions.compact.
-    """
+    """The pixels of a view where they fall in a camera's picture; None where it cannot see any of them."""
     pixels = PixelMap.between(view.world_from_camera, view.lens, world_from_camera, lens, options.pixel_centre)
     tiles = contributing(view.depth, pixels, lens)
-    if not len(tiles):
+    if not len(tiles.row):
         return None
-    depth = to_device(tiles.cut(view.depth), device)  # [K, side, side]
-    across, along = (to_device(line, device) for line in tiles.lines(pixels))
+    depth, (across, along) = tiles.cut(view.depth, device), tiles.lines(pixels, device)  # [K, side, side]
     x, y, ahead = (
         torch.addcmul(torch.full((), float(pixels.offset[axis]), device=device), depth, across[axis] + along[axis])
         for axis in range(3)
@@ -272,51 +260,24 @@ def project(
     shift = 0.5 - options.pixel_centre
     column, row = x / ahead + (lens.cx + shift), y / ahead + (lens.cy + shift)
     inside = (depth > 0.0) & (depth <= FARTHEST_M) & (ahead > NEAREST_M)
-    inside &= _within(column, lens.width, options) & _within(row, lens.height, options)
-    if options.compact or (options.compact is None and device.type == "cpu"):
-        return _left_out(column, row, ahead, inside, lens, tiles)
-    return _set_aside(column, row, ahead, inside, lens, tiles)
-
-
-def to_device(array: NDArray[np.generic], device: torch.device) -> Tensor:
-    """An array as a tensor; floating numbers become float32."""
-    kind = np.float32 if np.issubdtype(array.dtype, np.floating) else array.dtype
-    return torch.from_numpy(np.ascontiguousarray(array, kind)).to(device, non_blocking=True)
+    for place, size in ((column, lens.width), (row, lens.height)):  # cutting off the digits gives one of the pixels
+        inside &= ((place > -1.0) if options.published else (place >= 0.0)) & (place < size)
+    source = where_true(inside)
+    if not len(source):
+        return None
+    column, row, ahead = (each.flatten().index_select(0, source) for each in (column, row, ahead))
+    pixel = (row.to(torch.int32) * lens.width + column.to(torch.int32)).to(torch.int64)
+    return Hits(pixel=pixel, depth=ahead, tiles=tiles, source=source)
 
 
 def where_true(flags: Tensor) -> Tensor:
-    """Flat numbers of the true ones, int64; waits for the device."""
+    """Flat numbers of the true ones, int64."""
     if flags.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(flags.numpy()))  # five times as fast as torch's own
     return flags.flatten().nonzero()[:, 0]
 
 
-def _within(place: Tensor, size: int, options: SplatOptions) -> Tensor:
-    """Whether cutting off the digits behind the point gives one of a picture's pixels."""
-    return ((place > -1.0) if options.published else (place >= 0.0)) & (place < size)
-
-
-def _left_out(column: Tensor, row: Tensor, ahead: Tensor, inside: Tensor, lens: Intrinsics, tiles: Tiles) -> Hits:
-    source = where_true(inside)
-    column, row, depth = (each.flatten().index_select(0, source) for each in (column, row, ahead))
-    farthest = depth.amax() if len(source) else depth.new_zeros(())
-    return Hits(pixel=_flat(column, row, lens), depth=depth, tiles=tiles, source=source, farthest=farthest)
-
-
-def _set_aside(column: Tensor, row: Tensor, ahead: Tensor, inside: Tensor, lens: Intrinsics, tiles: Tiles) -> Hits:
-    aside = torch.arange(inside.numel(), device=inside.device) % (
-        lens.width * lens.height
-    )  # apart, or they would queue
-    outside = ~inside  # filled in, not chosen between: a number as one of two choices would be copied to the device
-    pixel = _flat(column.masked_fill(outside, 0.0), row.masked_fill(outside, 0.0), lens).flatten()
-    return Hits(
-        pixel=torch.where(inside.flatten(), pixel, aside),
-        depth=ahead.masked_fill(outside, torch.inf).flatten(),
-        tiles=tiles,
-        source=None,
-        farthest=ahead.masked_fill(outside, 0.0).amax(),
-    )
-
-
-def _flat(column: Tensor, row: Tensor, lens: Intrinsics) -> Tensor:
-    return (row.to(torch.int32) * lens.width + column.to(torch.int32)).to(torch.int64)
+def _to_device(array: NDArray[np.generic], device: torch.device) -> Tensor:
+    """An array as a tensor; floating numbers become float32."""
+    kind = np.float32 if np.issubdtype(array.dtype, np.floating) else array.dtype
+    return torch.from_numpy(np.ascontiguousarray(array, kind)).to(device)

@@ -53,7 +53,7 @@ def published_tensor(
     kernel: int = 21,
     sigma: float = 5.25,
 ) -> Tensor:
-    """A target picture the published way, on the device, without waiting for it.
+    """A target picture the published way, on the device.
 
     Args:
         views, world_from_camera, values, options, device: see splat().

@@ -9,7 +9,6 @@ from pictures: the cost does not depend on how many points there are.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from torch import Tensor
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
-from gcd_train.pointcloud.project import NEAREST_M, Doubles, Hits, SplatOptions, project, to_device, where_true
+from gcd_train.pointcloud.project import NEAREST_M, Doubles, Hits, SplatOptions, project, where_true
 
 Bytes = NDArray[np.uint8]
 Labels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -30,6 +29,7 @@ Labels = NDArray[np.uint8] | NDArray[np.uint16]
 _SHARPNESS, _FAR_FROM_M, _FAR_SHARPNESS, _FAR_LIMIT = 512.0, 64.0, 256.0, 32.0
 _NEIGHBOUR_SHARE = 0.02  # of a point's weight, beside its own pixel
 _FLOAT64_TRACE = 740.0  # a weight e^740 times smaller than the largest is the last that a float64 mean keeps
+_PATIENCE = -math.log(4e-8)  # a point of less relative weight is left out before colours are gathered
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,7 +38,7 @@ class Splatted:
 
     colour: float32 [H, W, C] in 0..1, 0 where nothing is. covered: bool [H, W], where something is.
     depth: float32 [H, W], metres along the optical axis, of the point that weighs most; 0 where nothing is.
-    labels: int32 [H, W], of the same point, 0 where nothing is; None if none were given.
+    labels: int32 [H, W], of the same point, 0 where nothing is or none were given.
     lit: bool [H, W, C / 3], where float64 would leave a trace of anything that is not black in three channels, however
     far behind; with `options.published` alone, else of no channels.
     """
@@ -46,7 +46,7 @@ class Splatted:
     colour: Tensor
     covered: Tensor
     depth: Tensor
-    labels: Tensor | None
+    labels: Tensor
     lit: Tensor
 
 
@@ -70,8 +70,6 @@ def splat(
         values: u8 [H, W, C] for each view, to be averaged; by default its colours. Join several things along C.
         labels: [H, W] for each view: numbers that must not be averaged, such as ids.
         options: see SplatOptions. device: a torch device, by default the CPU.
-    Returns:
-        The picture; on a GPU, without waiting for it.
     Raises:
         DataError: a view whose parts are of different sizes, or values of different kinds.
     Source: Generative Camera Dolly, point renderer as released; relative weights are ours.
@@ -80,136 +78,101 @@ def splat(
     shown = [view.rgb for view in views] if values is None else list(values)
     channels = _require_fitting(views, shown, labels)
     projected = [project(view, world_from_camera, lens, options, device) for view in views]
-    hits = [(number, each) for number, each in enumerate(projected) if each is not None]
-    canvas = _Canvas.of([each for _, each in hits], lens, channels, options, device)
-    for number, each in hits:
+    hits = {number: each for number, each in enumerate(projected) if each is not None}
+    canvas = _Canvas(list(hits.values()), lens, channels, lit=options.published, device=device)
+    for number, each in hits.items():
         canvas.add(each, shown[number], None if labels is None else labels[number])
-    picture = show(canvas.gathered(), options)
-    return Splatted(
-        colour=(picture.colour / 255).permute(1, 2, 0),
-        covered=picture.covered,
-        depth=picture.picked[0],
-        labels=None if labels is None else picture.picked[1].to(torch.int32),
-        lit=picture.lit.permute(1, 2, 0),
-    )
+    return canvas.shown([(down, right) for down in options.offsets for right in options.offsets])
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Gathered:
-    """What fell on each pixel, weights relative to the nearest point of that pixel.
-
-    nearest: [H, W], d of the nearest point, inf where nothing fell. rate: scalar; weights fall by e in d = 1 / rate.
-    weight: [H, W], sum of weights, 1 and more where something fell. colour: [C, H, W], sum of weights times values.
-    picked: [L, H, W], numbers of the nearest point itself: its depth, its labels. lit: [G, H, W], d of the
-    nearest point that is not black in three channels, inf where there is none; G is 0 where nobody asks.
-    """
-
-    nearest: Tensor
-    rate: Tensor
-    weight: Tensor
-    colour: Tensor
-    picked: Tensor
-    lit: Tensor
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class _Canvas:
-    """Sums over the points that fell on each pixel, [..., H*W]; see Gathered. is_far: scalar, which rule holds for d.
+    """Sums over the points that fell on each pixel, [..., H*W], with weights relative to its nearest point.
 
-    nearest_m: depth of the nearest point. lit: [G, H*W], see Gathered.
+    nearest_m, label: depth and label of the nearest point; nearest: its d, inf where nothing fell. rate: scalar,
+    weights fall by e in d = 1 / rate. weight: sum of weights, 1 and more where something fell. colour: [C, ...], sum of
+    weights times values. lit: [G, ...], d of the nearest point that is not black in three channels, inf without one;
+    G is 0 unless `lit`.
     """
 
-    lens: Intrinsics
-    options: SplatOptions
-    is_far: Tensor
-    rate: Tensor
-    nearest_m: Tensor
-    nearest: Tensor
-    weight: Tensor
-    colour: Tensor
-    label: Tensor
-    lit: Tensor
-
-    @classmethod
-    def of(
-        cls, hits: Sequence[Hits], lens: Intrinsics, channels: int, options: SplatOptions, device: torch.device
-    ) -> Self:
+    def __init__(
+        self, hits: Sequence[Hits], lens: Intrinsics, channels: int, *, lit: bool, device: torch.device
+    ) -> None:
         """An empty one, that knows which points are nearest."""
-        size = lens.width * lens.height
-        nearest_m = torch.full((size,), torch.inf, device=device)
+        self._shape, size = (lens.height, lens.width), lens.height * lens.width
+        self._nearest_m = torch.full((size,), torch.inf, device=device)
         farthest = torch.full((), NEAREST_M, device=device)
         for each in hits:
-            nearest_m.scatter_reduce_(0, each.pixel, each.depth, "amin")
-            farthest = torch.maximum(farthest, each.farthest)
-        is_far = farthest >= _FAR_FROM_M
+            self._nearest_m.scatter_reduce_(0, each.pixel, each.depth, "amin")
+            farthest = torch.maximum(farthest, each.depth.amax())
+        self._is_far = bool(farthest >= _FAR_FROM_M)
         far_rate = 2.0 * _FAR_SHARPNESS / farthest.sqrt().clamp(max=_FAR_LIMIT)
-        return cls(
-            lens=lens,
-            options=options,
-            is_far=is_far,
-            rate=torch.where(is_far, far_rate, 2.0 * _SHARPNESS / farthest),
-            nearest_m=nearest_m,
-            nearest=_d(nearest_m, is_far).masked_fill(nearest_m.isinf(), torch.inf),
-            weight=torch.zeros(size, device=device),
-            colour=torch.zeros(channels, size, device=device),
-            label=torch.zeros(size, dtype=torch.int32, device=device),
-            lit=torch.full((-(-channels // 3) if options.published else 0, size), torch.inf, device=device),
-        )
+        self._rate = far_rate if self._is_far else 2.0 * _SHARPNESS / farthest
+        self._nearest = self._d(self._nearest_m).masked_fill(self._nearest_m.isinf(), torch.inf)
+        self._weight, self._colour = (torch.zeros(*each, size, device=device) for each in ((), (channels,)))
+        self._label = torch.zeros(size, dtype=torch.int32, device=device)
+        self._lit = torch.full((-(-channels // 3) if lit else 0, size), torch.inf, device=device)
 
     def add(self, hits: Hits, values: Bytes, labels: Labels | None) -> None:
         """Weigh the points of a view, and gather what they show."""
-        behind = (_d(hits.depth, self.is_far) - self.nearest.index_select(0, hits.pixel)) * self.rate
-        pixel, depth, kept = hits.pixel, hits.depth, hits.source
-        if len(self.lit):
-            self._light(hits, values)
-        if kept is None:
-            behind = behind.masked_fill(depth.isinf(), torch.inf)
-        else:
-            near = where_true(behind <= self._patience)
-            pixel, depth, kept, behind = (each.index_select(0, near) for each in (pixel, depth, kept, behind))
+        d = self._d(hits.depth)
+        if len(self._lit):  # also of those that weigh next to nothing
+            for nearest, part in zip(self._lit, hits.pick(values, hits.source).split(3, -1), strict=True):
+                black = (part == 0).all(-1)
+                nearest.scatter_reduce_(0, hits.pixel, d.masked_fill(black, torch.inf), "amin")
+        behind = (d - self._nearest.index_select(0, hits.pixel)) * self._rate
+        near = where_true(behind <= _PATIENCE)
+        pixel, depth, kept, behind = (
+            each.index_select(0, near) for each in (hits.pixel, hits.depth, hits.source, behind)
+        )
         share = torch.exp(-behind)
-        self.weight.scatter_add_(0, pixel, share)
-        for sums, shown in zip(self.colour, _picked(values, hits, kept, share.device).unbind(1), strict=True):
+        self._weight.scatter_add_(0, pixel, share)
+        for sums, shown in zip(self._colour, hits.pick(values, kept).unbind(1), strict=True):
             sums.scatter_add_(0, pixel, shown * share)
         if labels is not None:
-            label = _picked(labels[..., None].astype(np.int32), hits, kept, share.device)[:, 0]
-            others = depth != self.nearest_m.index_select(0, pixel)
-            self.label.scatter_reduce_(0, pixel, label.masked_fill(others, 0), "amax")
+            label = hits.pick(labels[..., None].astype(np.int32), kept)[:, 0]
+            others = depth != self._nearest_m.index_select(0, pixel)
+            self._label.scatter_reduce_(0, pixel, label.masked_fill(others, 0), "amax")
 
-    def _light(self, hits: Hits, values: Bytes) -> None:
-        """Note how far the nearest points are that are not black, also those that weigh next to nothing."""
-        d = _d(hits.depth, self.is_far).masked_fill(hits.depth.isinf(), torch.inf)
-        for sums, part in zip(self.lit, _picked(values, hits, hits.source, d.device).split(3, -1), strict=True):
-            black = (part == 0).all(-1)
-            sums.scatter_reduce_(0, hits.pixel, d.masked_fill(black, torch.inf), "amin")
-
-    def gathered(self) -> Gathered:
-        """The sums, as pictures."""
-        shape = (self.lens.height, self.lens.width)
-        return Gathered(
-            nearest=self.nearest.view(shape),
-            rate=self.rate,
-            weight=self.weight.view(shape),
-            colour=self.colour.view(-1, *shape),
-            picked=torch.stack([self.nearest_m, self.label.float()]).view(-1, *shape),
-            lit=self.lit.view(-1, *shape),
+    def shown(self, offsets: Sequence[tuple[int, int]]) -> Splatted:
+        """Every pixel as the weighted mean of what shows in it, from pixels that are so many rows and columns away."""
+        nearest, weight, colour, nearest_m, label, lit_d = (
+            each.view(*each.shape[:-1], *self._shape)
+            for each in (self._nearest, self._weight, self._colour, self._nearest_m, self._label, self._lit)
+        )
+        handicap = -math.log(_NEIGHBOUR_SHARE) / self._rate  # what a neighbour's point seems to lie further back
+        behind = [handicap if at != (0, 0) else torch.zeros_like(handicap) for at in offsets]
+        seeming = [_moved(nearest, at, torch.inf) + more for at, more in zip(offsets, behind, strict=True)]
+        front = torch.stack(seeming).amin(dim=0)  # [H, W]
+        covered = front < torch.inf
+        front = front.masked_fill(~covered, 0.0)
+        total, mean, lit = torch.zeros_like(weight), torch.zeros_like(colour), torch.full_like(lit_d, torch.inf)
+        depth, labels = torch.zeros_like(nearest_m), torch.zeros_like(label)
+        for at, more, d in zip(offsets, behind, seeming, strict=True):
+            share = torch.exp((front - d) * self._rate)  # 0 where nothing fell
+            total += share * _moved(weight, at, 0.0)
+            mean += share * _moved(colour, at, 0.0)
+            depth = torch.where(d == front, _moved(nearest_m, at, 0.0), depth)
+            labels = torch.where(d == front, _moved(label, at, 0), labels)
+            lit = torch.minimum(lit, _moved(lit_d, at, torch.inf) + more)
+        return Splatted(
+            colour=(mean / total.clamp(min=1e-30) / 255).permute(1, 2, 0),
+            covered=covered,
+            depth=depth,
+            labels=labels,
+            lit=((lit - front) * self._rate <= _FLOAT64_TRACE).permute(1, 2, 0),
         )
 
-    @property
-    def _patience(self) -> float:
-        negligible = self.options.negligible
-        return -math.log(negligible) if negligible > 0.0 else math.inf
+    def _d(self, depth: Tensor) -> Tensor:
+        """What the depth test goes by."""
+        return depth.sqrt().clamp(max=_FAR_LIMIT) if self._is_far else depth
 
 
-def _d(depth: Tensor, is_far: Tensor) -> Tensor:
-    """What the depth test goes by."""
-    return torch.where(is_far, depth.sqrt().clamp(max=_FAR_LIMIT), depth)
-
-
-def _picked(picture: NDArray[np.generic], hits: Hits, kept: Tensor | None, device: torch.device) -> Tensor:
-    """What points show, [M, C]."""
-    cut = to_device(hits.tiles.cut(picture), device).flatten(0, 2)  # [K*side*side, C]
-    return cut if kept is None else cut.index_select(0, kept)
+def _moved(picture: Tensor, by: tuple[int, int], outside: float) -> Tensor:
+    """A picture [..., H, W] moved down and right by whole pixels, with a constant where nothing comes from."""
+    (down, right), (height, width) = by, picture.shape[-2:]
+    wide = F.pad(picture, (max(right, 0), max(-right, 0), max(down, 0), max(-down, 0)), value=outside)
+    top, left = max(-down, 0), max(-right, 0)
+    return wide[..., top : top + height, left : left + width]
 
 
 def _require_fitting(views: Sequence[SceneView], values: Sequence[Bytes], labels: Sequence[Labels] | None) -> int:
@@ -226,52 +189,3 @@ def _require_fitting(views: Sequence[SceneView], values: Sequence[Bytes], labels
         if shown.ndim != 3 or shown.dtype != np.uint8 or shown.shape[2] != values[0].shape[2]:
             raise DataError(f"values must be u8 [H, W, C] with the same C, got {shown.dtype} {list(shown.shape)}")
     return values[0].shape[2] if values else 3
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Shown:
-    """colour: [C, H, W], the mean of what shows. picked: [L, H, W], of the heaviest. covered: bool [H, W].
-
-    lit: bool [G, H, W], where float64 would have a trace of what is not black.
-    """
-
-    colour: Tensor
-    picked: Tensor
-    covered: Tensor
-    lit: Tensor
-
-
-def show(gathered: Gathered, options: SplatOptions) -> Shown:
-    """Every pixel as the weighted mean of what shows in it; 0 where nothing does."""
-    handicap = -math.log(_NEIGHBOUR_SHARE) / gathered.rate  # what a neighbour's point seems to lie further back
-    offsets = [(down, right) for down in options.offsets for right in options.offsets]
-    moved = _Moved(gathered.nearest.shape, options)
-    seeming = [moved(gathered.nearest, at, torch.inf) + (handicap if at != (0, 0) else 0.0) for at in offsets]
-    front = torch.stack(seeming).amin(dim=0)  # [H, W]
-    covered = front < torch.inf
-    front = front.masked_fill(~covered, 0.0)
-    weight, colour = torch.zeros_like(front), torch.zeros_like(gathered.colour)
-    picked, lit = torch.zeros_like(gathered.picked), torch.full_like(gathered.lit, torch.inf)
-    for at, depth in zip(offsets, seeming, strict=True):
-        share = torch.exp((front - depth) * gathered.rate)  # 0 where nothing fell
-        weight += share * moved(gathered.weight, at, 0.0)
-        colour += share * moved(gathered.colour, at, 0.0)
-        picked = torch.where(depth == front, moved(gathered.picked, at, 0.0), picked)
-        lit = torch.minimum(lit, moved(gathered.lit, at, torch.inf) + (handicap if at != (0, 0) else 0.0))
-    trace = (lit - front) * gathered.rate <= _FLOAT64_TRACE
-    return Shown(colour=colour / weight.clamp(min=1e-30), picked=picked, covered=covered, lit=trace)
-
-
-class _Moved:
-    """Pictures [..., H, W] moved by whole pixels, with a constant where nothing comes from."""
-
-    def __init__(self, size: torch.Size, options: SplatOptions) -> None:
-        self._height, self._width = size
-        self._before, self._after = -options.offsets[0], options.offsets[-1]
-
-    def __call__(self, picture: Tensor, by: tuple[int, int], outside: float) -> Tensor:
-        down, right = by
-        edges = (self._after, self._before, self._after, self._before)
-        wide = F.pad(picture, edges, value=outside)
-        top, left = self._after - down, self._after - right
-        return wide[..., top : top + self._height, left : left + self._width]
