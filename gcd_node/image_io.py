@@ -49,10 +49,10 @@ def make_folder(folder: Path) -> None:
         raise OutputError(f"cannot create {folder}: {error.strerror}; name another folder") from error
 
 
-def write_png(path: Path, image: Image) -> None:
-    """Write one picture. Raises OutputError."""
-    make_folder(path.parent)
-    _require_written(path, cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)))
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write one picture, [H, W, 3] RGB or [H, W] grey. Raises OutputError."""
+    coded = cv2.imencode(".png", image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    _write_whole(path, lambda file: file.write(coded.tobytes()))
 
 
 class VideoWriter:
@@ -121,7 +121,7 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     _write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
-def _write_whole(path: Path, save: Callable[[BinaryIO], None]) -> None:
+def _write_whole(path: Path, save: Callable[[BinaryIO], object]) -> None:
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -160,8 +160,9 @@ def replay_launch(
             status.update(f"window {report.window.window_id}: {report.render_s * 1000:.0f} ms")
 
         run = replay(settings, out, tell)
-    totals = msgspec.structs.asdict(run.manifest.totals)
-    Console(markup=False).print(table([*run.manifest.made_from.items(), *totals.items()]))
+    manifest = run.manifest
+    totals = {"frames": manifest.frames, "windows": len(manifest.windows), "windows with NaN": manifest.nan_windows}
+    Console(markup=False).print(table([*manifest.made_from.items(), *totals.items(), *manifest.rejected.items()]))
     Console(markup=False).print(f"wrote {run.path}", soft_wrap=True, highlight=False)
 
 
