@@ -19,10 +19,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator, outcomes
-from wire_messages import class_map, end, origin, pixels, view_header, window
+from wire_messages import class_map, end, jpeg_window, origin, pixels, window
 
 from gcd_client.control import Reply, decode_reply
-from gcd_client.images import colours, decode_jpegs, encode_jpegs, images
+from gcd_client.images import colours, decode_jpegs, images
 from gcd_client.protocol import (
     MAGIC,
     PREFIX,
@@ -33,7 +33,6 @@ from gcd_client.protocol import (
     decode,
     encode,
     topic_key,
-    view_topic,
 )
 from gcd_node.auth import load_clients
 from gcd_node.config import parse_config, to_toml
@@ -98,13 +97,6 @@ def test_any_header_ends_as_a_message_or_a_message_error(
     prefix = PREFIX.pack(topic, MAGIC, len(header) // 16, flags, len(payload), 0, 0, 0)
     with contextlib.suppress(MessageError):
         assert use(decode(prefix + header + payload))
-
-
-def jpeg_window() -> ViewMessage:
-    drawn = np.stack([cv2.resize(each, (24, 16)) for each in pixels(3)])
-    payload, offsets = encode_jpegs(drawn, 90)
-    header = replace(view_header(shape=drawn.shape), encoding="jpeg", offsets=offsets)
-    return ViewMessage(topic=view_topic("top", "win"), header=header, payload=payload)
 
 
 def status() -> StatusMessage:
