@@ -111,20 +111,18 @@ def read_npy(path: Path, wanted: str) -> NDArray[Any]:
         raise SourceError(f"cannot read {path}: {reason or type(error).__name__}; give {wanted}") from error
 
 
-def write_npy(path: Path, array: NDArray[Any]) -> None:
-    """Write one array; the file appears whole or not at all. Raises OutputError."""
-    _write_whole(path, lambda file: np.save(file, array, allow_pickle=False))
-
-
-def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name; the file appears whole or not at all. Raises OutputError."""
-    _write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+def write_arrays(path: Path, arrays: NDArray[Any] | Mapping[str, NDArray[Any]]) -> None:
+    """Write one array to .npy, several by name to .npz; the file appears whole or not at all. Raises OutputError."""
+    if isinstance(arrays, np.ndarray):
+        _write_whole(path, lambda file: np.save(file, arrays, allow_pickle=False))
+    else:
+        _write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def _write_whole(path: Path, save: Callable[[BinaryIO], object]) -> None:
     part = path.with_name(path.name + ".part")
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
             save(file)
         part.replace(path)
@@ -142,7 +140,7 @@ class ViewSaver:
     of which a window may give many, are numbered as the source did. Class maps and visibility are shown in colour, with
     a `legend.png`; their numbers are in `<window>.npy`, u8 [T, H, W]; of depth float32 [T, H, W], 1/m.
 
-    hatch: draw lines over the painted pixels of windows. A window whose visibility did not come is hatched all over.
+    hatch: also write windows whose visibility comes with lines over their painted pixels, to `<view>/hatched`.
 
     Raises:
         OutputError: a file cannot be written, or a view changes its size.
@@ -150,26 +148,26 @@ class ViewSaver:
 
     def __init__(self, folder: Path, *, hatch: bool = False) -> None:
         self._folder, self._hatch = folder, hatch
-        self._held: dict[str, tuple[ReceivedView, Image]] = {}  # windows that wait for their visibility, which is next
+        self._windows: dict[str, ReceivedView] = {}  # the newest of each view, whose visibility is next
         self._videos: dict[Path, VideoWriter] = {}
         self._legends: set[Path] = set()
         self.files = 0
 
     def add(self, view: ReceivedView) -> None:
-        """Write one message's frames; of a window to be hatched, once its visibility is here."""
-        view_id, kind, frames = view.header.view_id, kind_of(view.message.topic), view.colours
-        if self._hatch and kind == "win":
-            self._write_held(view_id, None)
-            self._held[view_id] = view, frames
-            return
-        if kind == "vis":
-            self._write_held(view_id, view)
-        self._write(view, frames)
+        """Write one message's frames."""
+        view_id, kind = view.header.view_id, kind_of(view.message.topic)
+        folder = self._folder / view_id / ("" if kind == "win" else kind)
+        self._write(view, view.colours, folder)
+        if kind == "win" and self._hatch:
+            self._windows[view_id] = view
+        elif kind == "vis" and view_id in self._windows:
+            window = self._windows.pop(view_id)
+            if _moment(window.header) == _moment(view.header):
+                shown = hatched(window.colours, view.images[..., 0])
+                self._write(window, shown, self._folder / view_id / "hatched")
 
     def close(self) -> None:
         """Finish the videos; until then they may lack their end."""
-        for view_id in tuple(self._held):
-            self._write_held(view_id, None)
         for video in self._videos.values():
             video.close()
         self._videos.clear()
@@ -180,26 +178,15 @@ class ViewSaver:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _write_held(self, view_id: str, visibility: ReceivedView | None) -> None:
-        if view_id not in self._held:
-            return
-        held, frames = self._held.pop(view_id)
-        seen = np.zeros(frames.shape[:3], np.uint8)
-        if visibility is not None and _moment(visibility.header) == _moment(held.header):
-            seen = visibility.images[..., 0]
-        self._write(held, hatched(frames, seen))
-
-    def _write(self, view: ReceivedView, frames: Image) -> None:
+    def _write(self, view: ReceivedView, frames: Image, folder: Path) -> None:
         header, kind = view.header, kind_of(view.message.topic)
-        folder = self._folder / header.view_id / ("" if kind == "win" else kind)
         for index, frame in enumerate(frames):
             number = f"{header.src.seq[0]:06d}" if kind == "frm" else f"{index:02d}"  # many of these share a window
             write_png(folder / f"{header.window_id:06d}_{number}.png", frame)
         self.files += len(frames)
         if kind == "depth" or header.classes is not None:
-            write_npy(
-                folder / f"{header.window_id:06d}.npy", view.inverse_depth if kind == "depth" else view.images[..., 0]
-            )
+            numbers = view.inverse_depth if kind == "depth" else view.images[..., 0]
+            write_arrays(folder / f"{header.window_id:06d}.npy", numbers)
             self.files += 1
         if header.classes is not None and folder not in self._legends:
             write_png(folder / "legend.png", legend(header.classes, _LEGEND_WIDTH))
@@ -219,17 +206,14 @@ def _moment(header: ViewHeader) -> tuple[object, ...]:
 # Side by side.
 
 
-def side_by_side(*columns: Image) -> Image:
-    """Pictures of one height next to each other, a thin white line between."""
-    line = np.full((columns[0].shape[0], _RULE, 3), _PAPER, np.uint8)
-    return np.concatenate([part for column in columns for part in (line, column)][1:], axis=1)
-
-
 def strip(rows: Sequence[Sequence[Image]]) -> Image:
-    """Rows of pictures under each other, a thin white line between; every row has as many."""
-    joined = [side_by_side(*row) for row in rows]
-    line = np.full((_RULE, joined[0].shape[1], 3), _PAPER, np.uint8)
-    return np.concatenate([part for row in joined for part in (line, row)][1:], axis=0)
+    """Rows of pictures under each other, a thin white line between all; every row has as many."""
+    white = (_PAPER,) * 3
+    framed = [
+        [cv2.copyMakeBorder(each, 0, _RULE, 0, _RULE, cv2.BORDER_CONSTANT, value=white) for each in row] for row in rows
+    ]
+    joined = np.concatenate([np.concatenate(row, axis=1) for row in framed])
+    return np.ascontiguousarray(joined[:-_RULE, :-_RULE], np.uint8)
 
 
 def spread(count: int, most: int) -> list[int]:

@@ -21,7 +21,7 @@ from gcd_client.protocol import ClassRecord
 from gcd_model import CameraMount, Clip, Intrinsics, SphericalDelta, Traits, Trajectory, View, hatched
 from gcd_node.errors import DepthError, SourceError, TooShortError, UsageError
 from gcd_node.frame import Image
-from gcd_node.image_io import legend, read_npy, spread, strip, to_u8, write_npz, write_png, write_video
+from gcd_node.image_io import legend, read_npy, spread, strip, to_u8, write_arrays, write_png, write_video
 from gcd_node.preprocess import Fit, assumed_hfov_deg, require_usable, stated_mount, stated_sphere, to_clip_tensor
 from gcd_node.sources import SourcePose
 from gcd_node.sources.depth import DepthPicture, OnnxDepth, clean_depth
@@ -45,8 +45,8 @@ class ClipRequest:
     height, width: else the trained size.
     pose: of the source camera, if stated.
     hfov_deg: horizontal field of view of the input's pictures, if known; not of a stereo pair.
-    depth: of the input's frames: a folder of 16-bit pictures in millimetres, one such picture of a still, .npy of
-        [T, H, W] metres, a network as .onnx, or with a calibration the right video of a stereo pair.
+    depth: of the input's frames: a folder of 16-bit pictures in millimetres, .npy of [T, H, W] metres, a network as
+        .onnx, or with a calibration the right video of a stereo pair.
     calibration: of the pair, as DepthAI writes it. rectified: the device has rectified both.
     depth_kind: what a network gives. unit_m: metres in one unit of the model's radius.
     """
@@ -110,7 +110,7 @@ def read_clip(path: Path, request: ClipRequest, traits: Traits) -> Clip:
         pictures = np.stack([fit.image(image) for image in images])
         lens = None if hfov_deg is None else fit.intrinsics(Intrinsics.from_hfov(hfov_deg, wide, high))
         if source is not None and not is_network:
-            chosen = _stated_depth(source, request, len(images), still=path.suffix.lower() in PICTURES)
+            chosen = _stated_depth(source, request, len(images))
             depth = [fit.depth(clean_depth(each, (high, wide))) for each in chosen]
     mount = stated_mount(request.pose, None if lens is None else lens.hfov_deg, traits)
     if source is not None and is_network:
@@ -158,18 +158,14 @@ def _pictures(path: Path, request: ClipRequest, frames: int) -> tuple[list[Image
     return images, video.info.fps_nominal
 
 
-def _stated_depth(path: Path, request: ClipRequest, frames: int, *, still: bool) -> list[NDArray[Any]]:
-    """Of the chosen frames, as they are in the files, [H, W]. still: they are one picture."""
+def _stated_depth(path: Path, request: ClipRequest, frames: int) -> list[NDArray[Any]]:
+    """Of the chosen frames, as they are in the files, [H, W]."""
     if path.is_dir():
         return [read_depth(each) for each in _strided(iter(list_pictures(path)), request, frames, path)]
-    if path.suffix.lower() == ".npy":
-        array = read_npy(path, "depth [T, H, W] in metres as .npy")
-        if array.ndim != 3:
-            raise SourceError(f"{path} must hold depth [T, H, W] in metres, got {array.dtype} {list(array.shape)}")
-        return _strided(iter(array), request, frames, path)
-    if not still:
-        raise SourceError(f"{path} is the depth of one frame of {frames}; give a folder or [T, H, W] as .npy")
-    return [read_depth(path)] * frames
+    array = read_npy(path, "a folder of 16-bit pictures, a network as .onnx, or depth [T, H, W] in metres as .npy")
+    if array.ndim != 3:
+        raise SourceError(f"{path} must hold depth [T, H, W] in metres, got {array.dtype} {list(array.shape)}")
+    return _strided(iter(array), request, frames, path)
 
 
 def _strided(images: Iterator[_Frame], request: ClipRequest, frames: int, path: Path) -> list[_Frame]:
@@ -260,6 +256,6 @@ def write_view(out: Path, clip: Clip, view: View, classes: Sequence[ClassRecord]
     for name in ("latents", "std", "classes", "visibility", "inverse_depth"):
         if (values := getattr(view, name)) is not None:
             arrays[name] = values.numpy()
-    write_npz(out / "view.npz", arrays)
+    write_arrays(out / "view.npz", arrays)
     shown = strip([[row[i] for i in spread(len(pictures), _STRIP_FRAMES)] for row in rows])
     write_png(out / "strip.png", np.concatenate([shown, legend(classes, shown.shape[1])]) if classes else shown)
