@@ -1,10 +1,10 @@
 """The node's settings, as a launch file states them (TOML): one page with every section of a launch file."""
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import Annotated, Literal, TypeAlias
-from urllib.parse import urlsplit, urlunsplit
 
 import msgspec
 import tomli_w
@@ -374,13 +374,6 @@ def _stated(table: Table) -> Table:
 
 
 def _without_password(url: str) -> str:
-    try:
-        split = urlsplit(url)
-        if split.password is None and not split.query:
-            return url
-        name, at, host = split.netloc.rpartition("@")
-        user = name.partition(":")[0]
-        shown = f"{user}:{_HIDDEN}{at}{host}" if split.password is not None else split.netloc
-        return urlunsplit((split.scheme, shown, split.path, _HIDDEN if split.query else "", ""))
-    except ValueError:
-        return _HIDDEN
+    """Rather too much is hidden than too little, where a password holds what a url may not."""
+    shown = re.sub(r"^([^:/]*://[^:/?#]*):.*@", rf"\1:{_HIDDEN}@", url, flags=re.DOTALL)
+    return re.sub(r"[?#].*", f"?{_HIDDEN}", shown, flags=re.DOTALL)

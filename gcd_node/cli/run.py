@@ -182,15 +182,14 @@ def diff(
 
     Ends with 0 if they are identical or near enough, with 1 if not, with 65 or 66 if one is damaged or missing.
     """
-    from gcd_node.replay.compare import Tolerance, compare, report_text, to_plain
+    from gcd_node.replay.compare import Tolerance, compare, report_text
     from gcd_node.replay.run import open_run
 
     tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
     runs = open_run(run_a), open_run(run_b)
     with Console(stderr=True, markup=False).status("comparing"):
         comparison = compare(*runs)
-    plain = msgspec.json.encode(to_plain(comparison, tolerance)).decode() if as_json else None
-    typer.echo(plain or report_text(comparison, tolerance))
+    typer.echo(msgspec.json.encode(comparison).decode() if as_json else report_text(comparison, tolerance))
     if comparison.failures(tolerance):
         raise typer.Exit(1)
 

@@ -1,10 +1,8 @@
-"""Two runs, window by window: what differs, how far the pixels are apart, and what the two were made from; in words and
-as JSON."""
+"""Two runs, window by window: what differs, how far the pixels are apart, and what the two were made from."""
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 import cv2
 import msgspec
@@ -78,11 +76,12 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunComparison:
-    """Two runs. facts: what they were made from, in A and in B, where it differs, by names such as `config model.steps`
-    or `weights sha256_12`. views: how many, of all windows. differences: those that are not the same, by window."""
+    """Two runs, a and b. facts: what they were made from, in A and in B, where it differs, by names such as
+    `config model.steps` or `weights sha256_12`. views: how many, of all windows. differences: those that are not the
+    same, by window. As JSON, the infinite PSNR of identical pictures is null."""
 
-    a: RunFolder
-    b: RunFolder
+    a: str
+    b: str
     facts: dict[str, tuple[str, str]]
     views: int
     differences: tuple[Difference, ...]
@@ -109,7 +108,7 @@ def compare(a: RunFolder, b: RunFolder) -> RunComparison:
     facts_a, facts_b = dict(_facts(a.manifest)), dict(_facts(b.manifest))
     pairs = {name: (facts_a.get(name, _ABSENT), facts_b.get(name, _ABSENT)) for name in facts_a | facts_b}
     different = {printable(name): (printable(one), printable(two)) for name, (one, two) in pairs.items() if one != two}
-    return RunComparison(a=a, b=b, facts=different, views=len(views), differences=differences)
+    return RunComparison(a=str(a.path), b=str(b.path), facts=different, views=len(views), differences=differences)
 
 
 def _compare_view(
@@ -191,16 +190,3 @@ def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
     lines += [f"  {each}" for each in failures[:_LINES]]
     lines += [f"  and {len(failures) - _LINES} more"] if len(failures) > _LINES else []
     return "\n".join(lines)
-
-
-def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:
-    """Everything as plain values for JSON, which has null for the PSNR of identical pictures, infinite here."""
-    return {
-        "a": str(comparison.a.path),
-        "b": str(comparison.b.path),
-        "passed": not comparison.failures(tolerance),
-        "identical": not comparison.differences,
-        "facts": [{"name": name, "a": a, "b": b} for name, (a, b) in comparison.facts.items()],
-        "views": comparison.views,
-        "differences": [{**asdict(each), "passed": each.within(tolerance)} for each in comparison.differences],
-    }

@@ -20,7 +20,6 @@ from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessa
 from gcd_model import Traits
 from gcd_node.config import LifeConfig, NodeConfig
 from gcd_node.errors import ConfigError, ModelFailedError, SourceError
-from gcd_node.frame import FrameSource, SourceInfo
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import PublisherStats
@@ -40,7 +39,7 @@ from gcd_node.replay.run import (
     write_pixels,
 )
 from gcd_node.session import load_model, model_threads
-from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
+from gcd_node.sources import LiveSource, SyntheticSource, open_source, resolve_path
 from gcd_node.stream_context import config_digest
 
 PARTS = Parts(open_source=open_source, load_model=load_model)
@@ -89,25 +88,17 @@ def replay(
         ModelFailedError: not one window came out.
     """
     config = lockstep_config(config)
-    infos: list[SourceInfo] = []
     traits: list[Traits] = []
-
-    def open_and_note(section: SourceConfig) -> FrameSource:
-        source = parts.open_source(section)
-        infos.append(source.info)
-        return source
-
     with new_folder(out) as folder, _repeatable():
         writer = RunWriter(folder, on_window)
-        noting = Parts(open_source=open_and_note, load_model=parts.load_model)
-        summary = Node(config, noting, writer, on_configured=traits.append, on_window=writer.finish_window).run()
+        summary = Node(config, parts, writer, on_configured=traits.append, on_window=writer.finish_window).run()
         if not writer.windows:
             raise ModelFailedError(
                 f'none of the {summary.counts.nan_windows} windows came out: all had NaN; try dtype = "float32" in '
                 "[model], and look at the weights with `gcd-node weights inspect`"
             )
         manifest = Manifest(
-            made_from=_made_from(config, infos[0], traits[-1]),
+            made_from=_made_from(config, traits[-1]),
             config=msgspec.to_builtins(config),
             cfg_digest=config_digest(config, traits[-1]),
             frames=summary.frames,
@@ -196,7 +187,7 @@ class RunWriter:
     def stop_waiting(self) -> None: ...
 
 
-def _made_from(config: NodeConfig, info: SourceInfo, traits: Traits) -> dict[str, str]:
+def _made_from(config: NodeConfig, traits: Traits) -> dict[str, str]:
     """Weights, recording, programs and machine: hashes of two runs are only bound to agree if all of it does."""
     section, files = config.source, dict[str, Path]()
     if not isinstance(section, SyntheticSource | LiveSource):
@@ -207,8 +198,6 @@ def _made_from(config: NodeConfig, info: SourceInfo, traits: Traits) -> dict[str
         "weights name": traits.name,
         "weights sha256_12": traits.sha256_12,
         "weights precision": traits.precision,
-        "source id": f"{info.kind} {info.id}",
-        "source pictures": f"{info.width}x{info.height}, {info.fps_nominal:g} FPS, {info.codec or 'no codec'}",
         **{name: digest_of(path) for name, path in files.items()},
         "version python": platform.python_version(),
         "version gcd-node": version("gcd-node"),
