@@ -3,8 +3,7 @@
 import hashlib
 import platform
 import re
-from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -32,11 +31,10 @@ from gcd_node.replay.run import (
     RunFolder,
     WindowEntry,
     encode_manifest,
+    keep_pixels,
     new_folder,
     open_run,
     pixel_digest,
-    pixels_path,
-    write_pixels,
 )
 from gcd_node.session import load_model, model_threads
 from gcd_node.sources import LiveSource, SyntheticSource, open_source, resolve_path
@@ -89,7 +87,8 @@ def replay(
     """
     config = lockstep_config(config)
     traits: list[Traits] = []
-    with new_folder(out) as folder, _repeatable():
+    repeatable = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True)  # on a GPU
+    with new_folder(out) as folder, repeatable:
         writer = RunWriter(folder, on_window)
         summary = Node(config, parts, writer, on_configured=traits.append, on_window=writer.finish_window).run()
         if not writer.windows:
@@ -109,18 +108,6 @@ def replay(
         )
         (folder / MANIFEST).write_bytes(encode_manifest(manifest))
     return open_run(out)
-
-
-@contextmanager
-def _repeatable() -> Generator[None]:
-    """On a GPU, only convolutions that give the same result each time."""
-    cudnn = torch.backends.cudnn
-    before = cudnn.deterministic, cudnn.benchmark
-    cudnn.deterministic, cudnn.benchmark = True, False
-    try:
-        yield
-    finally:
-        cudnn.deterministic, cudnn.benchmark = before
 
 
 class RunWriter:
@@ -147,8 +134,8 @@ class RunWriter:
         frames, height, width, channels = header.shape
         shape = (frames, height, width, 3) if channels == 3 else (frames, height, -1)
         pixels = np.frombuffer(message.payload, np.uint8).reshape(shape)
-        write_pixels(pixels_path(self._folder, header.view_id, header.window_id, kind), pixels)
-        self._views.setdefault(header.view_id, {})[kind] = pixel_digest(pixels)
+        digest = keep_pixels(self._folder, header.view_id, header.window_id, kind, pixels)
+        self._views.setdefault(header.view_id, {})[kind] = digest
         if kind == "win":
             self._seed, self._ood = header.quality.seed, header.quality.ood
         return True

@@ -110,7 +110,7 @@ class RunFolder:
         return {kind: self._read(window, view_id, kind) for kind in window.views[view_id]}
 
     def _read(self, window: WindowEntry, view_id: str, kind: KeptKind) -> Pixels:
-        path = pixels_path(self.path, view_id, window.window_id, kind)
+        path = _place(self.path, view_id, window.window_id, kind)
         try:
             picture = read_picture(path)
         except SourceError as error:
@@ -150,14 +150,14 @@ def pixel_digest(pixels: Pixels) -> str:
     return hashlib.sha256(np.ascontiguousarray(pixels).data).hexdigest()
 
 
-def pixels_path(folder: Path, view_id: str, window_id: int, kind: KeptKind) -> Path:
-    """Where the pixels of a kind of a view of a window are."""
+def keep_pixels(folder: Path, view_id: str, window_id: int, kind: KeptKind, pixels: Pixels) -> Digest:
+    """Write the pixels of a kind of a view of a window; gives their digest. Raises OutputError."""
+    write_png(_place(folder, view_id, window_id, kind), pixels.reshape(-1, *pixels.shape[2:]))
+    return pixel_digest(pixels)
+
+
+def _place(folder: Path, view_id: str, window_id: int, kind: KeptKind) -> Path:
     return folder / view_id / f"{window_id:06d}.{kind}.png"
-
-
-def write_pixels(path: Path, pixels: Pixels) -> None:
-    """Write the pixels of a kind of a view of a window. Raises OutputError."""
-    write_png(path, pixels.reshape(-1, *pixels.shape[2:]))
 
 
 @contextmanager

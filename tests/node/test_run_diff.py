@@ -17,7 +17,7 @@ from gcd_node.cli.main import run_app
 from gcd_node.errors import UsageError
 from gcd_node.frame import Frame
 from gcd_node.replay.compare import Tolerance, compare, report_text
-from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, open_run, pixel_digest, pixels_path, write_pixels
+from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, keep_pixels, open_run, pixel_digest
 
 pytestmark = pytest.mark.timeout(60)
 EXACT, LOOSE = Tolerance(), Tolerance(min_psnr_db=1.0)
@@ -138,7 +138,7 @@ def test_pictures_of_another_size_cannot_be_near(golden: RunFolder, tmp_path: Pa
     first, *others = golden.manifest.windows
     changed = msgspec.structs.replace(first, views={"main": {"win": pixel_digest(black)}})
     resized = restated(golden, tmp_path / "run", windows=(changed, *others))
-    write_pixels(pixels_path(resized.path, "main", 0, "win"), black)
+    keep_pixels(resized.path, "main", 0, "win", black)
     (view,) = compare(golden, resized).failures(LOOSE)
     assert view.facts == ("size",)
 
