@@ -112,23 +112,15 @@ class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if (self.position_m is None) != (self.look_at_m is None):
             raise ValueError("position_m says where a view stands, look_at_m what it looks at: state both")
         if sum([self.position_m is not None, self.pose is not None, not self.at_source]) > 1:
-            raise ValueError(
-                "a goal is azimuth_deg, elevation_deg and radius, or position_m and look_at_m, or pose: state one of "
-                "them"
-            )
-        if (self.pose is None) == (self.kind == "pose"):
-            raise ValueError(
-                'kind = "pose" needs pose, x, y, z and a quaternion x, y, z, w; for a pose say kind = "pose"'
-            )
+            raise ValueError("a goal is angles and radius, or position_m and look_at_m, or pose: state one of them")
+        if (self.pose is not None) != (self.kind == "pose"):
+            raise ValueError('kind = "pose" goes with pose, x, y, z and a quaternion x, y, z, w: state both')
         if self.pose is not None:
             pose_matrix(self.pose)
         if self.kind == "orbit" and self.position_m is not None:
             raise ValueError('an orbit swings about the scene: leave position_m to kind = "fixed"')
-        moving = (self.rate_deg_s is not None, self.amplitude_deg is not None)
-        if self.kind == "orbit" and not all(moving):
-            raise ValueError("an orbit needs rate_deg_s and amplitude_deg")
-        if self.kind != "orbit" and any(moving):
-            raise ValueError('a view that stands has no rate_deg_s and no amplitude_deg; for these say kind = "orbit"')
+        if {self.rate_deg_s is not None, self.amplitude_deg is not None} != {self.kind == "orbit"}:
+            raise ValueError('an orbit needs rate_deg_s and amplitude_deg, which are for kind = "orbit" alone')
 
     @property
     def at_source(self) -> bool:

@@ -61,27 +61,26 @@ class VideoWriter:
 
     def __init__(self, path: Path, fps: float) -> None:
         self._path, self._fps = path, max(fps, 1.0)
-        self._video: cv2.VideoWriter | None = None
-        self._size = (0, 0)
+        self._video, self._size = cv2.VideoWriter(), (0, 0)
 
     def add(self, frames: Iterable[NDArray[np.uint8]]) -> None:
-        """Append pictures, [H, W, 3] RGB or [H, W] grey. Raises OutputError: it cannot be written, or the size is
-        another than before."""
+        """Append pictures, [H, W, 3] RGB. Raises OutputError: it cannot be written, or the size is another than
+        before."""
         for frame in frames:
             size = (frame.shape[1], frame.shape[0])
-            if self._video is None:
+            if not self._video.isOpened():
                 make_folder(self._path.parent)
                 code = cv2.VideoWriter.fourcc(*("FFV1" if self._path.suffix == ".mkv" else "mp4v"))
-                self._video, self._size = cv2.VideoWriter(str(self._path), code, self._fps, size), size
-                _require_written(self._path, self._video.isOpened())
+                self._size = size
+                if not self._video.open(str(self._path), code, self._fps, size):
+                    raise OutputError(f"cannot write {self._path}; is there space, and may this user write there?")
             if size != self._size:
                 raise OutputError(f"{self._path} holds pictures of {self._size}, now {size}; write to a new folder")
-            self._video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR))
+            self._video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
 
     def close(self) -> None:
         """Finish the file."""
-        if self._video is not None:
-            self._video.release()
+        self._video.release()
 
 
 def write_video(path: Path, frames: Iterable[Image], fps: float) -> None:
@@ -89,11 +88,6 @@ def write_video(path: Path, frames: Iterable[Image], fps: float) -> None:
     writer = VideoWriter(path, fps)
     writer.add(frames)
     writer.close()
-
-
-def _require_written(path: Path, done: bool) -> None:
-    if not done:
-        raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
 
 
 def read_npy(path: Path, wanted: str) -> NDArray[Any]:
@@ -241,18 +235,13 @@ def sheet(body: Image, headings: Sequence[str], classes: Sequence[ClassRecord]) 
 
 
 def legend(classes: Sequence[ClassRecord], width: int) -> Image:
-    """Each class's colour and name, in as many lines of `width` pixels as it takes: [lines * 22, width, 3]."""
-    places: list[tuple[int, int]] = []
+    """Each class's colour and name in columns, in as many lines of `width` pixels as needed: [lines * 22, width, 3]."""
     names = [each.name.replace("_", " ") for each in classes]
-    line, left = 0, _GAP
-    for name in names:
-        needed = cv2.getTextSize(name, _FONT, _SCALE, 1)[0][0] + _SWATCH + 3 * _GAP
-        if left > _GAP and left + needed > width:
-            line, left = line + 1, _GAP
-        places.append((line, left))
-        left += needed
-    picture = np.full(((line + 1) * _LINE, width, 3), _PAPER, np.uint8)
-    for each, name, (line, left) in zip(classes, names, places, strict=True):
+    wide = max(cv2.getTextSize(name, _FONT, _SCALE, 1)[0][0] for name in names) + _SWATCH + 3 * _GAP
+    columns = max(1, width // wide)
+    picture = np.full((-(-len(names) // columns) * _LINE, width, 3), _PAPER, np.uint8)
+    for index, (each, name) in enumerate(zip(classes, names, strict=True)):
+        line, left = index // columns, index % columns * wide + _GAP
         top = line * _LINE + (_LINE - _SWATCH) // 2
         picture[top : top + _SWATCH, left : left + _SWATCH] = each.colour
         _write(picture, name, left + _SWATCH + _GAP, line)
