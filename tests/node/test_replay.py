@@ -4,12 +4,13 @@ import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
 import torch
 import zmq
-from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, fake_maps, painting_traits, traits
+from fakes import HEIGHT, WIDTH, FakeSource, fake_maps, painting_traits, traits
 from media import ramp, write_video
 from runs import FRAMES, WINDOWS, LevelModel, copied, launch, made_run, nan_model, parts
 
@@ -26,7 +27,6 @@ from gcd_node.errors import (
     TooShortError,
 )
 from gcd_node.frame import Frame
-from gcd_node.image_io import write_png
 from gcd_node.inference import WindowReport
 from gcd_node.replay.lockstep import digest_of, lockstep_config, replay
 from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, open_run, pixel_digest
@@ -54,24 +54,20 @@ def test_a_real_model_replayed_twice_gives_the_same_hashes_whatever_the_pace(tmp
     assert run_app(["diff", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
 
 
-def test_what_is_on_disk_is_what_the_model_drew(run: RunFolder) -> None:
+def test_what_is_on_disk_is_what_the_model_drew_to_the_bit(run: RunFolder, tmp_path: Path) -> None:
     for index, window in enumerate(run.manifest.windows):
         view = run.read_view(window, "main")
-        levels = [20 + seq % 200 for seq in range(FRAMES * index, FRAMES * (index + 1))]
-        drawn = np.repeat(np.array(levels, np.uint8), HEIGHT * WIDTH * 3).reshape(FRAMES, HEIGHT, WIDTH, 3)
+        levels = np.arange(20 + FRAMES * index, 20 + FRAMES * (index + 1), dtype=np.uint8)
+        drawn = np.broadcast_to(levels[:, None, None, None], (FRAMES, HEIGHT, WIDTH, 3))
         assert np.array_equal(view["win"], drawn)
         assert pixel_digest(drawn) == window.views["main"]["win"] == window.input_sha256
         columns = (np.arange(FRAMES)[:, None] + np.arange(WIDTH)) % len(painting_traits().classes)
         assert np.array_equal(view["cls"], np.repeat(columns[:, None], HEIGHT, axis=1))
-
-
-def test_visibility_and_depth_are_on_disk_to_the_bit(tmp_path: Path) -> None:
-    made = made_run(tmp_path / "run", LevelModel(traits(), holds=("visibility", "inverse_depth")))
-    for window in made.manifest.windows:
-        maps, drawn = made.read_view(window, "main"), fake_maps()
-        assert set(maps) == {"win", "vis", "depth"}
-        assert np.array_equal(maps["vis"], drawn["visibility"].numpy())
-        assert np.array_equal(maps["depth"].view("<f2"), drawn["inverse_depth"].numpy().astype("<f2"))
+    live = made_run(tmp_path / "run", LevelModel(traits(), holds=("visibility", "inverse_depth")))
+    maps, drawn_maps = live.read_view(live.manifest.windows[0], "main"), fake_maps()
+    assert set(maps) == {"win", "vis", "depth"}
+    assert np.array_equal(maps["vis"], drawn_maps["visibility"].numpy())
+    assert np.array_equal(maps["depth"].view("<f2"), drawn_maps["inverse_depth"].numpy().astype("<f2"))
 
 
 def test_a_manifest_tells_the_whole_story(run: RunFolder) -> None:
@@ -181,36 +177,31 @@ def test_a_folder_in_use_is_refused_before_anything_is_loaded_and_an_empty_one_t
     assert len(made_run(tmp_path / "run").manifest.windows) == WINDOWS
 
 
-def broken() -> FakeSource:
-    source = FakeSource(20)
-    source.fails = SourceError("the disk is gone")
-    return source
-
-
 @pytest.mark.parametrize(
-    ("model", "source", "error"),
+    ("frames", "fails", "nan", "error"),
     [
-        (None, lambda: FakeSource(9), TooShortError),
-        (None, broken, SourceError),
-        (lambda: nan_model({0, 1, 2}), None, ModelFailedError),
+        (9, None, (), TooShortError),
+        (20, SourceError("the disk is gone"), (), SourceError),
+        (42, None, (0, 1, 2), ModelFailedError),
     ],
 )
 def test_a_replay_that_fails_leaves_nothing(
-    model: Callable[[], FakeSynthesizer] | None,
-    source: Callable[[], FakeSource] | None,
-    error: type[NodeError],
-    tmp_path: Path,
+    frames: int, fails: Exception | None, nan: tuple[int, ...], error: type[NodeError], tmp_path: Path
 ) -> None:
+    source = FakeSource(frames)
+    source.fails = fails
     with pytest.raises(error):
-        made_run(tmp_path / "run", model and model(), source and source())
+        made_run(tmp_path / "run", nan_model(set(nan)), source)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_ends_a_replay_with_what_could_not_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    full = OSError(28, "No space left on device")
-    monkeypatch.setattr(Path, "write_bytes", lambda *_: (_ for _ in ()).throw(full))
+    def full(path: Path, _: bytes) -> None:
+        raise OSError(28, "No space left on device", path)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OutputError, match="No space left"):
         made_run(tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
@@ -218,30 +209,24 @@ def test_a_full_disk_ends_a_replay_with_what_could_not_be_written(
 
 # Damaged runs.
 
-PICTURE = Path("main", "000001.win.png")
-
-
-def truncated(folder: Path) -> None:
-    whole = (folder / PICTURE).read_bytes()
-    (folder / PICTURE).write_bytes(whole[: len(whole) // 2])
-
 
 @pytest.mark.parametrize(
-    "damage",
+    "content",
     [
-        truncated,
-        lambda folder: write_png(folder / PICTURE, np.full((FRAMES * HEIGHT, WIDTH, 3), 7, np.uint8)),
-        lambda folder: write_png(folder / PICTURE, np.full((FRAMES * HEIGHT - 1, WIDTH), 7, np.uint8)),
-        lambda folder: (folder / "main" / "000001.cls.png").unlink(),
-        lambda folder: (folder / PICTURE).write_bytes(b"no picture"),
+        lambda whole: whole[: len(whole) // 2],
+        lambda _: cv2.imencode(".png", np.full((FRAMES * HEIGHT, WIDTH, 3), 7, np.uint8))[1].tobytes(),
+        lambda _: cv2.imencode(".png", np.full((FRAMES * HEIGHT - 1, WIDTH), 7, np.uint8))[1].tobytes(),
+        lambda _: b"no picture",
+        lambda _: None,
     ],
 )
 def test_pixels_that_do_not_fit_their_manifest_are_damage(
-    damage: Callable[[Path], None], run: RunFolder, tmp_path: Path
+    content: Callable[[bytes], bytes | None], run: RunFolder, tmp_path: Path
 ) -> None:
-    folder = copied(run, tmp_path / "copy")
-    damage(folder)
-    damaged = open_run(folder)
+    picture = copied(run, tmp_path / "copy") / "main" / "000001.win.png"
+    new = content(picture.read_bytes())
+    picture.unlink() if new is None else picture.write_bytes(new)
+    damaged = open_run(tmp_path / "copy")
     with pytest.raises(DamagedRunError):
         damaged.read_view(damaged.manifest.windows[1], "main")
 
