@@ -1,20 +1,10 @@
 """What can go wrong in the node, and the exit code each becomes (sysexits).
 
     NodeError 70
-    ├── UsageError 64         options that contradict each other or make no sense
-    ├── SourceError 66        an input is missing, empty, damaged or undecodable; a camera is lost
-    │   ├── TooShortError 65      an input has fewer frames than one window
-    │   ├── DepthError 65         a depth picture, or a picture that depth is taken from, cannot be used
-    │   ├── SourceAbsentError 69  there is no such camera
-    │   ├── ReaderError 70        reading or placing frames broke: nobody foresaw how
-    │   └── SourceLostError 75    a camera is gone and did not come back
-    ├── StaleError 69         no fresh status came in time
-    ├── EndpointError 73      an endpoint is in use or cannot be bound
-    ├── PublisherError 70     the publisher thread has died
-    ├── OutputError 73        a result cannot be written
-    ├── DamagedRunError 65    the folder of a replay is incomplete, damaged or none
-    ├── ModelFailedError 70   the model keeps producing unusable views
-    └── ConfigError 78        a launch file or a setting is wrong
+    ├── UsageError 64, StaleError 69, PublisherError 70, ModelFailedError 70
+    ├── EndpointError 73, OutputError 73, DamagedRunError 65, ConfigError 78
+    └── SourceError 66
+        └── TooShortError 65, DepthError 65, SourceAbsentError 69, ReaderError 70, SourceLostError 75
 
 Messages, commands, endpoints and keys have the client's errors (gcd_client.ClientError), with exit codes of the same
 kind. Every message says what was wanted, what came, and what to do.

@@ -49,10 +49,10 @@ def make_folder(folder: Path) -> None:
         raise OutputError(f"cannot create {folder}: {error.strerror}; name another folder") from error
 
 
-def write_png(path: Path, image: Image) -> None:
-    """Write one picture. Raises OutputError."""
-    make_folder(path.parent)
-    _require_written(path, cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)))
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write one picture, [H, W, 3] RGB or [H, W] grey. Raises OutputError."""
+    coded = cv2.imencode(".png", image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    _write_whole(path, lambda file: file.write(coded.tobytes()))
 
 
 class VideoWriter:
@@ -61,27 +61,26 @@ class VideoWriter:
 
     def __init__(self, path: Path, fps: float) -> None:
         self._path, self._fps = path, max(fps, 1.0)
-        self._video: cv2.VideoWriter | None = None
-        self._size = (0, 0)
+        self._video, self._size = cv2.VideoWriter(), (0, 0)
 
     def add(self, frames: Iterable[NDArray[np.uint8]]) -> None:
-        """Append pictures, [H, W, 3] RGB or [H, W] grey. Raises OutputError: it cannot be written, or the size is
-        another than before."""
+        """Append pictures, [H, W, 3] RGB. Raises OutputError: it cannot be written, or the size is another than
+        before."""
         for frame in frames:
             size = (frame.shape[1], frame.shape[0])
-            if self._video is None:
+            if not self._video.isOpened():
                 make_folder(self._path.parent)
                 code = cv2.VideoWriter.fourcc(*("FFV1" if self._path.suffix == ".mkv" else "mp4v"))
-                self._video, self._size = cv2.VideoWriter(str(self._path), code, self._fps, size), size
-                _require_written(self._path, self._video.isOpened())
+                self._size = size
+                if not self._video.open(str(self._path), code, self._fps, size):
+                    raise OutputError(f"cannot write {self._path}; is there space, and may this user write there?")
             if size != self._size:
                 raise OutputError(f"{self._path} holds pictures of {self._size}, now {size}; write to a new folder")
-            self._video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR))
+            self._video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
 
     def close(self) -> None:
         """Finish the file."""
-        if self._video is not None:
-            self._video.release()
+        self._video.release()
 
 
 def write_video(path: Path, frames: Iterable[Image], fps: float) -> None:
@@ -89,11 +88,6 @@ def write_video(path: Path, frames: Iterable[Image], fps: float) -> None:
     writer = VideoWriter(path, fps)
     writer.add(frames)
     writer.close()
-
-
-def _require_written(path: Path, done: bool) -> None:
-    if not done:
-        raise OutputError(f"cannot write {path}; is there space, and may this user write there?")
 
 
 def read_npy(path: Path, wanted: str) -> NDArray[Any]:
@@ -111,20 +105,18 @@ def read_npy(path: Path, wanted: str) -> NDArray[Any]:
         raise SourceError(f"cannot read {path}: {reason or type(error).__name__}; give {wanted}") from error
 
 
-def write_npy(path: Path, array: NDArray[Any]) -> None:
-    """Write one array; the file appears whole or not at all. Raises OutputError."""
-    _write_whole(path, lambda file: np.save(file, array, allow_pickle=False))
+def write_arrays(path: Path, arrays: NDArray[Any] | Mapping[str, NDArray[Any]]) -> None:
+    """Write one array to .npy, several by name to .npz; the file appears whole or not at all. Raises OutputError."""
+    if isinstance(arrays, np.ndarray):
+        _write_whole(path, lambda file: np.save(file, arrays, allow_pickle=False))
+    else:
+        _write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
-def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name; the file appears whole or not at all. Raises OutputError."""
-    _write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
-
-
-def _write_whole(path: Path, save: Callable[[BinaryIO], None]) -> None:
+def _write_whole(path: Path, save: Callable[[BinaryIO], object]) -> None:
     part = path.with_name(path.name + ".part")
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
             save(file)
         part.replace(path)
@@ -142,7 +134,7 @@ class ViewSaver:
     of which a window may give many, are numbered as the source did. Class maps and visibility are shown in colour, with
     a `legend.png`; their numbers are in `<window>.npy`, u8 [T, H, W]; of depth float32 [T, H, W], 1/m.
 
-    hatch: draw lines over the painted pixels of windows. A window whose visibility did not come is hatched all over.
+    hatch: also write windows whose visibility comes with lines over their painted pixels, to `<view>/hatched`.
 
     Raises:
         OutputError: a file cannot be written, or a view changes its size.
@@ -150,26 +142,26 @@ class ViewSaver:
 
     def __init__(self, folder: Path, *, hatch: bool = False) -> None:
         self._folder, self._hatch = folder, hatch
-        self._held: dict[str, tuple[ReceivedView, Image]] = {}  # windows that wait for their visibility, which is next
+        self._windows: dict[str, ReceivedView] = {}  # the newest of each view, whose visibility is next
         self._videos: dict[Path, VideoWriter] = {}
         self._legends: set[Path] = set()
         self.files = 0
 
     def add(self, view: ReceivedView) -> None:
-        """Write one message's frames; of a window to be hatched, once its visibility is here."""
-        view_id, kind, frames = view.header.view_id, kind_of(view.message.topic), view.colours
-        if self._hatch and kind == "win":
-            self._write_held(view_id, None)
-            self._held[view_id] = view, frames
-            return
-        if kind == "vis":
-            self._write_held(view_id, view)
-        self._write(view, frames)
+        """Write one message's frames."""
+        view_id, kind = view.header.view_id, kind_of(view.message.topic)
+        folder = self._folder / view_id / ("" if kind == "win" else kind)
+        self._write(view, view.colours, folder)
+        if kind == "win" and self._hatch:
+            self._windows[view_id] = view
+        elif kind == "vis" and view_id in self._windows:
+            window = self._windows.pop(view_id)
+            if _moment(window.header) == _moment(view.header):
+                shown = hatched(window.colours, view.images[..., 0])
+                self._write(window, shown, self._folder / view_id / "hatched")
 
     def close(self) -> None:
         """Finish the videos; until then they may lack their end."""
-        for view_id in tuple(self._held):
-            self._write_held(view_id, None)
         for video in self._videos.values():
             video.close()
         self._videos.clear()
@@ -180,26 +172,15 @@ class ViewSaver:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _write_held(self, view_id: str, visibility: ReceivedView | None) -> None:
-        if view_id not in self._held:
-            return
-        held, frames = self._held.pop(view_id)
-        seen = np.zeros(frames.shape[:3], np.uint8)
-        if visibility is not None and _moment(visibility.header) == _moment(held.header):
-            seen = visibility.images[..., 0]
-        self._write(held, hatched(frames, seen))
-
-    def _write(self, view: ReceivedView, frames: Image) -> None:
+    def _write(self, view: ReceivedView, frames: Image, folder: Path) -> None:
         header, kind = view.header, kind_of(view.message.topic)
-        folder = self._folder / header.view_id / ("" if kind == "win" else kind)
         for index, frame in enumerate(frames):
             number = f"{header.src.seq[0]:06d}" if kind == "frm" else f"{index:02d}"  # many of these share a window
             write_png(folder / f"{header.window_id:06d}_{number}.png", frame)
         self.files += len(frames)
         if kind == "depth" or header.classes is not None:
-            write_npy(
-                folder / f"{header.window_id:06d}.npy", view.inverse_depth if kind == "depth" else view.images[..., 0]
-            )
+            numbers = view.inverse_depth if kind == "depth" else view.images[..., 0]
+            write_arrays(folder / f"{header.window_id:06d}.npy", numbers)
             self.files += 1
         if header.classes is not None and folder not in self._legends:
             write_png(folder / "legend.png", legend(header.classes, _LEGEND_WIDTH))
@@ -219,17 +200,14 @@ def _moment(header: ViewHeader) -> tuple[object, ...]:
 # Side by side.
 
 
-def side_by_side(*columns: Image) -> Image:
-    """Pictures of one height next to each other, a thin white line between."""
-    line = np.full((columns[0].shape[0], _RULE, 3), _PAPER, np.uint8)
-    return np.concatenate([part for column in columns for part in (line, column)][1:], axis=1)
-
-
 def strip(rows: Sequence[Sequence[Image]]) -> Image:
-    """Rows of pictures under each other, a thin white line between; every row has as many."""
-    joined = [side_by_side(*row) for row in rows]
-    line = np.full((_RULE, joined[0].shape[1], 3), _PAPER, np.uint8)
-    return np.concatenate([part for row in joined for part in (line, row)][1:], axis=0)
+    """Rows of pictures under each other, a thin white line between all; every row has as many."""
+    white = (_PAPER,) * 3
+    framed = [
+        [cv2.copyMakeBorder(each, 0, _RULE, 0, _RULE, cv2.BORDER_CONSTANT, value=white) for each in row] for row in rows
+    ]
+    joined = np.concatenate([np.concatenate(row, axis=1) for row in framed])
+    return np.ascontiguousarray(joined[:-_RULE, :-_RULE], np.uint8)
 
 
 def spread(count: int, most: int) -> list[int]:
@@ -257,18 +235,13 @@ def sheet(body: Image, headings: Sequence[str], classes: Sequence[ClassRecord]) 
 
 
 def legend(classes: Sequence[ClassRecord], width: int) -> Image:
-    """Each class's colour and name, in as many lines of `width` pixels as it takes: [lines * 22, width, 3]."""
-    places: list[tuple[int, int]] = []
+    """Each class's colour and name in columns, in as many lines of `width` pixels as needed: [lines * 22, width, 3]."""
     names = [each.name.replace("_", " ") for each in classes]
-    line, left = 0, _GAP
-    for name in names:
-        needed = cv2.getTextSize(name, _FONT, _SCALE, 1)[0][0] + _SWATCH + 3 * _GAP
-        if left > _GAP and left + needed > width:
-            line, left = line + 1, _GAP
-        places.append((line, left))
-        left += needed
-    picture = np.full(((line + 1) * _LINE, width, 3), _PAPER, np.uint8)
-    for each, name, (line, left) in zip(classes, names, places, strict=True):
+    wide = max(cv2.getTextSize(name, _FONT, _SCALE, 1)[0][0] for name in names) + _SWATCH + 3 * _GAP
+    columns = max(1, width // wide)
+    picture = np.full((-(-len(names) // columns) * _LINE, width, 3), _PAPER, np.uint8)
+    for index, (each, name) in enumerate(zip(classes, names, strict=True)):
+        line, left = index // columns, index % columns * wide + _GAP
         top = line * _LINE + (_LINE - _SWATCH) // 2
         picture[top : top + _SWATCH, left : left + _SWATCH] = each.colour
         _write(picture, name, left + _SWATCH + _GAP, line)

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from gcd_node.replay.run import Manifest, RunFolder
+    from gcd_node.replay.run import RunFolder
 
 __all__ = ["ReplayFixture", "ReplayedRun", "gcd_replay"]
 
-_RENEWED = pytest.StashKey[list[str]]()
 _UPDATE = "--gcd-update"
 
 
@@ -30,8 +29,7 @@ class ReplayedRun:
     tmp_path. manifest: what it states of itself, seeds, stamps, digests, totals."""
 
     def __init__(self, run: "RunFolder", config: pytest.Config) -> None:
-        self.folder: Path = run.path
-        self.manifest: Manifest = run.manifest
+        self.folder, self.manifest = run.path, run.manifest
         self._run, self._config = run, config
 
     def assert_same_as(
@@ -46,15 +44,18 @@ class ReplayedRun:
             max_class_share: of a view's class pixels in a window, how many may differ, 0 to 1.
         Raises:
             AssertionError: it differs, or there is no golden run yet. DamagedRunError: the golden is damaged.
+            OutputError: with --gcd-update, there is something else than a run.
         """
         __tracebackhide__ = True
         from gcd_node.replay.compare import Tolerance, compare, report_text
-        from gcd_node.replay.run import open_run
+        from gcd_node.replay.run import MANIFEST, new_folder, open_run
 
         path = self._config.rootpath / golden
         if self._config.getoption(_UPDATE):
-            if _renew(self._run, path):
-                self._config.stash[_RENEWED].append(str(path))
+            if (path / MANIFEST).is_file():
+                shutil.rmtree(path)
+            with new_folder(path) as folder:
+                shutil.copytree(self.folder, folder, dirs_exist_ok=True)
             return
         if not path.exists():
             raise AssertionError(
@@ -67,33 +68,6 @@ class ReplayedRun:
                 f"{report_text(comparison, tolerance)}\nA is the golden run {path}\nB is this run {self.folder}\n"
                 f"If this is how it should be: pytest {_UPDATE}"
             )
-
-
-def _renew(run: "RunFolder", golden: Path) -> bool:
-    """Make `golden` a copy of the run; whether anything changed. One that already says the same stays untouched, unlike
-    one that is damaged or of an earlier version.
-
-    Raises:
-        OutputError: `golden` is something else than a run, or cannot be written. DamagedRunError: the run is damaged.
-    """
-    from gcd_node.errors import DamagedRunError, OutputError
-    from gcd_node.replay.compare import compare
-    from gcd_node.replay.run import MANIFEST, new_folder, open_run
-
-    if golden.is_dir() and any(golden.iterdir()):
-        if not (golden / MANIFEST).is_file():
-            raise OutputError(f"{golden} is there and is no golden run (it has no {MANIFEST}); name another folder")
-        with contextlib.suppress(DamagedRunError):
-            comparison = compare(open_run(golden), run)
-            if not comparison.failures() and not comparison.facts:
-                return False
-        try:
-            shutil.rmtree(golden)
-        except OSError as error:
-            raise OutputError(f"cannot replace {golden}: {error.strerror}; check its permissions") from error
-    with new_folder(golden) as folder:
-        shutil.copytree(run.path, folder, dirs_exist_ok=True)
-    return True
 
 
 class ReplayFixture:
@@ -131,16 +105,5 @@ def gcd_replay(request: pytest.FixtureRequest, tmp_path: Path) -> ReplayFixture:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Adds --gcd-update."""
-    group = parser.getgroup("gcd-node")
-    group.addoption(_UPDATE, action="store_true", help="make every golden run that a test asks for what it is now")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Nothing is renewed yet."""
-    config.stash[_RENEWED] = []
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Says which golden runs were renewed."""
-    for path in dict.fromkeys(config.stash[_RENEWED]):
-        terminalreporter.write_line(f"gcd-node: renewed the golden run {path}")
+    explained = "make every golden run that a test asks for what it is now"
+    parser.getgroup("gcd-node").addoption(_UPDATE, action="store_true", help=explained)

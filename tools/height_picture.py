@@ -72,8 +72,8 @@ def main() -> None:
     parser.add_argument("--frames", default="0,6,13")
     parser.add_argument("--picture", type=Path, required=True)
     options = parser.parse_args()
-    inverse = np.load(options.folder / "depth.npz")["inverse_depth"].astype(np.float64)
-    visibility = np.load(options.folder / "visibility.npz")["visibility"]
+    view = np.load(options.folder / "view.npz")
+    inverse, visibility = view["inverse_depth"].astype(np.float64), view["visibility"]
     tiles = []
     for t in map(int, options.frames.split(",")):
         points, seen = points_of(inverse[t], options.hfov_deg), visibility[t] == 2

@@ -160,8 +160,9 @@ def replay_launch(
             status.update(f"window {report.window.window_id}: {report.render_s * 1000:.0f} ms")
 
         run = replay(settings, out, tell)
-    totals = msgspec.structs.asdict(run.manifest.totals)
-    Console(markup=False).print(table([*run.manifest.made_from.items(), *totals.items()]))
+    manifest = run.manifest
+    totals = {"frames": manifest.frames, "windows": len(manifest.windows), "windows with NaN": manifest.nan_windows}
+    Console(markup=False).print(table([*manifest.made_from.items(), *totals.items(), *manifest.rejected.items()]))
     Console(markup=False).print(f"wrote {run.path}", soft_wrap=True, highlight=False)
 
 
@@ -181,15 +182,14 @@ def diff(
 
     Ends with 0 if they are identical or near enough, with 1 if not, with 65 or 66 if one is damaged or missing.
     """
-    from gcd_node.replay.compare import Tolerance, compare, report_text, to_plain
+    from gcd_node.replay.compare import Tolerance, compare, report_text
     from gcd_node.replay.run import open_run
 
     tolerance = Tolerance(min_psnr_db=min_psnr, max_class_share=max_class_share)
     runs = open_run(run_a), open_run(run_b)
     with Console(stderr=True, markup=False).status("comparing"):
         comparison = compare(*runs)
-    plain = msgspec.json.encode(to_plain(comparison, tolerance)).decode() if as_json else None
-    typer.echo(plain or report_text(comparison, tolerance))
+    typer.echo(msgspec.json.encode(comparison).decode() if as_json else report_text(comparison, tolerance))
     if comparison.failures(tolerance):
         raise typer.Exit(1)
 

@@ -53,9 +53,7 @@ def view(
         Option(help="Windows, frames at the goal pose, deviations, class maps, what was seen, depth, or all of these."),
     ] = "win",
     save: Annotated[Path | None, Option(help="Folder for PNG files and a lossless MKV per view.")] = None,
-    hatch: Annotated[
-        bool, Option("--hatch", help="Save windows with lines over their painted pixels; over all where nobody says.")
-    ] = False,
+    hatch: Annotated[bool, Option("--hatch", help="Save windows also with lines over their painted pixels.")] = False,
     limit: Annotated[int | None, Option(min=1, help="End after so many messages.")] = None,
     timeout: Annotated[
         float | None, Option(help="End when nothing came for so many seconds; 69 if nothing ever did.")

@@ -1,20 +1,18 @@
-"""Two runs, window by window: the same pixels or how far apart, and what the two were made from; in words and as
-JSON."""
+"""Two runs, window by window: what differs, how far the pixels are apart, and what the two were made from."""
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, field
 
 import cv2
 import msgspec
 import numpy as np
 
-from gcd_model import FileError, decode_toml, printable
-from gcd_node.errors import DamagedRunError, UsageError
-from gcd_node.replay.run import MANIFEST, Manifest, Pixels, RunFolder, ViewPixels, WindowEntry, read_windows
+from gcd_model import printable
+from gcd_node.errors import UsageError
+from gcd_node.replay.run import KeptKind, Manifest, Pixels, RunFolder, WindowEntry
 
-_MAP_NAMES = {"cls": "class map", "vis": "visibility", "depth": "depth"}
+_MAP_NAMES: dict[KeptKind, str] = {"cls": "class map", "vis": "visibility", "depth": "depth"}
 _ABSENT = "-"  # shown for what one of the runs does not have
 _TOP = 255.0
 _DEPTH_SLACK = 0.01  # ten times what f16 rounds away, a tenth of what depth networks err
@@ -47,69 +45,50 @@ class Tolerance:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Distance:
-    """How far the pictures of one view of one window are apart.
+class Difference:
+    """One view of one window that is not the same in both runs.
 
-    psnr_db: of all T frames together, infinite if they are identical. worst_frame, worst_psnr_db: of the frame that
-    differs most. largest: difference of any level, 0 to 255. shares: of the pixels of each kind of map that there is,
-    how many differ.
-    """
-
-    psnr_db: float
-    worst_frame: int
-    worst_psnr_db: float
-    largest: int
-    shares: dict[str, float]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ViewComparison:
-    """One view of one window.
-
-    only_in: the run that has it, if the other has not. facts: what must agree and does not: "stamps", "seqs", "epoch",
-    "ood", "size", the name of a map. distance: None if there are no two pictures of one size. same_input, same_seed:
-    the model was given the same pictures, and the same seed.
+    facts: what must agree and does not: "only in A", "stamps_ns", "seqs", "epoch", "ood", "size", the name of a map.
+    worst_psnr_db, worst_frame: of the frame that differs most, infinite if none does. shares: of the pixels of each
+    kind of map, how many differ. cause: what of the model's input was another already: "pictures", "seed", or "".
     """
 
     window_id: int
     view_id: str
-    only_in: Literal["A", "B"] | None = None
     facts: tuple[str, ...] = ()
-    same_input: bool = True
-    same_seed: bool = True
-    distance: Distance | None = None
+    worst_psnr_db: float = math.inf
+    worst_frame: int = 0
+    shares: dict[str, float] = field(default_factory=dict[str, float])
+    cause: str = ""
 
     def within(self, tolerance: Tolerance) -> bool:
         """Whether all that must agree does, and the pictures are near enough."""
-        if self.facts or self.distance is None:
-            return False
         least_db = math.inf if tolerance.min_psnr_db is None else tolerance.min_psnr_db
-        share = max(self.distance.shares.values(), default=0.0)
-        return self.distance.worst_psnr_db >= least_db and share <= tolerance.max_class_share
+        share = max(self.shares.values(), default=0.0)
+        return not self.facts and self.worst_psnr_db >= least_db and share <= tolerance.max_class_share
 
     def __str__(self) -> str:
-        parts = [f"window {self.window_id}, view {self.view_id}: "]
-        parts += [f"only in {self.only_in}; "] if self.only_in else []
-        if (far := self.distance) is not None:
-            worst = f"frame {far.worst_frame} {far.worst_psnr_db:.2f} dB"
-            parts += [f"{far.psnr_db:.2f} dB, {worst}, up to {far.largest} levels; "] if far.largest else []
-            parts += [f"{share:.3%} of the {_MAP_NAMES[kind]}; " for kind, share in far.shares.items() if share]
-        return "".join(parts + [f"other {fact}; " for fact in self.facts]).removesuffix("; ")
+        parts = [each if each.startswith("only in ") else f"other {each}" for each in self.facts]
+        parts += [f"frame {self.worst_frame} {self.worst_psnr_db:.2f} dB"] if self.worst_psnr_db < math.inf else []
+        parts += [f"{share:.3%} of the {kind}" for kind, share in self.shares.items() if share]
+        return f"window {self.window_id}, view {self.view_id}: {'; '.join(parts)}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunComparison:
-    """Two runs. facts: what they were made from, in A and in B, where it differs, by names such as `config model.steps`
-    or `weights sha256_12`. views: by window, those that only one has too."""
+    """Two runs, a and b. facts: what they were made from, in A and in B, where it differs, by names such as
+    `config model.steps` or `weights sha256_12`. views: how many, of all windows. differences: those that are not the
+    same, by window. As JSON, the infinite PSNR of identical pictures is null."""
 
-    a: RunFolder
-    b: RunFolder
+    a: str
+    b: str
     facts: dict[str, tuple[str, str]]
-    views: tuple[ViewComparison, ...]
+    views: int
+    differences: tuple[Difference, ...]
 
-    def failures(self, tolerance: Tolerance | None = None) -> tuple[ViewComparison, ...]:
-        """Every view that is not near enough; without a tolerance, that is not identical."""
-        return tuple(view for view in self.views if not view.within(tolerance or Tolerance()))
+    def failures(self, tolerance: Tolerance) -> tuple[Difference, ...]:
+        """Every view that is not near enough."""
+        return tuple(each for each in self.differences if not each.within(tolerance))
 
 
 def compare(a: RunFolder, b: RunFolder) -> RunComparison:
@@ -117,88 +96,68 @@ def compare(a: RunFolder, b: RunFolder) -> RunComparison:
 
     Windows belong together by window_id.
     Raises:
-        DamagedRunError: see read_windows(); or the configuration of a manifest is not TOML.
+        DamagedRunError: see RunFolder.read_view().
     """
-    views: list[ViewComparison] = []
-    rest_a, rest_b = read_windows(a), read_windows(b)
-    ids_a, ids_b = ({window.window_id for window in run.manifest.windows} for run in (a, b))
-    for window_id in sorted(ids_a | ids_b):
-        window_a, views_a = next(rest_a) if window_id in ids_a else (None, {})
-        window_b, views_b = next(rest_b) if window_id in ids_b else (None, {})
-        for view_id in dict.fromkeys((*views_a, *views_b)):
-            pixels_a, pixels_b = views_a.get(view_id), views_b.get(view_id)
-            if window_a is None or window_b is None or pixels_a is None or pixels_b is None:
-                only_in = "B" if pixels_a is None else "A"
-                views.append(ViewComparison(window_id=window_id, view_id=view_id, only_in=only_in))
-            else:
-                same_size = a.manifest.size == b.manifest.size
-                distance = _distance(pixels_a, pixels_b) if same_size else None
-                facts = [] if same_size else ["size"]
-                facts += [name for kind, name in _MAP_NAMES.items() if (kind in pixels_a) != (kind in pixels_b)]
-                views.append(_compare_view(view_id, window_a, window_b, facts, distance))
-    for rest in (rest_a, rest_b):
-        next(rest, None)  # to look at their ends
+    of_a, of_b = (
+        {(window.window_id, view_id): window for window in run.manifest.windows for view_id in window.views}
+        for run in (a, b)
+    )
+    views = sorted(of_a | of_b)
+    compared = (_compare_view(a, b, view_id, of_a.get((w, view_id)), of_b.get((w, view_id))) for w, view_id in views)
+    differences = tuple(each for each in compared if not each.within(Tolerance()))
     facts_a, facts_b = dict(_facts(a.manifest)), dict(_facts(b.manifest))
     pairs = {name: (facts_a.get(name, _ABSENT), facts_b.get(name, _ABSENT)) for name in facts_a | facts_b}
     different = {printable(name): (printable(one), printable(two)) for name, (one, two) in pairs.items() if one != two}
-    return RunComparison(a=a, b=b, facts=different, views=tuple(views))
+    return RunComparison(a=str(a.path), b=str(b.path), facts=different, views=len(views), differences=differences)
 
 
 def _compare_view(
-    view_id: str, a: WindowEntry, b: WindowEntry, facts: list[str], distance: Distance | None
-) -> ViewComparison:
-    moments = [name for name in ("stamps", "seqs", "epoch") if getattr(a, name) != getattr(b, name)]
-    moments += ["ood"] if a.views[view_id].ood != b.views[view_id].ood else []
-    return ViewComparison(
+    run_a: RunFolder, run_b: RunFolder, view_id: str, a: WindowEntry | None, b: WindowEntry | None
+) -> Difference:
+    if a is None or b is None:
+        (only,) = (each for each in (a, b) if each is not None)
+        return Difference(window_id=only.window_id, view_id=view_id, facts=("only in B" if a is None else "only in A",))
+    pixels_a, pixels_b = run_a.read_view(a, view_id), run_b.read_view(b, view_id)
+    facts = [name for name in ("stamps_ns", "seqs", "epoch", "ood") if getattr(a, name) != getattr(b, name)]
+    facts += [name for kind, name in _MAP_NAMES.items() if (kind in pixels_a) != (kind in pixels_b)]
+    both: list[KeptKind] = [kind for kind in pixels_a if kind in pixels_b]
+    if any(pixels_a[kind].shape != pixels_b[kind].shape for kind in both):
+        return Difference(window_id=a.window_id, view_id=view_id, facts=(*facts, "size"))
+    psnr_db = [_psnr_db(*pair) for pair in zip(pixels_a["win"], pixels_b["win"], strict=True)]
+    cause = "" if a.seed == b.seed else "seed"
+    return Difference(
         window_id=a.window_id,
         view_id=view_id,
-        facts=(*moments, *facts),
-        same_input=a.input_sha256 == b.input_sha256,
-        same_seed=a.views[view_id].seed == b.views[view_id].seed,
-        distance=distance,
+        facts=tuple(facts),
+        worst_psnr_db=min(psnr_db),
+        worst_frame=int(np.argmin(psnr_db)),
+        shares={_MAP_NAMES[kind]: _share(kind, pixels_a[kind], pixels_b[kind]) for kind in both if kind != "win"},
+        cause=cause if a.input_sha256 == b.input_sha256 else "pictures",
     )
 
 
-def _distance(a: ViewPixels, b: ViewPixels) -> Distance:
-    pairs = list(zip(a["win"], b["win"], strict=True))
-    squares = [float(cv2.norm(one, other, cv2.NORM_L2SQR)) for one, other in pairs]
-    worst = int(np.argmax(squares))
-    return Distance(
-        psnr_db=_psnr_db(sum(squares), a["win"].size),
-        worst_frame=worst,
-        worst_psnr_db=_psnr_db(squares[worst], a["win"][worst].size),
-        largest=max(int(cv2.absdiff(one, other).max()) for one, other in pairs),
-        shares={kind: _share(kind, a[kind], b[kind]) for kind in _MAP_NAMES if kind in a and kind in b},
-    )
+def _psnr_db(a: Pixels, b: Pixels) -> float:
+    """Peak signal-to-noise ratio of two pictures."""
+    squares = float(cv2.norm(a, b, cv2.NORM_L2SQR))
+    return math.inf if squares == 0 else 10 * math.log10(_TOP**2 * a.size / squares)
 
 
-def _psnr_db(squares: float, count: int) -> float:
-    """Peak signal-to-noise ratio of u8 pictures from the sum of squared differences of `count` levels."""
-    return math.inf if squares == 0 else 10 * math.log10(_TOP**2 * count / squares)
-
-
-def _share(kind: str, a: Pixels, b: Pixels) -> float:
+def _share(kind: KeptKind, a: Pixels, b: Pixels) -> float:
     """Of the pixels, how many differ. A frame whose depth differs by less than 1 % counts one pixel."""
     if kind != "depth":
         return float((a != b).mean())
-    one, other = (np.ascontiguousarray(each).view("<f2").astype(np.float32) for each in (a, b))
+    one, other = (each.view("<f2").astype(np.float32) for each in (a, b))
     far = (np.abs(one - other) > _DEPTH_SLACK * np.maximum(one, other)).mean(axis=(1, 2))
     return float(np.maximum(far, (a != b).any(axis=(1, 2)) / one[0].size).mean())
 
 
 def _facts(manifest: Manifest) -> Iterator[tuple[str, str]]:
-    """What a run was made from: settings, weights, recording, versions, machine, size, totals, troubles; in this
-    order."""
-    try:
-        config = decode_toml(manifest.config)
-    except FileError as error:
-        raise DamagedRunError(f"the config in {MANIFEST} {error}; replay the recording again") from error
-    yield from _flat("config", {key: config[key] for key in _SECTIONS if key in config})
+    """What a run was made from: settings, weights, recording, versions, machine, totals, troubles; in this order."""
+    yield from _flat("config", {key: manifest.config.get(key) for key in _SECTIONS})
     yield from manifest.made_from.items()
-    yield from _flat("size", {**msgspec.to_builtins(manifest.size), "fps": manifest.fps})
-    yield from _flat("total", msgspec.to_builtins(manifest.totals))
-    for trouble in manifest.troubles:
-        yield f"trouble {trouble.code} in window {trouble.window_id}", trouble.detail
+    totals = {"frames": manifest.frames, "windows": len(manifest.windows), "nan_windows": manifest.nan_windows}
+    yield from _flat("total", {**totals, "rejected": manifest.rejected})
+    yield from _flat("trouble", manifest.troubles)
 
 
 def _flat(group: str, table: Mapping[str, object], place: str = "") -> Iterator[tuple[str, str]]:
@@ -212,7 +171,7 @@ def _flat(group: str, table: Mapping[str, object], place: str = "") -> Iterator[
 
 def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
     """The whole comparison in words: verdict, causes, first divergence, and the first views that are too far apart."""
-    total, different, failures = len(comparison.views), comparison.failures(), comparison.failures(tolerance)
+    total, different, failures = comparison.views, comparison.differences, comparison.failures(tolerance)
     lines = [f"DIFFERENT: {len(failures)} of {total} views are not {tolerance}"]
     if not different:
         lines = [f"identical: all {total} views"]
@@ -222,32 +181,12 @@ def report_text(comparison: RunComparison, tolerance: Tolerance) -> str:
         lines += ["what A and B were made from differs (A, B):"]
         lines += [f"  {name}: {a}, {b}" for name, (a, b) in comparison.facts.items()]
     if different:
-        first = different[0]
-        cause = "" if first.only_in else "; the model was given the same pictures"
-        if not first.same_input:
-            cause = "; the model was given other pictures already: look at the recording and its decoder"
-        elif not first.same_seed:
-            cause += " and another seed, as any other setting brings one"
-        lines.append(f"first divergence: {first}{cause}")
+        causes = {
+            "pictures": "; the model was given other pictures already: look at the recording and its decoder",
+            "seed": "; the model was given the same pictures and another seed, as any other setting brings one",
+        }
+        same = "" if different[0].facts else "; the model was given the same pictures"
+        lines.append(f"first divergence: {different[0]}{causes.get(different[0].cause, same)}")
     lines += [f"  {each}" for each in failures[:_LINES]]
     lines += [f"  and {len(failures) - _LINES} more"] if len(failures) > _LINES else []
     return "\n".join(lines)
-
-
-def to_plain(comparison: RunComparison, tolerance: Tolerance) -> dict[str, Any]:
-    """Everything as plain values for JSON, which has null for the PSNR of identical pictures, infinite here."""
-    different = comparison.failures()
-    first = {"window_id": different[0].window_id, "view_id": different[0].view_id} if different else None
-    return {
-        "a": str(comparison.a.path),
-        "b": str(comparison.b.path),
-        "passed": not comparison.failures(tolerance),
-        "identical": not different,
-        **asdict(tolerance),
-        "facts": [{"name": name, "a": a, "b": b} for name, (a, b) in comparison.facts.items()],
-        "first_divergence": first,
-        "views": [
-            {**asdict(view), "identical": view.within(Tolerance()), "passed": view.within(tolerance)}
-            for view in comparison.views
-        ],
-    }

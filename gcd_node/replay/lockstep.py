@@ -2,54 +2,46 @@
 
 import hashlib
 import platform
-from collections.abc import Callable, Generator, Mapping
-from contextlib import closing, contextmanager
+import re
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import cv2
 import kornia
+import msgspec
 import numpy as np
 import torch
 from msgspec.structs import replace
 
-from gcd_client.protocol import ClassRecord, EndMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
+from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
 from gcd_model import Traits
-from gcd_node.config import LifeConfig, NodeConfig, to_toml
-from gcd_node.errors import ConfigError, DamagedRunError, ModelFailedError, OutputError, SourceError
-from gcd_node.frame import FrameSource, SourceInfo
-from gcd_node.image_io import VideoWriter
+from gcd_node.config import LifeConfig, NodeConfig
+from gcd_node.errors import ConfigError, ModelFailedError, SourceError
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import PublisherStats
 from gcd_node.node import Node
-from gcd_node.pipeline import Summary
 from gcd_node.replay.run import (
     MANIFEST,
+    Digest,
+    KeptKind,
     Manifest,
-    Pixels,
     RunFolder,
-    SizeEntry,
-    TotalsEntry,
-    TroubleEntry,
-    ViewEntry,
     WindowEntry,
     encode_manifest,
+    keep_pixels,
     new_folder,
     open_run,
     pixel_digest,
-    pixels_path,
-    read_windows,
 )
 from gcd_node.session import load_model, model_threads
-from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
+from gcd_node.sources import LiveSource, SyntheticSource, open_source, resolve_path
 from gcd_node.stream_context import config_digest
 
 PARTS = Parts(open_source=open_source, load_model=load_model)
 """What a launch file names, as `gcd-node run` opens it."""
-_TROUBLES = ("MODEL_NAN", "GPU_OOM")
-_SECOND_NS = 1_000_000_000
 
 
 def lockstep_config(config: NodeConfig) -> NodeConfig:
@@ -94,103 +86,72 @@ def replay(
         ModelFailedError: not one window came out.
     """
     config = lockstep_config(config)
-    infos: list[SourceInfo] = []
     traits: list[Traits] = []
-
-    def open_and_note(section: SourceConfig) -> FrameSource:
-        source = parts.open_source(section)
-        infos.append(source.info)
-        return source
-
-    with new_folder(out) as folder, _repeatable():
-        with closing(RunWriter(folder, on_window)) as writer:
-            noting = Parts(open_source=open_and_note, load_model=parts.load_model)
-            node = Node(config, noting, writer, on_configured=traits.append, on_window=writer.finish_window)
-            summary = node.run()
-        manifest = _manifest(config, infos[0], traits[-1], writer, summary)
-        try:
-            (folder / MANIFEST).write_bytes(encode_manifest(manifest))
-            for _ in read_windows(open_run(folder)):  # OpenCV does not say that a disk is full
-                pass
-        except (OSError, DamagedRunError) as error:
-            raise OutputError(f"{out} could not be written whole; is there space? {error}") from error
+    repeatable = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True)  # on a GPU
+    with new_folder(out) as folder, repeatable:
+        writer = RunWriter(folder, on_window)
+        summary = Node(config, parts, writer, on_configured=traits.append, on_window=writer.finish_window).run()
+        if not writer.windows:
+            raise ModelFailedError(
+                f'none of the {summary.counts.nan_windows} windows came out: all had NaN; try dtype = "float32" in '
+                "[model], and look at the weights with `gcd-node weights inspect`"
+            )
+        manifest = Manifest(
+            made_from=_made_from(config, traits[-1]),
+            config=msgspec.to_builtins(config),
+            cfg_digest=config_digest(config, traits[-1]),
+            frames=summary.frames,
+            rejected=dict(sorted(summary.rejected.items())),
+            nan_windows=summary.counts.nan_windows,
+            troubles=writer.troubles,
+            windows=tuple(writer.windows),
+        )
+        (folder / MANIFEST).write_bytes(encode_manifest(manifest))
     return open_run(out)
 
 
-@contextmanager
-def _repeatable() -> Generator[None]:
-    """On a GPU, only convolutions that give the same result each time."""
-    cudnn = torch.backends.cudnn
-    before = cudnn.deterministic, cudnn.benchmark
-    cudnn.deterministic, cudnn.benchmark = True, False
-    try:
-        yield
-    finally:
-        cudnn.deterministic, cudnn.benchmark = before
-
-
 class RunWriter:
-    """A message sink that needs no reader: takes the rgb8 messages of a lockstep node and keeps windows and their maps.
+    """A message sink that needs no reader: keeps the windows of a lockstep node and their maps.
 
-    Single frames are part of their window, and deviations of its samples: neither is kept. size, fps: of its windows,
-    None before the first.
+    Single frames are part of their window, and deviations of its samples: neither is kept.
     """
 
     def __init__(self, folder: Path, on_window: Callable[[WindowReport], None] | None) -> None:
         self.windows: list[WindowEntry] = []
-        self.troubles: list[TroubleEntry] = []
-        self.classes: tuple[ClassRecord, ...] = ()
-        self.size: SizeEntry | None = None
-        self.fps = 0.0
+        self.troubles: dict[str, str] = {}
         self.stats = PublisherStats()  # nobody reads
         self._folder, self._on_window = folder, on_window
-        self._videos: dict[Path, VideoWriter] = {}
-        self._views: dict[str, ViewEntry] = {}  # of the window in work
+        self._views: dict[str, dict[KeptKind, Digest]] = {}  # of the window in work, as the next two
+        self._seed, self._ood = 0, ()
 
-    def close(self) -> None:
-        """Finish the videos."""
-        for video in self._videos.values():
-            video.close()
+    _ood: tuple[str, ...]
 
     def send(self, message: ViewMessage) -> bool:
-        """Take a view; see MessageSink. Raises OutputError if its video cannot be begun."""
+        """Take a view; see MessageSink. Raises OutputError."""
         header, kind = message.header, kind_of(message.topic)
         if kind not in ("win", "cls", "vis", "depth"):
             return True
         frames, height, width, channels = header.shape
-        pixels: Pixels = np.frombuffer(message.payload, np.uint8)
-        pixels = pixels.reshape((frames, height, width, 3) if channels == 3 else (frames, height, -1))
-        sha256, quality = pixel_digest(pixels), header.quality
+        shape = (frames, height, width, 3) if channels == 3 else (frames, height, -1)
+        pixels = np.frombuffer(message.payload, np.uint8).reshape(shape)
+        digest = keep_pixels(self._folder, header.view_id, header.window_id, kind, pixels)
+        self._views.setdefault(header.view_id, {})[kind] = digest
         if kind == "win":
-            self.size = SizeEntry(frames=frames, height=height, width=width)
-            self._views[header.view_id] = ViewEntry(
-                view_rev=header.view_rev,
-                sha256={"win": sha256},
-                seed=quality.seed,
-                steps=quality.steps,
-                ood=quality.ood,
-                nan_frames=quality.nan_frames,
-            )
-        elif kind == "cls":
-            self.classes = tuple(header.classes or ())
-        self._views[header.view_id].sha256[kind] = sha256
-        path = pixels_path(self._folder, header.view_id, kind)
-        if path not in self._videos:
-            self._videos[path] = VideoWriter(path, header.src.fps_cond)
-        self._videos[path].add(pixels)
+            self._seed, self._ood = header.quality.seed, header.quality.ood
         return True
 
     def finish_window(self, report: WindowReport) -> None:
         """Take note that all views of a window were sent; a node's `on_window`."""
-        window, self.fps = report.window, report.window.fps
+        window = report.window
         self.windows.append(
             WindowEntry(
                 window_id=window.window_id,
                 epoch=window.epoch,
-                stamps=tuple(divmod(stamp_ns, _SECOND_NS) for stamp_ns in window.stamps_ns),
+                stamps_ns=tuple(window.stamps_ns),
                 seqs=window.seqs,
                 input_sha256=pixel_digest(window.images),
-                render_ms=round(report.render_s * 1000, 3),
+                seed=self._seed,
+                ood=self._ood,
                 views=self._views,
             )
         )
@@ -200,9 +161,9 @@ class RunWriter:
 
     def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None:
         """Keep what the model could not do; see MessageSink."""
-        if topic == "event" and fields["code"] in _TROUBLES:
+        if topic == "event" and fields["code"] in ("MODEL_NAN", "GPU_OOM"):
             detail = fields["rung"] if "rung" in fields else f"seeds {', '.join(map(str, fields['seeds']))}"
-            self.troubles.append(TroubleEntry(code=fields["code"], window_id=fields["window_id"], detail=detail))
+            self.troubles[f"{fields['code']} in window {fields['window_id']}"] = detail
 
     # Nobody looks, and nobody is waited for:
 
@@ -213,46 +174,20 @@ class RunWriter:
     def stop_waiting(self) -> None: ...
 
 
-def _manifest(config: NodeConfig, info: SourceInfo, traits: Traits, writer: RunWriter, summary: Summary) -> Manifest:
-    if writer.size is None:
-        raise ModelFailedError(
-            f'none of the {summary.counts.nan_windows} windows came out: all had NaN; try dtype = "float32" in '
-            "[model], and look at the weights with `gcd-node weights inspect`"
-        )
-    return Manifest(
-        made_from=_made_from(config, info, traits),
-        config=to_toml(config),
-        cfg_digest=config_digest(config, traits),
-        size=writer.size,
-        fps=writer.fps,
-        classes=writer.classes,
-        totals=TotalsEntry(
-            frames=summary.frames,
-            windows=summary.counts.windows,
-            rejected=dict(sorted(summary.rejected.items())),
-            nan_windows=summary.counts.nan_windows,
-        ),
-        troubles=tuple(writer.troubles),
-        windows=tuple(writer.windows),
-    )
-
-
-def _made_from(config: NodeConfig, info: SourceInfo, traits: Traits) -> dict[str, str]:
+def _made_from(config: NodeConfig, traits: Traits) -> dict[str, str]:
     """Weights, recording, programs and machine: hashes of two runs are only bound to agree if all of it does."""
-    section, digests = config.source, dict[str, str]()
+    section, files = config.source, dict[str, Path]()
     if not isinstance(section, SyntheticSource | LiveSource):
-        digests["source sha256"] = digest_of(resolve_path(section.path))
+        files["source sha256"] = resolve_path(section.path)
     if section.calibration is not None:
-        digests["calibration sha256"] = digest_of(Path(section.calibration).expanduser())
+        files["calibration sha256"] = Path(section.calibration).expanduser()
     return {
         "weights name": traits.name,
         "weights sha256_12": traits.sha256_12,
         "weights precision": traits.precision,
-        "source id": f"{info.kind} {info.id}",
-        "source pictures": f"{info.width}x{info.height}, {info.fps_nominal:g} FPS, {info.codec or 'no codec'}",
-        **digests,
-        "version gcd-node": version("gcd-node"),
+        **{name: digest_of(path) for name, path in files.items()},
         "version python": platform.python_version(),
+        "version gcd-node": version("gcd-node"),
         "version torch": str(torch.__version__),
         "version kornia": kornia.__version__,
         "version opencv": cv2.__version__,
@@ -287,9 +222,6 @@ def digest_of(path: Path) -> str:
 def _processor(device: str) -> str:
     if device.startswith("cuda"):
         return torch.cuda.get_device_name(device)
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor() or "unknown")
+    told = Path("/proc/cpuinfo")
+    names = re.findall(r"^model name\s*: (.*)$", told.read_text(), re.MULTILINE) if told.exists() else []
+    return names[0] if names else platform.processor() or "unknown"

@@ -1,110 +1,62 @@
 """A run on disk: what it was made from, a digest of every view of every window, and the pixels without loss.
 
-    RUN/manifest.json   RUN/VIEW.mkv   RUN/VIEW.classes.mkv   RUN/VIEW.visibility.mkv   RUN/VIEW.depth.mkv
+    RUN/manifest.json   RUN/VIEW/000000.win.png   RUN/VIEW/000000.cls.png   .vis.png   .depth.png
 
-All windows of a view follow each other in an FFV1 video. The folder appears when all of it is there.
+A picture holds the T frames of one window under each other. The folder appears when all of it is there.
 """
 
 import hashlib
 import os
 import shutil
-from collections.abc import Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gcd_client.protocol import ClassRecord
 from gcd_model import FileError, read_json
-from gcd_node.config import Count, ViewId
+from gcd_node.config import ViewId
 from gcd_node.errors import DamagedRunError, OutputError, SourceError
-from gcd_node.image_io import make_folder
-from gcd_node.sources.files import open_video
+from gcd_node.image_io import make_folder, write_png
+from gcd_node.sources.files import read_picture
 
 MANIFEST = "manifest.json"
-_MAX_MANIFEST, _MAX_WINDOW = 64 * 2**20, 2**28  # bytes: a day of windows; 6 times the largest model's pixels
-_MATROSKA = b"\x1a\x45\xdf\xa3"
+_MAX_MANIFEST = 64 * 2**20  # bytes: a day of windows
 
 Pixels = NDArray[np.uint8]
+"""Of a view of a window: "win" [T, H, W, 3] RGB; "cls" and "vis" [T, H, W]; "depth" [T, H, 2 W], the bytes of its
+float16 values."""
 Digest: TypeAlias = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$(?!\n)")]
-"""SHA-256, 64 hex digits."""
+"""SHA-256 of the bytes of an array in C order, 64 hex digits."""
 KeptKind: TypeAlias = Literal["win", "cls", "vis", "depth"]
 """What a run keeps of a view, named as in the wire protocol."""
-_SUFFIXES: dict[KeptKind, str] = {"win": "", "cls": ".classes", "vis": ".visibility", "depth": ".depth"}
-
-
-class SizeEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Of every view: T frames of H x W pixels."""
-
-    frames: Count
-    height: Count
-    width: Count
-
-    def __post_init__(self) -> None:
-        if 3 * self.frames * self.height * self.width > _MAX_WINDOW:
-            raise ValueError(
-                f"a window of {self.frames} x {self.height} x {self.width} takes more than {_MAX_WINDOW} bytes"
-            )
-
-
-class TroubleEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the model could not do: MODEL_NAN, the window is missing; GPU_OOM, less was asked of it from here on."""
-
-    code: str
-    window_id: int
-    detail: str
-
-
-class TotalsEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """frames: read. windows: rendered. rejected: what spoilt windows, and how many. nan_windows: missing for that."""
-
-    frames: int
-    windows: int
-    rejected: dict[str, int]
-    nan_windows: int
-
-
-class ViewEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One view of one window.
-
-    sha256: of its pixels by kind: of "win" u8 [T, H, W, 3] RGB, before any JPEG; of "cls" and "vis" u8 [T, H, W]; of
-    "depth" f16 [T, H, W]. seed, steps: of the sampler. ood: what lay outside the trained domain. nan_frames: frames
-    with non-finite values; always 0 of a view that came out.
-    """
-
-    view_rev: int
-    sha256: dict[KeptKind, Digest]
-    seed: int
-    steps: int
-    ood: tuple[str, ...]
-    nan_frames: int
-
-    def __post_init__(self) -> None:
-        if "win" not in self.sha256:
-            raise ValueError("a view needs the digest of its pixels")
 
 
 class WindowEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One window.
 
-    stamps: [sec, nanosec] of its T frames as the source gave them (one number would be changed by readers that hold
-    numbers as doubles); those of different epochs cannot be compared. seqs: the source's numbers of the frames.
-    input_sha256: of the pictures the model was given, u8 [T, H, W, 3]. render_ms: of all its views together.
+    stamps_ns: of its T frames as the source gave them; those of different epochs cannot be compared. seqs: the source's
+    numbers of the frames. input_sha256: of the pictures the model was given, u8 [T, H, W, 3]. seed: of the sampler.
+    ood: what lay outside the trained domain. views: digests of the pixels of each, before any JPEG.
     """
 
     window_id: Annotated[int, Meta(ge=0)]
     epoch: int
-    stamps: tuple[tuple[int, int], ...]
+    stamps_ns: Annotated[tuple[int, ...], Meta(min_length=1)]
     seqs: tuple[int, ...]
     input_sha256: Digest
-    render_ms: float
-    views: Annotated[dict[ViewId, ViewEntry], Meta(min_length=1)]
+    seed: int
+    ood: tuple[str, ...]
+    views: Annotated[dict[ViewId, dict[KeptKind, Digest]], Meta(min_length=1)]
+
+    def __post_init__(self) -> None:
+        if any("win" not in kinds for kinds in self.views.values()):
+            raise ValueError("a view needs the digest of its pixels")
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -112,30 +64,25 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     format: another number is another layout.
     made_from: all that decides its pixels beside the configuration, such as "weights sha256_12" or "version torch".
-    config: TOML, without secrets. cfg_digest: see config_digest(). fps: of a window. classes: the ontology of the class
-    maps, empty without. windows: by rising id.
+    config: the launch file as it was replayed. cfg_digest: see config_digest().
+    frames: read. rejected: what spoilt windows, and how many. nan_windows: missing because of NaN. troubles: what the
+        model could not do, such as "MODEL_NAN in window 3", with its detail. windows: by rising id.
     """
 
-    format: Literal["gcd-run/2"] = "gcd-run/2"
+    format: Literal["gcd-run/3"] = "gcd-run/3"
     made_from: dict[str, str]
-    config: str
+    config: dict[str, Any]
     cfg_digest: str
-    size: SizeEntry
-    fps: float
-    classes: tuple[ClassRecord, ...]
-    totals: TotalsEntry
-    troubles: tuple[TroubleEntry, ...]
+    frames: int
+    rejected: dict[str, int]
+    nan_windows: int
+    troubles: dict[str, str]
     windows: Annotated[tuple[WindowEntry, ...], Meta(min_length=1)]
 
     def __post_init__(self) -> None:
         ids = [window.window_id for window in self.windows]
         if ids != sorted(set(ids)):
             raise ValueError("the window_id of each window must be higher than the one before")
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        """Ids of all views, in the order they first occur."""
-        return tuple(dict.fromkeys(view_id for window in self.windows for view_id in window.views))
 
 
 def encode_manifest(manifest: Manifest) -> bytes:
@@ -147,12 +94,35 @@ def encode_manifest(manifest: Manifest) -> bytes:
     return f'{head},\n  "windows": [\n    {lines}\n  ]\n}}\n'.encode()
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class RunFolder:
     """A run that lies in `path`; nothing but its manifest was looked at."""
 
     path: Path
     manifest: Manifest
+
+    def read_view(self, window: WindowEntry, view_id: str) -> dict[KeptKind, Pixels]:
+        """The pixels of a view of a window by kind.
+
+        Raises:
+            DamagedRunError: a picture is missing, none, or has other pixels than those with its digest.
+        """
+        return {kind: self._read(window, view_id, kind) for kind in window.views[view_id]}
+
+    def _read(self, window: WindowEntry, view_id: str, kind: KeptKind) -> Pixels:
+        path = _place(self.path, view_id, window.window_id, kind)
+        try:
+            picture = read_picture(path)
+        except SourceError as error:
+            raise DamagedRunError(f"{error}; copy the whole folder of the run, or replay it again") from error
+        pixels = picture if kind == "win" else np.ascontiguousarray(picture[..., 0])
+        odd = len(pixels) % len(window.stamps_ns) or (kind == "depth" and pixels.shape[1] % 2)
+        if odd or pixel_digest(pixels) != window.views[view_id][kind]:
+            raise DamagedRunError(
+                f"{path} does not have the pixels whose SHA-256 {MANIFEST} states; one of the two was changed or "
+                "damaged: replay again"
+            )
+        return pixels.reshape(len(window.stamps_ns), -1, *pixels.shape[1:])
 
 
 def open_run(path: Path) -> RunFolder:
@@ -168,88 +138,26 @@ def open_run(path: Path) -> RunFolder:
     if not file.exists():
         raise DamagedRunError(f"{path} has no {MANIFEST}: it is no run, or one that did not finish; replay again")
     try:
-        manifest = read_json(file, Manifest, _MAX_MANIFEST)
+        return RunFolder(path, read_json(file, Manifest, _MAX_MANIFEST))
     except FileError as error:
         raise DamagedRunError(
             f"{file} is no manifest of a run as this version writes it: it {error}; replay the recording again"
         ) from error
-    return RunFolder(path=path, manifest=manifest)
-
-
-# Pixels.
-
-
-ViewPixels: TypeAlias = dict[KeptKind, Pixels]
-"""Of a view of a window, by kind: of "win" u8 [T, H, W, 3] RGB; of "cls" and "vis" u8 [T, H, W]; of "depth"
-u8 [T, H, 2 W], the bytes of its values."""
 
 
 def pixel_digest(pixels: Pixels) -> str:
-    """SHA-256 of the bytes of an array in C order, 64 hex digits."""
+    """See Digest."""
     return hashlib.sha256(np.ascontiguousarray(pixels).data).hexdigest()
 
 
-def pixels_path(folder: Path, view_id: str, kind: KeptKind) -> Path:
-    """Where the pixels of a kind of a view are."""
-    return folder / f"{view_id}{_SUFFIXES[kind]}.mkv"
+def keep_pixels(folder: Path, view_id: str, window_id: int, kind: KeptKind, pixels: Pixels) -> Digest:
+    """Write the pixels of a kind of a view of a window; gives their digest. Raises OutputError."""
+    write_png(_place(folder, view_id, window_id, kind), pixels.reshape(-1, *pixels.shape[2:]))
+    return pixel_digest(pixels)
 
 
-def read_windows(run: RunFolder) -> Iterator[tuple[WindowEntry, dict[str, ViewPixels]]]:
-    """Every window with its pixels by view, in order; each is checked against its digest.
-
-    Raises:
-        DamagedRunError: a video is missing, no video, shorter or longer than the manifest says, has pictures of another
-            size, or other pixels than those with that digest.
-    """
-    videos: dict[Path, cv2.VideoCapture] = {}
-    with ExitStack() as stack:
-        for window in run.manifest.windows:
-            views: dict[str, ViewPixels] = {view_id: {} for view_id in window.views}
-            for view_id, view in window.views.items():
-                for kind, sha256 in view.sha256.items():
-                    path = pixels_path(run.path, view_id, kind)
-                    video = videos[path] = videos[path] if path in videos else _open_video(path, stack)
-                    pixels = views[view_id][kind] = _next_window(video, path, run.manifest.size, kind)
-                    if pixel_digest(pixels) != sha256:
-                        raise DamagedRunError(
-                            f"{path}: the pixels of window {window.window_id} do not have the SHA-256 that "
-                            "manifest.json states; one of the two was changed or damaged: replay again"
-                        )
-            yield window, views
-        for path, video in videos.items():
-            if video.read()[0]:
-                raise DamagedRunError(f"{path} has more frames than {MANIFEST} says; replay again")
-
-
-def _open_video(path: Path, stack: ExitStack) -> cv2.VideoCapture:
-    try:
-        with path.open("rb") as file:
-            if file.read(len(_MATROSKA)) != _MATROSKA:  # FFmpeg would follow a play list to addresses nobody named
-                raise SourceError(f"{path} is no Matroska video")
-        return stack.enter_context(open_video(path))
-    except (OSError, SourceError) as error:
-        raise DamagedRunError(f"{error}; copy the whole folder of the run, or replay it again") from error
-
-
-def _next_window(video: cv2.VideoCapture, path: Path, size: SizeEntry, kind: KeptKind) -> Pixels:
-    """u8 [T, H, W, 3] RGB, or of maps [T, H, W]."""
-    height, width = size.height, (2 if kind == "depth" else 1) * size.width
-    frames: list[Pixels] = []
-    for index in range(size.frames):
-        good, frame = video.read()
-        if not good:
-            raise DamagedRunError(
-                f"{path} ends at frame {index} of {size.frames} of a window: it is shorter than {MANIFEST} says; copy "
-                "it again, or replay again"
-            )
-        if frame.shape[:2] != (height, width):
-            raise DamagedRunError(
-                f"{path} has pictures of {frame.shape[1]} x {frame.shape[0]} pixels, {MANIFEST} says {width} x "
-                f"{height}; one of the two was changed or damaged: replay again"
-            )
-        plain = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) if kind == "win" else frame[..., 0]
-        frames.append(np.asarray(plain, np.uint8))
-    return np.stack(frames)
+def _place(folder: Path, view_id: str, window_id: int, kind: KeptKind) -> Path:
+    return folder / view_id / f"{window_id:06d}.{kind}.png"
 
 
 @contextmanager
@@ -268,9 +176,8 @@ def new_folder(path: Path) -> Generator[Path]:
     make_folder(part)
     try:
         yield part
-        try:
-            part.replace(path)
-        except OSError as error:
-            raise OutputError(f"cannot create {path}: {error.strerror}; name another folder") from error
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; is there space? Or name another folder") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)

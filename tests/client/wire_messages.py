@@ -4,12 +4,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from gcd_client.images import VISIBILITY, payload_of
+from gcd_client.images import VISIBILITY, encode_jpegs, payload_of
 from gcd_client.protocol import (
     MAPS_PROTO,
     ClassRecord,
@@ -100,6 +101,14 @@ def window(
         view_id=view_id, window_id=window_id, boot_id=boot_id, view_rev=view_rev, age_ms=age_ms, shape=images.shape
     )
     return ViewMessage(topic=view_topic(view_id, kind), header=header, payload=payload_of(images))
+
+
+def jpeg_window(window_id: int = 0, **changes: Any) -> ViewMessage:
+    """Two frames as JPEG; changes: of the header."""
+    drawn = pixels(window_id, height=16, width=24)
+    payload, offsets = encode_jpegs(drawn, 90)
+    header = replace(view_header(window_id=window_id, shape=drawn.shape), encoding="jpeg", offsets=offsets, **changes)
+    return ViewMessage(topic="view/top/win", header=header, payload=payload)
 
 
 CLASSES = (

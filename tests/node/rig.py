@@ -5,18 +5,14 @@ import gc
 import socket
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from cameras import Bench, until
 from fakes import FakeSynthesizer, traits
-from numpy.typing import NDArray
 
 from gcd_client.control import ControlClient, Reply
-from gcd_client.protocol import ViewHeader
 from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
 from gcd_model import ViewSynthesizer
 from gcd_node.config import ModelSection, NodeConfig, parse_config
@@ -31,27 +27,6 @@ CAMERA = 'kind = "v4l2"'
 LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 _LOOK_MS, _SILENT_LOOKS = 50, 6
 """How long a reader waits for more, and how often in vain once the node is done: once, after a last word."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A view that arrived; pixels [T, H, W, C] unless they were not kept."""
-
-    header: ViewHeader
-    sequence: int
-    age_ms: float
-    skipped: int
-    pixels: NDArray[np.uint8] | None
-
-
-def seen(view: ReceivedView, *, keep: bool) -> Seen:
-    return Seen(
-        header=view.header,
-        sequence=view.message.sequence,
-        age_ms=view.age_ms,
-        skipped=view.skipped,
-        pixels=view.images if keep else None,
-    )
 
 
 def rig_config(folder: Path, source: str, views: str, more: str) -> NodeConfig:
@@ -99,9 +74,8 @@ class Rig:
         once: bool = False,
         service: ServiceManager | None = None,
         watched: bool = True,
-        keep: bool = True,
     ) -> None:
-        """watched: somebody reads the views. keep: their pixels too."""
+        """watched: somebody reads the views."""
         self.config = rig_config(folder, config, views, more)
         self.model = FakeSynthesizer(traits()) if model is None else model
         loaded = self.model
@@ -114,13 +88,11 @@ class Rig:
         self.node, self.publisher, self.control = self._session.enter_context(opened)
         self.folder = folder
         self.notes: list[tuple[float, str, Mapping[str, Any]]] = []
-        self.views: list[Seen] = []
-        self._keep, self._froze = keep, False
-        self.ended: set[str] = set()
+        self.views: list[ReceivedView] = []
+        self.ended = False
         self.summary: Summary | None = None
         self.failure: Exception | None = None
-        self._done = threading.Event()
-        self._watched = watched
+        self._done, self._watched, self._froze = threading.Event(), watched, False
         targets = [self._hear, *([self._see] if watched else []), self._live]
         self._threads = [threading.Thread(target=target, daemon=True) for target in targets]
 
@@ -155,25 +127,27 @@ class Rig:
             self.failure = error
 
     def _hear(self) -> None:
+        def is_over() -> bool:
+            return bool(self.notes) and self.notes[-1][2].get("state") == "finalized"
+
         with StatusSubscriber(f"ipc://{self.folder}/status") as notes:
-            silent, over = 0, False
-            while silent < (1 if over else _SILENT_LOOKS):
-                done, note = self._done.is_set(), notes.receive(_LOOK_MS)
-                silent = silent + 1 if done and note is None else 0
-                if note is not None:
-                    self.notes.append((time.monotonic(), note.topic, note.fields))
-                    over = note.fields.get("state") == "finalized"
+            for note in self._received(notes, is_over):
+                self.notes.append((time.monotonic(), note.topic, note.fields))
 
     def _see(self) -> None:
         with ViewSubscriber(f"ipc://{self.folder}/data", None, "win", conflate=False) as views:
-            silent = 0
-            while silent < (1 if self.ended else _SILENT_LOOKS):
-                done, view = self._done.is_set(), views.receive(_LOOK_MS)
-                silent = silent + 1 if done and view is None else 0
-                if view is not None:
-                    self.views.append(seen(view, keep=self._keep))
-                elif views.ended:
-                    self.ended.add("win")
+            for view in self._received(views, lambda: self.ended):
+                self.views.append(view)
+
+    def _received(self, reader: StatusSubscriber | ViewSubscriber, is_over: Callable[[], bool]) -> Iterator[Any]:
+        silent = 0
+        while silent < (1 if is_over() else _SILENT_LOOKS):
+            done, found = self._done.is_set(), reader.receive(_LOOK_MS)
+            silent = silent + 1 if done and found is None else 0
+            if found is not None:
+                yield found
+            elif reader.ended:
+                self.ended = True
 
     # What it said.
 
@@ -187,7 +161,7 @@ class Rig:
     def metas(self) -> list[Mapping[str, Any]]:
         return [fields for _, topic, fields in list(self.notes) if topic == "meta"]
 
-    def of(self, view: str = "main") -> list[Seen]:
+    def of(self, view: str = "main") -> list[ReceivedView]:
         return [each for each in list(self.views) if each.header.view_id == view]
 
     def await_event(self, code: str, count: int = 1) -> Mapping[str, Any]:
@@ -201,15 +175,9 @@ class Rig:
         until(lambda: any(holds(status) for status in self.statuses()))
         return next(status for status in self.statuses() if holds(status))
 
-    def await_views(self, count: int, view: str = "main") -> list[Seen]:
+    def await_views(self, count: int, view: str = "main") -> list[ReceivedView]:
         until(lambda: len(self.of(view)) >= count)
         return self.of(view)
 
     def ask(self, verb: str, args: Mapping[str, object] | None = None, **more: object) -> Reply:
         return self.client.request(verb, {**(args or {}), **more})
-
-    def try_out(self, verb: str, **args: object) -> Reply:
-        return self.client.request(verb, args, dry_run=True)
-
-    def ask_at(self, view_rev: int, verb: str, **args: object) -> Reply:
-        return self.client.request(verb, args, if_view_rev=view_rev)

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from fakes import FakeSource, FakeSynthesizer, traits
 
 from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, Trajectory, View
@@ -44,19 +43,16 @@ class LevelModel(FakeSynthesizer):
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        window, options = len(self.asked), options or RenderOptions()
-        video = ((features.latents + 1) / 2 * 255).round() - ((options.steps or 1) - 1)
+        window, steps = len(self.asked), 1 if options is None else options.steps or 1
+        video = ((features.latents + 1) / 2 * 255).round() - (steps - 1)
         for (at, frame), levels in self._lower.items():
-            if at == window:
-                video[frame] -= levels
-        return [self._view(view, video, window) for view in super().render(features, trajectories, options)]
-
-    def _view(self, view: View, video: torch.Tensor, window: int) -> View:
-        classes = view.classes
-        if classes is not None:
-            columns = self._classes.get(window, 0)
-            classes[:, 0, :, :columns] = (classes[:, 0, :, :columns] + 1) % len(self.traits.classes)
-        return replace(view, samples=(video / 255)[None])
+            video[frame] -= levels if at == window else 0
+        views = super().render(features, trajectories, options)
+        for view in views:
+            if view.classes is not None:
+                first = view.classes[:, 0, :, : self._classes.get(window, 0)]
+                first.add_(1).remainder_(len(self.traits.classes))
+        return [replace(view, samples=(video / 255)[None]) for view in views]
 
 
 def nan_model(windows: set[int]) -> FakeSynthesizer:

@@ -249,23 +249,18 @@ def test_a_log_whose_pictures_never_come_again_plays_and_then_fails(
 
 def test_what_a_strange_run_states_takes_neither_time_nor_memory(tmp_path: Path) -> None:
     golden = made_run(tmp_path / "golden")
-    lies = {"config": "a" + ".a" * 20_000 + "=1", "size": {"frames": 14, "height": 10**6, "width": 10**6}}
-    for key, value in lies.items():
-        run = copied(golden, tmp_path / key)
-        manifest = json.loads((run / MANIFEST).read_text())
-        (run / MANIFEST).write_text(json.dumps(manifest | {key: value}))
-        with pytest.raises(DamagedRunError):
-            compare(golden, open_run(run))
-    with (tmp_path / "config" / MANIFEST).open("r+b") as file:
+    run = copied(golden, tmp_path / "run")
+    manifest = (run / MANIFEST).read_text()
+    (run / MANIFEST).write_text(manifest.replace('"config": {', '"config": {"model": ' + '{"a":' * 20_000, 1))
+    with pytest.raises(DamagedRunError):
+        open_run(run)
+    with (run / MANIFEST).open("r+b") as file:
         file.truncate(2**30)  # a sparse file
     with pytest.raises(DamagedRunError):
-        open_run(tmp_path / "config")
-
-
-def test_a_play_list_in_the_place_of_a_video_is_not_followed(tmp_path: Path) -> None:
-    golden = made_run(tmp_path / "golden")
-    run = copied(golden, tmp_path / "run")
-    (run / "main.mkv").write_text("#EXTM3U\n#EXTINF:10,\nhttp://127.0.0.1:1/video.ts\n")
+        open_run(run)
+    (run / MANIFEST).write_text(manifest)
+    (run / "main" / "000000.win.png").unlink()
+    os.mkfifo(run / "main" / "000000.win.png")
     with pytest.raises(DamagedRunError):
         compare(golden, open_run(run))
 

@@ -14,12 +14,12 @@ from media import noise
 from msgspec.structs import replace as struct_replace
 
 from gcd_client.protocol import to_json
-from gcd_model import RenderOptions, SourceFeatures, Traits, Trajectory, View
+from gcd_model import Clip, RenderOptions, SourceFeatures, Traits, Trajectory, View
 from gcd_node.cli.main import run_app
 from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError
 from gcd_node.frame import Frame, Image
 from gcd_node.image_io import write_video
-from gcd_node.offline import ClipRequest, OfflineClip, read_clip
+from gcd_node.offline import ClipRequest, read_clip
 
 LIVE = live_traits()
 FRAMES = 14
@@ -40,7 +40,7 @@ def numbered_depth(frames: int = 30) -> np.ndarray:
     )
 
 
-def read(path: Path, **request: Any) -> OfflineClip:
+def read(path: Path, **request: Any) -> Clip:
     return read_clip(path, ClipRequest(**request), LIVE)
 
 
@@ -56,7 +56,7 @@ def test_depth_takes_the_way_of_its_pictures_from_a_file_as_from_a_folder(video:
     folder = as_folder(tmp_path / "d", numbered_depth())
     wanted = numbered_depth()[1 : 1 + 2 * FRAMES : 2, :, WIDTH // 2 : 3 * WIDTH // 2]
     for path in (tmp_path / "d.npy", folder):
-        clip = read(video, depth=path, start=1, stride=2).clip
+        clip = read(video, depth=path, start=1, stride=2)
         assert clip.depth is not None
         assert np.allclose(clip.depth.numpy(), wanted, atol=6e-4)
 
@@ -94,11 +94,9 @@ def still_clip(tmp_path: Path) -> Path:
 def test_a_live_view_is_written_with_all_it_tells(still_clip: Path, tmp_path: Path) -> None:
     orbit = ("--depth", tmp_path / "depth.npy", "--source-radius", 2.7, "--azimuth-deg", 10)
     assert synthesize(still_clip, "random:live", tmp_path, *orbit) == 0
-    seen = np.load(tmp_path / "visibility.npz")
-    assert seen["visibility"].shape == (FRAMES, HEIGHT, WIDTH)
-    assert seen["names"][seen["ids"] == 0].tolist() == ["painted"]
-    assert np.load(tmp_path / "depth.npz")["inverse_depth"].shape == (FRAMES, HEIGHT, WIDTH)
-    assert np.load(tmp_path / "classes.npz")["classes"].shape == (1, FRAMES, HEIGHT, WIDTH)
+    arrays = np.load(tmp_path / "view.npz")
+    assert arrays["visibility"].shape == arrays["inverse_depth"].shape == (FRAMES, HEIGHT, WIDTH)
+    assert arrays["classes"].shape == (1, FRAMES, HEIGHT, WIDTH)
     assert (tmp_path / "seen.mp4").stat().st_size > 0
 
 
@@ -110,13 +108,13 @@ def test_with_depth_a_published_model_tells_what_was_seen_in_the_units_of_its_ra
     for name, (file, unit_m) in {"a": ("depth.npy", 1), "b": ("small.npy", 0.1), "c": ("small.npy", 1)}.items():
         options = (*orbit, "--depth", tmp_path / file, "--unit-m", unit_m)
         assert synthesize(still_clip, "random:kubric90", tmp_path / name, *options) == 0
-    a, b, c = (np.load(tmp_path / name / "visibility.npz")["visibility"] for name in "abc")
+    a, b, c = (np.load(tmp_path / name / "view.npz")["visibility"] for name in "abc")
     assert np.array_equal(a, b)
     assert not np.array_equal(a, c)
     assert (a[0, :, :20] == 0).all()  # a hole is painted, whatever the model drew there; it has not moved yet
     assert (a[0, :, 21:] == 2).all()
     assert synthesize(still_clip, "random:kubric90", tmp_path / "d", *orbit) == 0
-    assert not (tmp_path / "d" / "visibility.npz").exists()
+    assert "visibility" not in np.load(tmp_path / "d" / "view.npz")
 
 
 @pytest.mark.parametrize(

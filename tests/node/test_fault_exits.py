@@ -14,15 +14,13 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from tiny_weights import write_tiny
 
-from gcd_model import ViewSynthesizer
 from gcd_node import session
 from gcd_node.cli.main import run_app
-from gcd_node.config import ModelSection, PublishConfig
+from gcd_node.config import PublishConfig
 from gcd_node.frame import FrameSource
 from gcd_node.publisher import Publisher
 
 SLACK_S = 10.0  # what a machine that does other things may add
-LIVE = 'kind = "v4l2"\ndevice = "/dev/video-none"'
 
 Outcome = Callable[..., tuple[int, str]]
 
@@ -30,7 +28,7 @@ Outcome = Callable[..., tuple[int, str]]
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Outcome:
     """Runs a launch file as the command line does; gives its exit code and what it said. Camera and model are fakes
-    where they are given."""
+    where they are given; the camera is there once."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
     def ran(
@@ -56,31 +54,17 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
             endpoint = "ipc://{tmp_path}/control"
         """)
         if opened is not None:
-            monkeypatch.setattr(session, "open_source", _giving(opened))
+            left = [opened]
+            monkeypatch.setattr(session, "open_source", lambda *_: left.pop() if left else Bench().open())
         if fake:
-            monkeypatch.setattr(session, "load_model", _loading)
+            monkeypatch.setattr(session, "load_model", lambda _: FakeSynthesizer(traits()))
         return run_app([command, str(launch)]), capsys.readouterr().err
 
     return ran
 
 
-def _giving(source: FrameSource) -> Callable[..., FrameSource]:
-    """Opens this source once; the next time it is gone."""
-    bench = Bench()
-    left = [source]
-
-    def opened(*_: object) -> FrameSource:
-        return left.pop() if left else bench.open()
-
-    return opened
-
-
-def _loading(_: ModelSection) -> ViewSynthesizer:
-    return FakeSynthesizer(traits())
-
-
 def test_f2_check_without_a_camera_is_exit_69(run: Outcome) -> None:
-    code, said = run("check", source=LIVE)
+    code, said = run("check", source='kind = "v4l2"\ndevice = "/dev/video-none"')
     assert code == 69
     assert "/dev/video-none" in said
 

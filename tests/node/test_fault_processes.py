@@ -16,11 +16,9 @@ from fakes import FakeSynthesizer, Steady, traits
 from media import environment
 from recordings import files, of, said, summary
 from rig import Rig
-from torch import Tensor
 from wire_messages import start_reader
 
 from gcd_client.subscriber import ViewSubscriber
-from gcd_model import Augmentation, Clip, SourceFeatures
 
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
 SLACK_S = 3.0  # what a machine that does other things may add
@@ -30,23 +28,9 @@ END_S = 5.0 + 30.0  # and for ending one
 pytestmark = pytest.mark.timeout(2 * START_S)
 
 
-class Forgetful(FakeSynthesizer):
-    """Keeps no clip, for whoever measures memory."""
-
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
-        features = super().encode(clip, augmentation, extra)
-        self.clips.clear()
-        return features
-
-
-def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "gcd_node", *arguments]
-
-
 def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Steady(), Forgetful(traits()), config=REALTIME, keep=False) as rig:
+    model = FakeSynthesizer(traits(), lambda _: model.clips.clear())  # keeps none: memory is measured
+    with Rig(tmp_path, lambda _: Steady(), model, config=REALTIME) as rig:
         reader = start_reader(f"ipc://{tmp_path}/data", "main")
         try:
             assert reader.stdout is not None
@@ -92,7 +76,8 @@ def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> N
         autostart = true
     """)
     with ViewSubscriber(f"ipc://{tmp_path}/data", "main", conflate=False) as views:
-        node = subprocess.Popen(command("run", str(launch)), stderr=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", "gcd_node", "run", str(launch)]
+        node = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         try:
             assert views.receive(1000 * START_S) is not None
             node.send_signal(signal.SIGTERM)
@@ -112,17 +97,14 @@ def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> N
 @pytest.fixture(scope="module")
 def hung(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, "subprocess.Popen[str]"]]:
     """Nodes that hang, begun all at once: each takes its time to start and to end."""
-    begun = {each: _hung(each, tmp_path_factory.mktemp(each)) for each in ("load", "render")}
+    script, begun = str(Path(__file__).with_name("hung_process.py")), {}
+    for phase in ("load", "render"):
+        command = [sys.executable, script, str(tmp_path_factory.mktemp(phase)), phase]
+        begun[phase] = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
     yield begun
     for node in begun.values():
         node.kill()
         node.communicate()
-
-
-def _hung(phase: str, folder: Path) -> "subprocess.Popen[str]":
-    script = str(Path(__file__).with_name("hung_process.py"))
-    command = [sys.executable, script, str(folder), phase]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
 
 
 def test_f23_a_model_that_hears_nothing_does_not_hold_up_the_end(hung: dict[str, "subprocess.Popen[str]"]) -> None:

@@ -11,7 +11,7 @@ from gcd_model import hatched
 from gcd_node.demo import moments
 from gcd_node.errors import OutputError
 from gcd_node.frame import Image
-from gcd_node.image_io import legend, to_u8, write_npy, write_png, write_video
+from gcd_node.image_io import legend, to_u8, write_arrays, write_png, write_video
 
 SEEN = np.full((16, 24), 2, np.uint8)
 
@@ -45,7 +45,7 @@ def test_what_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         write_png(tmp_path / "file" / "x.png", gradient())
 
 
-@pytest.mark.parametrize(("width", "lines"), [(80, 3), (150, 2), (1000, 1)])
+@pytest.mark.parametrize(("width", "lines"), [(80, 3), (220, 2), (1000, 1)])
 def test_a_legend_takes_as_many_lines_as_it_needs_and_drops_no_class(width: int, lines: int) -> None:
     picture = legend(CLASSES, width)
     assert picture.shape == (22 * lines, width, 3)
@@ -59,7 +59,7 @@ def test_a_legend_takes_as_many_lines_as_it_needs_and_drops_no_class(width: int,
 def test_what_arrived_whole_is_put_together_in_order_and_the_unseen_hatched(tmp_path: Path) -> None:
     pictures = {window: [gradient(10 * window + i) for i in range(2)] for window in (5, 2, 7)}
     for window, frames in pictures.items():
-        write_npy(tmp_path / "vis" / f"{window:06d}.npy", np.stack([SEEN, 0 * SEEN]))
+        write_arrays(tmp_path / "vis" / f"{window:06d}.npy", np.stack([SEEN, 0 * SEEN]))
         for i, frame in enumerate(frames):
             write_png(tmp_path / f"{window:06d}_{i:02d}.png", frame)
             write_png(tmp_path / "cls" / f"{window:06d}_{i:02d}.png", frame)

@@ -17,7 +17,14 @@ from gcd_node.errors import ConfigError
 from gcd_node.session import load_model
 from gcd_node.stream_context import config_digest
 
-_RANK = 2
+LAUNCH = b"""
+[source]
+path = "drive.mp4"
+[model]
+weights = "random:driving"
+device = "cpu"
+[view.topdown]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -30,54 +37,27 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         name for name in sorted(state) if name.endswith("query.weight") and state[name].ndim == 2
     ).removesuffix(".weight")
     width = state[f"{layer}.weight"].shape[0]
-    factors = {f"{layer}.down": torch.ones(_RANK, width), f"{layer}.up": torch.ones(width, _RANK)}
+    factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
     assert loaded.family is not None
     card = Card(name="adapted", config=loaded.networks.config, family=loaded.family.name, move_time=loaded.move_time)
     for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
-        adapter = Adapter(rank=_RANK, alpha=1.0, base=base, card=card, tensors=factors)
+        adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)
         write_adapter(folder / f"{name}.safetensors", adapter, overwrite=False)
     return {name: folder / f"{name}.safetensors" for name in ("tiny", "own", "other")}
 
 
-def launch(tmp_path: Path, weights: Path, adapter: Path | None) -> NodeConfig:
-    told = "" if adapter is None else f'adapter = "{adapter}"'
-    return parse_config(
-        f"""
-        [source]
-        path = "{tmp_path}/none.mkv"
-        [model]
-        weights = "{weights}"
-        device = "cpu"
-        {told}
-        [view.main]
-        """.encode(),
-        "launch.toml",
-    )
+def launch(weights: object, *changes: str) -> NodeConfig:
+    return parse_config(LAUNCH, "launch.toml", [f"model.weights={weights}", *changes])
 
 
-def test_the_node_runs_weights_with_their_adapter_under_a_name_of_their_own(
-    tmp_path: Path, files: dict[str, Path]
-) -> None:
-    plain, adapted = launch(tmp_path, files["tiny"], None), launch(tmp_path, files["tiny"], files["own"])
+def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(files: dict[str, Path]) -> None:
+    plain, adapted = launch(files["tiny"]), launch(files["tiny"], f"model.adapter={files['own']}")
     before, traits = load_model(plain.model).traits, load_model(adapted.model).traits
     assert traits.name == "adapted"
     assert traits.sha256_12 != before.sha256_12
     assert config_digest(plain, before) != config_digest(adapted, before)
-
-
-def test_an_adapter_of_other_weights_ends_a_run_before_it_begins(tmp_path: Path, files: dict[str, Path]) -> None:
     with pytest.raises(CheckpointError):
-        load_model(launch(tmp_path, files["tiny"], files["other"]).model)
-
-
-LAUNCH = b"""
-[source]
-path = "drive.mp4"
-[model]
-weights = "random:driving"
-threads = 1
-[view.topdown]
-"""
+        load_model(launch(files["tiny"], f"model.adapter={files['other']}").model)
 
 
 def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,8 +68,6 @@ def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pyte
 
 @pytest.mark.parametrize("change", ["model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'])
 def test_onnxruntime_is_refused_for_what_is_no_export(change: str) -> None:
-    section = parse_config(LAUNCH, "launch.toml", [change]).model
-    with pytest.raises(
-        ConfigError, match=r"\[model\]: the engine onnxruntime runs exports, and random:driving is none"
-    ):
+    section = launch("random:driving", change).model
+    with pytest.raises(ConfigError, match="onnxruntime runs exports, and random:driving is none"):
         load_model(section)

@@ -55,7 +55,7 @@ def test_a_node_goes_through_its_life_as_it_is_asked(tmp_path: Path) -> None:
         rig.await_state("finalized")
     assert rig.failure is None
     assert len({view.header.boot_id for view in rig.views}) == 1
-    assert [view.sequence for view in rig.of()] == [0, 2]  # 1 was the end of the first stream
+    assert [view.message.sequence for view in rig.of()] == [0, 2]  # 1 was the end of the first stream
 
 
 def asked(rig: Rig, verb: str) -> dict[str, Any]:
@@ -113,11 +113,11 @@ def test_a_change_meant_for_another_revision_is_refused(tmp_path: Path) -> None:
         assert rig.ask("set_view", view="main", azimuth_deg=1.0).code is Code.NOT_READY
         rig.ask("configure")
         rig.await_state("inactive")
-        assert rig.ask_at(1, "set_view", view="main", azimuth_deg=1.0).code is Code.OK
-        refused = rig.ask_at(1, "set_view", view="main", azimuth_deg=2.0)
+        assert rig.client.request("set_view", {"view": "main", "azimuth_deg": 1.0}, if_view_rev=1).code is Code.OK
+        refused = rig.client.request("set_view", {"view": "main", "azimuth_deg": 2.0}, if_view_rev=1)
         assert (refused.code, refused.result) == (Code.WRONG_STATE, {"view_rev": 2})
-        assert rig.ask_at(1, "remove_view", view="main").code is Code.WRONG_STATE
-        assert rig.ask_at(2, "remove_view", view="main").code is Code.OK
+        assert rig.client.request("remove_view", {"view": "main"}, if_view_rev=1).code is Code.WRONG_STATE
+        assert rig.client.request("remove_view", {"view": "main"}, if_view_rev=2).code is Code.OK
 
 
 def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
@@ -128,9 +128,7 @@ def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
         until(lambda: rig.of()[-1].header.encoding == "jpeg")
         header = rig.of()[-1].header
         assert header.quality.steps == 3
-        pixels = rig.of()[-1].pixels
-        assert pixels is not None
-        assert pixels.shape == (14, 64, 96, 3)
+        assert rig.of()[-1].images.shape == (14, 64, 96, 3)
         model = rig.model
         assert isinstance(model, FakeSynthesizer)
         assert model.asked[-1][1].guidance == (1.0, 2.0)

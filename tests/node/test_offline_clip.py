@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from fakes import HEIGHT, WIDTH, traits
 
-from gcd_model import OptionError
+from gcd_model import Clip, OptionError
 from gcd_node.errors import TooShortError, UsageError
 from gcd_node.image_io import write_png, write_video
-from gcd_node.offline import ClipRequest, OfflineClip, read_clip
+from gcd_node.offline import ClipRequest, read_clip
 
 
 def numbered(count: int, height: int = 2 * HEIGHT, width: int = 2 * WIDTH) -> list[np.ndarray]:
@@ -20,20 +20,20 @@ def video(tmp_path: Path) -> Path:
     return tmp_path / "v.mkv"
 
 
-def read(path: Path, family: str = "kubric90", **request: object) -> OfflineClip:
+def read(path: Path, family: str = "kubric90", **request: object) -> Clip:
     return read_clip(path, ClipRequest(**request), traits(family))  # type: ignore[arg-type]
 
 
-def levels(clip: OfflineClip) -> list[int]:
-    return [int(picture[0, 0, 0]) for picture in clip.pictures]
+def levels(clip: Clip) -> list[int]:
+    return [round((float(frame[0, 0, 0]) + 1) * 127.5) for frame in clip.video]
 
 
 def test_a_video_goes_to_the_trained_size_and_the_range_of_the_model(video: Path) -> None:
     clip = read(video)
-    assert clip.clip.video.shape == (14, 3, HEIGHT, WIDTH)
+    assert clip.video.shape == (14, 3, HEIGHT, WIDTH)
     assert levels(clip) == [10 * i for i in range(14)]
-    assert clip.clip.video[1].unique().tolist() == pytest.approx([10 / 127.5 - 1])
-    assert clip.clip.fps == 24.0
+    assert clip.video[1].unique().tolist() == pytest.approx([10 / 127.5 - 1])
+    assert clip.fps == 24.0
 
 
 def test_start_and_stride_count_frames_of_the_input(video: Path) -> None:
@@ -41,19 +41,19 @@ def test_start_and_stride_count_frames_of_the_input(video: Path) -> None:
     write_video(video, numbered(41), 24.0)
     clip = read(video, start=1, stride=3)
     assert levels(clip) == [10 * i % 250 for i in range(1, 41, 3)]
-    assert clip.clip.fps == 8.0
+    assert clip.fps == 8.0
 
 
 def test_the_label_is_what_the_user_says_and_a_foreign_rate_is_kept_and_said(
     video: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert read(video, fps=7.5).clip.fps == 7.5
-    assert read(video, "driving").clip.fps == 24.0
+    assert read(video, fps=7.5).fps == 7.5
+    assert read(video, "driving").fps == 24.0
     assert "24 frames per second" in caplog.text
 
 
 def test_another_size_may_be_asked_for(video: Path) -> None:
-    assert read(video, height=2 * HEIGHT, width=2 * WIDTH).clip.video.shape == (14, 3, 2 * HEIGHT, 2 * WIDTH)
+    assert read(video, height=2 * HEIGHT, width=2 * WIDTH).video.shape == (14, 3, 2 * HEIGHT, 2 * WIDTH)
     with pytest.raises(OptionError):
         read(video, height=HEIGHT + 1, width=WIDTH)
     with pytest.raises(UsageError):
@@ -69,7 +69,7 @@ def test_too_few_frames_is_an_error_with_the_count(video: Path, request_: dict[s
 def test_a_still_is_repeated_and_a_folder_read_in_order(tmp_path: Path) -> None:
     write_png(tmp_path / "s.png", numbered(5)[4])
     still = read(tmp_path / "s.png")
-    assert (levels(still), still.clip.fps) == ([40] * 14, 12.0)
+    assert (levels(still), still.fps) == ([40] * 14, 12.0)
     for index, picture in enumerate(numbered(15)):
         write_png(tmp_path / "folder" / f"{index}.png", picture)
     assert levels(read(tmp_path / "folder", start=1)) == [10 * i for i in range(1, 15)]

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,12 +24,12 @@ import pytest
 import zmq
 from msgspec.structs import replace
 from ros_stand_in import ROS, STORE, RosNode
-from wire_messages import CLASSES, OTHER_BOOT, class_map, depth, numbers, origin, pixels, visibility, window
+from wire_messages import CLASSES, OTHER_BOOT, class_map, depth, jpeg_window, numbers, origin, visibility, window
 
 from gcd_client import AuthError, ViewSubscriber
 from gcd_client.control import Code
-from gcd_client.images import depth_m, encode_jpegs
-from gcd_client.protocol import Message, StatusMessage, ViewMessage, encode
+from gcd_client.images import depth_m
+from gcd_client.protocol import Message, StatusMessage, encode
 from gcd_node.control import ControlServer, Outcome
 from gcd_node.lifecycle import PATHS, Lifecycle, State
 from gcd_node.sources.logs import pose_of
@@ -44,42 +43,22 @@ with pytest.MonkeyPatch.context() as patch:
     from gcd_views import bridge, messages
 
 
-def with_header(message: ViewMessage, **changes: Any) -> ViewMessage:
-    return replace(message, header=replace(message.header, **changes))
-
-
-def jpeg_window(window_id: int = 0) -> ViewMessage:
-    payload, offsets = encode_jpegs(pixels(window_id, height=16, width=24))
-    made = window(window_id)
-    header = replace(made.header, encoding="jpeg", offsets=offsets, shape=(2, 16, 24, 3), pose_units="m")
-    return ViewMessage(topic=made.topic, header=header, payload=payload)
-
-
-def test_a_picture_is_the_nodes_own_and_stamped_when_its_frame_was_captured() -> None:
+def test_pictures_and_maps_pass_as_they_are_stamped_when_their_frame_was_captured() -> None:
     message = jpeg_window()
-    picture = messages.to_compressed_image(message, 1, "gcd/top_optical")
-    decoded = messages.to_image(message, 1, "gcd/top_optical")
+    picture, decoded = (
+        make(message, 1, "gcd/top_optical") for make in (messages.to_compressed_image, messages.to_image)
+    )
     assert decoded.header == picture.header
+    assert picture.header.stamp.sec * 10**9 + picture.header.stamp.nanosec == message.header.t_capture_ns[1]
     assert picture.data.tobytes() == message.payload[message.header.offsets[1] :]
-    stamp = picture.header.stamp
-    assert stamp.sec * 10**9 + stamp.nanosec == message.header.t_capture_ns[1]
     expected = cv2.cvtColor(cv2.imdecode(picture.data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     assert np.array_equal(decoded.data.reshape(16, 24, 3), expected)
-
-
-@pytest.mark.parametrize(
-    ("message", "encoding", "payload"),
-    [
-        (window(), "rgb8", window().payload),
-        (class_map(), "mono8", class_map().payload),
-        (visibility(), "mono8", visibility().payload),
-        (depth(), "32FC1", depth_m(depth()).tobytes()),  # metres, NaN where unknown
-    ],
-)
-def test_pixels_pass_as_they_are(message: ViewMessage, encoding: str, payload: bytes) -> None:
-    made = messages.to_image(message, 1, "gcd/top_optical")
-    assert (made.encoding, made.height, made.width, made.step) == (encoding, 4, 6, len(payload) // 8)
-    assert made.data.tobytes() == bytes(payload[len(payload) // 2 :])
+    metres = depth_m(depth()).tobytes()  # NaN where unknown
+    maps = [(each, "mono8", each.payload) for each in (class_map(), visibility())] + [(depth(), "32FC1", metres)]
+    for message, encoding, payload in [(window(), "rgb8", window().payload), *maps]:
+        made = messages.to_image(message, 1, "gcd/top_optical")
+        assert (made.encoding, made.height, made.width, made.step) == (encoding, 4, 6, len(payload) // 8)
+        assert made.data.tobytes() == bytes(payload[len(payload) // 2 :])
 
 
 def test_a_camera_has_no_distortion_and_zeros_where_it_is_unknown() -> None:
@@ -94,11 +73,10 @@ def test_a_camera_has_no_distortion_and_zeros_where_it_is_unknown() -> None:
 
 
 def test_a_transform_takes_points_of_the_view_to_the_source_camera() -> None:
-    chance, pose = np.random.default_rng(0), np.eye(4)
-    for turn in [chance.normal(size=3) for _ in range(50)] + list(np.pi * np.eye(3)):  # half turns, too
+    chance, pose, header = np.random.default_rng(0), np.eye(4), replace(window().header, pose_units="m")
+    for turn in [*chance.normal(size=(50, 3)), *(np.pi * np.eye(3))]:  # half turns, too
         pose[:3] = np.column_stack([cv2.Rodrigues(turn)[0], (2.0, 3.0, 4.0)])
-        matrix = tuple(pose.flatten().tolist())
-        header = replace(window().header, source_from_view=(matrix, matrix), pose_units="m")
+        header = replace(header, source_from_view=(tuple(pose.flatten().tolist()),) * 2)
         made = messages.to_transform(header, 1, "oak", "gcd/top_optical", 0.0)
         assert (made.header.frame_id, made.child_frame_id) == ("oak", "gcd/top_optical")
         np.testing.assert_allclose(pose_of(made.transform.translation, made.transform.rotation), pose, atol=1e-9)
@@ -200,16 +178,16 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 
 def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node(bench: Bench) -> None:
     names = ("image", "image/compressed", "camera_info", "classes", "class_names", "depth", "visibility")
-    topics = {f"~/top/{name}" for name in names} | {"/tf", "/diagnostics"}
-    bench.until(lambda: topics <= set(bench.node.published), jpeg_window(), class_map(), depth(), visibility())
+    topics, pictures = {f"~/top/{name}" for name in names} | {"/tf", "/diagnostics"}, jpeg_window(pose_units="m")
+    bench.until(lambda: topics <= set(bench.node.published), pictures, class_map(), depth(), visibility())
     assert bench.node.topics == topics
-    pictures = [bench.out(f"~/top/{name}")[0].header for name in names if name != "class_names"]
+    headers = [bench.out(f"~/top/{name}")[0].header for name in names if name != "class_names"]
     newest_at_goal = divmod(window().header.t_capture_ns[1], 10**9)
-    assert {(each.frame_id, (each.stamp.sec, each.stamp.nanosec)) for each in pictures} == {
+    assert {(each.frame_id, (each.stamp.sec, each.stamp.nanosec)) for each in headers} == {
         ("robot/gcd/top_optical", newest_at_goal)
     }
     transform = bench.out("/tf")[0].transforms[0]
-    assert transform.header.stamp == pictures[0].stamp
+    assert transform.header.stamp == headers[0].stamp
     frames = (transform.header.frame_id, transform.child_frame_id)
     assert frames == ("robot/gcd/source_optical", "robot/gcd/top_optical")
     bench.until(lambda: len(bench.out("~/top/classes")) > 1, class_map())
@@ -232,7 +210,7 @@ def test_what_is_old_or_on_its_way_is_never_published(bench: Bench, changes: dic
         told = bench.diagnostic(1)
         return told.counts.get(count, "0") != "0" if count else told.level == 1
 
-    bench.until(counted, with_header(jpeg_window(), **changes))
+    bench.until(counted, jpeg_window(**changes))
     assert set(bench.node.published) == {"/diagnostics"}
     bench.until(lambda: bench.out("~/top/image/compressed") and bench.diagnostic(1).level == 0, jpeg_window())
 
@@ -269,7 +247,10 @@ def test_a_dead_node_shows_and_one_that_is_started_again_is_read_again(
     monkeypatch.undo()
     bench.start()
     before = len(bench.out("~/top/depth"))
-    bench.until(lambda: len(bench.out("~/top/depth")) > before, with_header(depth(), boot_id=OTHER_BOOT))
+    bench.until(
+        lambda: len(bench.out("~/top/depth")) > before,
+        replace(depth(), header=replace(depth().header, boot_id=OTHER_BOOT)),
+    )
     bench.until(lambda: bench.diagnostic(0).level == 0 and bench.diagnostic(1).counts["depth.restarts"] == "1")
 
 
@@ -324,30 +305,22 @@ def test_a_wrong_parameter_ends_the_program_with_a_line(monkeypatch: pytest.Monk
         bridge.main()
 
 
-def imported(path: Path) -> set[str]:
-    """Top-level packages that a file imports; its syntax is that of Python 3.10, which Humble has."""
-    ast.parse(path.read_text(), feature_version=(3, 10))
-    return set(re.findall(r"^(?:from|import) (\w+)", path.read_text(), re.MULTILINE)) - set(sys.stdlib_module_names)
-
-
-def test_the_package_is_complete(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_package_is_complete_and_imports_what_it_declares(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "setuptools", setuptools := MagicMock())
     runpy.run_path(str(PACKAGE / "setup.py"))
-    setup = setuptools.setup.call_args.kwargs
-    manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()
-    assert [manifest.findtext(key) for key in ("name", "version", "export/build_type")] == [
-        setup["name"], setup["version"], "ament_python"
-    ]  # fmt: skip
+    setup, manifest = setuptools.setup.call_args.kwargs, ElementTree.parse(PACKAGE / "package.xml").getroot()
+    told = [manifest.findtext(key) for key in ("name", "version", "export/build_type")]
+    assert told == [setup["name"], setup["version"], "ament_python"]
     data = dict(setup["data_files"])
-    assert [name for names in data.values() for name in names if not (PACKAGE / name).is_file()] == []
-    assert data["share/ament_index/resource_index/packages"] == ["resource/gcd_views"]
-    assert "package.xml" in data["share/gcd_views"]
-    (script,) = setup["entry_points"]["console_scripts"]
-    name, _, target = script.partition(" = ")
-    assert EntryPoint(name, target, "console_scripts").load() is bridge.main
-    needed = set[str]().union(*map(imported, [*PACKAGE.glob("gcd_views/*.py"), *PACKAGE.glob("launch/*.py")]))
+    assert all((PACKAGE / name).is_file() for names in data.values() for name in names)
+    assert {"share/ament_index/resource_index/packages", "share/gcd_views/launch"} <= set(data)
+    assert setup["entry_points"]["console_scripts"] == ["gcd_views = gcd_views.bridge:main"]
+    needed = set[str]()
+    for path in [*PACKAGE.glob("gcd_views/*.py"), *PACKAGE.glob("launch/*.py")]:
+        ast.parse(path.read_text(), feature_version=(3, 10))  # which Humble has
+        needed |= set(re.findall(r"^(?:from|import) (\w+)", path.read_text(), re.MULTILINE))
     declared = {each.text for each in manifest.findall("exec_depend")}
-    assert needed - {"gcd_views", "gcd_client", "numpy"} <= declared
+    assert needed - set(sys.stdlib_module_names) - {"gcd_views", "gcd_client", "numpy"} <= declared
     assert {"gcd-client", "numpy"} <= set(setup["install_requires"])
 
 
@@ -360,16 +333,13 @@ def test_the_launch_file_starts_the_package_with_parameters_it_knows(
         monkeypatch.setitem(sys.modules, f"launch{name}", ros)
     launch = runpy.run_path(str(PACKAGE / "launch" / "gcd_views.launch.py"))
     launch["generate_launch_description"]()
-    node, declared = ros.Node.call_args.kwargs, ros.DeclareLaunchArgument.call_args_list
+    node = ros.Node.call_args.kwargs
     assert (node["package"], node["executable"]) == ("gcd_views", "gcd_views")
-    assert {each.args[0] for each in declared} == set(launch["ARGUMENTS"])
-    (values,) = node["parameters"]
     known = set[str]()
     monkeypatch.setattr(RosNode, "parameters", SimpleNamespace(get=lambda name, default: known.add(name) or default))
     bridge.GcdViews().stop()
-    assert set(values) <= known
+    assert {"data", "keys", "node_key"} <= set(node["parameters"][0]) <= known
     parts = ros.PythonExpression.call_args_list[0].args[0]
-    assert {"keys", "node_key"} <= set(values)
     for folder, host, endpoint in (
         ("", "", "ipc"),
         ("/run/gcd/left", "", "ipc:///run/gcd/left/data"),

@@ -17,11 +17,6 @@ pytest_plugins = ["pytester"]
 pytestmark = pytest.mark.timeout(60)
 
 ROOT = Path(__file__).parents[2]
-TEST = """
-def test_drive(gcd_replay):
-    run = gcd_replay("launch.toml", {settings})
-    run.assert_same_as("golden/drive"{bounds})
-"""
 
 
 @pytest.fixture
@@ -35,67 +30,63 @@ def project(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytes
     return pytester
 
 
-def outcome(project: pytest.Pytester, settings: dict[str, object], bounds: str = "", *options: str) -> pytest.RunResult:
-    project.makepyfile(TEST.format(settings=settings, bounds=bounds))
+def run_test(project: pytest.Pytester, *options: str, settings: object = None, bounds: str = "") -> pytest.RunResult:
+    project.makepyfile(f"""
+        def test_drive(gcd_replay):
+            gcd_replay("launch.toml", {settings}).assert_same_as("golden/drive"{bounds})
+    """)
     return project.runpytest_inprocess("-p", "gcd_node.testing", *options)
 
 
 def test_a_golden_run_is_asked_for_made_and_then_met(project: pytest.Pytester) -> None:
-    result = outcome(project, {})
+    result = run_test(project)
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*no golden run at *golden/drive: make one with `pytest --gcd-update`*"])
-    made = outcome(project, {}, "", "--gcd-update")
-    made.assert_outcomes(passed=1)
-    made.stdout.fnmatch_lines(["gcd-node: renewed the golden run *golden/drive"])
-    outcome(project, {}).assert_outcomes(passed=1)
-    tests = project.mkdir("tests")  # paths are meant from the root of the project
-    (tests / "test_drive.py").write_text(TEST.format(settings={}, bounds=""))
+    run_test(project, "--gcd-update").assert_outcomes(passed=1)
+    run_test(project).assert_outcomes(passed=1)
+    (moved,) = project.path.glob("test_*.py")
+    moved.rename(project.mkdir("tests") / moved.name)  # paths are meant from the root of the project
     result = project.runpytest_inprocess("-p", "gcd_node.testing", "--rootdir", str(project.path), "tests")
     result.assert_outcomes(passed=1)
 
 
 def test_a_run_that_differs_fails_with_causes_and_passes_if_near_enough(project: pytest.Pytester) -> None:
-    outcome(project, {}, "", "--gcd-update")
-    result = outcome(project, {"model.steps": 3}, ", min_psnr=45.0")
+    run_test(project, "--gcd-update")
+    result = run_test(project, settings={"model.steps": 3}, bounds=", min_psnr=45.0")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         [
             "*DIFFERENT: 3 of 3 views are not within 45 dB in every frame",
             "*config model.steps: 1, 3",
-            "*first divergence: window 0, view main: 42.11 dB*the same pictures*",
+            "*first divergence: window 0, view main: *42.11 dB*the same pictures*",
         ]
     )
-    outcome(project, {"model.steps": 3}, ", min_psnr=40.0").assert_outcomes(passed=1)
+    run_test(project, settings={"model.steps": 3}, bounds=", min_psnr=40.0").assert_outcomes(passed=1)
 
 
 def test_settings_are_what_they_are_in_python(project: pytest.Pytester) -> None:
-    outcome(project, {}, "", "--gcd-update")
-    same: dict[str, object] = {"source.kind": "synthetic", "model.guidance": [1.0, 2.0], "node_id": "4"}
-    outcome(project, same).assert_outcomes(passed=1)
-    outcome(project, {"model.stepps": 4}).stdout.fnmatch_lines(["*ConfigError: *`steps`*"])
+    run_test(project, "--gcd-update")
+    same = {"source.kind": "synthetic", "model.guidance": [1.0, 2.0], "node_id": "4"}
+    run_test(project, settings=same).assert_outcomes(passed=1)
+    run_test(project, settings={"model.stepps": 4}).stdout.fnmatch_lines(["*ConfigError: *`steps`*"])
 
 
-def test_an_update_renews_what_differs_or_is_damaged_and_leaves_what_does_not(project: pytest.Pytester) -> None:
-    outcome(project, {}, "", "--gcd-update")
-    manifest = project.path / "golden" / "drive" / MANIFEST
-    first = manifest.read_bytes()
-    outcome(project, {}, "", "--gcd-update").stdout.no_fnmatch_line("*renewed*")
-    assert manifest.read_bytes() == first
-    manifest.write_text("{")
-    outcome(project, {}).stdout.fnmatch_lines(["*DamagedRunError*"])
-    outcome(project, {"model.steps": 2}, "", "--gcd-update").assert_outcomes(passed=1)
-    outcome(project, {"model.steps": 2}).assert_outcomes(passed=1)
-    assert [path.name for path in manifest.parent.parent.iterdir()] == ["drive"]
-
-
-def test_an_update_never_removes_a_folder_that_is_no_run(project: pytest.Pytester) -> None:
+def test_an_update_makes_a_run_anew_byte_for_byte_or_in_place_of_a_damaged_one_and_removes_nothing_else(
+    project: pytest.Pytester,
+) -> None:
     mine = project.path / "golden" / "drive" / "mine.txt"
     mine.parent.mkdir(parents=True)
     mine.touch()
-    result = outcome(project, {}, "", "--gcd-update")
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*OutputError*no golden run*"])
-    assert mine.exists()
+    run_test(project, "--gcd-update").stdout.fnmatch_lines(["*OutputError*no empty folder*"])
+    mine.unlink()
+    run_test(project, "--gcd-update").assert_outcomes(passed=1)
+    first = {path.name: path.read_bytes() for path in mine.parent.rglob("*.*")}
+    run_test(project, "--gcd-update")
+    assert {path.name: path.read_bytes() for path in mine.parent.rglob("*.*")} == first
+    (mine.parent / MANIFEST).write_text("{")
+    run_test(project).stdout.fnmatch_lines(["*DamagedRunError*"])
+    run_test(project, "--gcd-update", settings={"model.steps": 2}).assert_outcomes(passed=1)
+    run_test(project, settings={"model.steps": 2}).assert_outcomes(passed=1)
 
 
 def test_the_plugin_brings_no_model_into_a_session_that_replays_nothing(pytester: pytest.Pytester) -> None:
