@@ -23,10 +23,10 @@ OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "w
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
-    ("gcd_node", 59, 14_236),
-    ("tests/node", 83, 15_132),
-    ("train/gcd_train", 149, 31_642),
-    ("tests/train", 90, 15_733),
+    ("gcd_node", 59, 13_667),
+    ("tests/node", 83, 14_664),
+    ("train/gcd_train", 148, 31_009),
+    ("tests/train", 90, 15_600),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 
