@@ -11,10 +11,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError
-from gcd_train.layouts.scene_writer import SceneFormat, SceneRun, generate_scenes, write_scene_sheet
+from gcd_train.layouts.scene_writer import SceneFormat, SceneRun, generate_scenes
 from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, driving_world, orbit_world
-from gcd_train.scenes.pair_writer import generate, write_contact_sheet
+from gcd_train.scenes.pair_writer import generate
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
@@ -34,7 +34,6 @@ Pairs = Annotated[bool, typer.Option("--pairs", help="Pairs of clips in shards, 
 Clips = Annotated[int | None, typer.Option(min=1, help="How many pairs: implies --pairs; by default 100.")]
 ClipsPerScene = Annotated[int, typer.Option(min=1, help="Pairs: how many are cut from one simulation.")]
 ClipsPerShard = Annotated[int, typer.Option(min=1, help="Pairs a file.")]
-Sheet = Annotated[Path | None, typer.Option(help="Also draw the first scenes into this PNG.")]
 
 
 @app.callback()
@@ -62,17 +61,16 @@ def _orbited(name: str, about: str) -> None:
         height: Height = None,
         clips_per_scene: ClipsPerScene = 3,
         clips_per_shard: ClipsPerShard = 24,
-        contact_sheet: Sheet = None,
     ) -> None:
         with errors_shown():
             world, place = SCENE_WORLDS[name], _one_folder(folder, out)
             if _wants_pairs(pairs, clips, scenes, compact):
                 form = _pair_form(width, height, frames, oversample, clips_per_shard)
                 made = orbit_world(world, form, clips_per_scene=clips_per_scene)
-                _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
+                _make_pairs(place, made, made.seeds_of(first_seed, clips or 100), workers, ray)
                 return
             form = _form(world, compact, oversample, frames, width, height)
-            _make_scenes(world, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+            _make_scenes(world, place, form, _seeds(first_seed, scenes), workers, ray)
 
 
 _ORBITED = """%s, seen by 16 cameras, in Kubric-4D's layout (60 frames at 24 Hz).
@@ -103,7 +101,6 @@ def driving(
     ),
     mount_height: Annotated[float, typer.Option(help="Pairs: true height of the source camera, metres.")] = 1.55,
     mount_tilt: Annotated[float, typer.Option(help="Pairs: true tilt of the source camera, degrees down.")] = 0.0,
-    contact_sheet: Sheet = None,
 ) -> None:
     """Road scenes. Whole, in ParallelDomain-4D's layout (19 cameras, 50 frames at 10 Hz), with OUT or --scenes.
 
@@ -116,11 +113,11 @@ def driving(
         if _wants_pairs(told, clips, scenes, compact):
             form = _pair_form(width, height, frames, oversample, clips_per_shard)
             world = driving_world(form, mount, path)
-            _make_pairs(place, world, world.seeds_of(first_seed, clips or 100), workers, ray, contact_sheet)
+            _make_pairs(place, world, world.seeds_of(first_seed, clips or 100), workers, ray)
             return
         drive = SCENE_WORLDS["driving"]
         form = _form(drive, compact, oversample, frames, width, height)
-        _make_scenes(drive, place, form, _seeds(first_seed, scenes), workers, ray, contact_sheet)
+        _make_scenes(drive, place, form, _seeds(first_seed, scenes), workers, ray)
 
 
 @app.command()
@@ -204,7 +201,6 @@ def _make_scenes(
     seeds: range,
     workers: int | None,
     ray: str | None,
-    sheet: Path | None,
 ) -> None:
     """Exit code: that of the last failure, 0 without."""
     stop_as_by_ctrl_c()
@@ -220,18 +216,12 @@ def _make_scenes(
             bar.update(task, completed=run.done, rate=rate)
     for line in run.lines():
         say(line)
-    if sheet is not None and run.written + run.there:
-        write_scene_sheet([out / world.scene_name(seed) for seed in seeds], sheet)
     if run.failures:
         raise typer.Exit(run.exit_code)
 
 
-def _make_pairs(
-    out: Path, world: World, seeds: range, workers: int | None, ray: str | None, sheet: Path | None
-) -> None:
+def _make_pairs(out: Path, world: World, seeds: range, workers: int | None, ray: str | None) -> None:
     stop_as_by_ctrl_c()
     with progress_bar("clips", len(seeds), keep=True) as show:
         for done in generate(out, world, seeds, workers or os.cpu_count() or 1, ray):
             show(done)
-    if sheet is not None:
-        write_contact_sheet(out, sheet)

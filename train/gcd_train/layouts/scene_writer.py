@@ -1,25 +1,19 @@
-"""Makes scenes of a world and writes them whole: pictures, metadata, geometry, manifest; and a picture of them."""
+"""Makes scenes of a world and writes them whole: pictures, metadata, geometry, manifest."""
 
 import io
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.small_files import read_json
-from gcd_train.data.files import read_npz
 from gcd_train.errors import DataError, RecipeError, TrainError
-from gcd_train.files import new_folder, remove_leftovers, write_whole
-from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.layouts.encodings import stored_depth
+from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.layouts.kubric4d import Kubric4DWriter
 from gcd_train.layouts.manifest import (
     GEOMETRY,
@@ -39,7 +33,6 @@ from gcd_train.scenes.worlds import SceneWorld
 
 GIVE_UP_AFTER = 5
 """Failures in a row after which a run stops: the disk is full, or nothing can be drawn."""
-_SHEET_ROWS, _SHEET_WIDTH = 8, 320
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -215,71 +208,3 @@ def generate_scenes(
         yield run
         if run.gave_up:
             return
-
-
-def write_scene_sheet(scenes: Sequence[Path], out: Path) -> None:
-    """First, middle and last frame of one camera, two others, depth and labels, of the first 8 scenes, as PNG.
-
-    Raises:
-        DataError: none of the scenes is there, or a picture cannot be read.
-        RunError: the sheet cannot be written.
-    """
-    there = [scene for scene in scenes if (scene / MANIFEST).exists()][:_SHEET_ROWS]
-    if not there:
-        raise DataError(f"there is no finished scene to draw into {out.name}; look at the failures above")
-    rows = [np.concatenate([_small(picture) for picture in _row(scene)], axis=1) for scene in there]
-    _, data = cv2.imencode(".png", np.concatenate([row for row in rows if row.shape == rows[0].shape]))
-    write_whole(out, data.tobytes())
-
-
-def _row(scene: Path) -> Iterator[NDArray[np.uint8]]:
-    """BGR pictures, read back from the scene's files."""
-    manifest = read_manifest(scene)
-    last = manifest.frames - 1
-    on_stage = manifest.layout == "kubric4d"
-    names: Any = kubric4d if on_stage else parallel_domain4d
-    colour, ids = ("rgba", "segmentation") if on_stage else ("rgb", "semantic_segmentation_2d")
-    cameras = (4, 0, 9) if on_stage else (parallel_domain4d.FORWARD, "yaw-60", "camera0")
-    first, second, third = (n if isinstance(n, str) or n < len(manifest.cameras) else 0 for n in cameras)
-
-    def path(camera: int | str, layer: str, step: int) -> Path:
-        return names.frame_path(scene, camera, layer, step, compact=manifest.compact)
-
-    for camera, step in ((first, 0), (first, manifest.frames // 2), (first, last), (second, last), (third, last)):
-        yield _read(path(camera, colour, step), cv2.IMREAD_COLOR_BGR).astype(np.uint8)
-    metres = _metres(path(first, "depth", last))
-    near = np.float32(np.percentile(metres, 2))
-    yield np.repeat((255 * near / np.maximum(metres, near)).astype(np.uint8)[..., None], 3, -1)
-    labels = _read(path(first, ids, last), cv2.IMREAD_COLOR_BGR).astype(np.uint8)
-    yield labels if on_stage else _class_colours(scene)[labels[..., 2]]
-
-
-def _read(path: Path, flag: int) -> NDArray[np.generic]:
-    picture = cv2.imread(str(path), flag)
-    if picture is None:
-        raise DataError(f"{path} cannot be read; delete the scene and generate it again")
-    return picture
-
-
-def _metres(path: Path) -> NDArray[np.float32]:
-    if path.suffix == ".npz":
-        return read_npz(path)[parallel_domain4d.DEPTH_KEY].astype(np.float32)
-    stored = _read(path, cv2.IMREAD_UNCHANGED)
-    metres = stored_depth(stored) if path.suffix == ".png" else np.asarray(stored, np.float32)
-    if metres is None:
-        raise DataError(f"{path} holds no depth codes, but {stored.dtype} {list(stored.shape)}; remove the scene")
-    return metres
-
-
-def _class_colours(scene: Path) -> NDArray[np.uint8]:
-    """BGR by class id, [256, 3]."""
-    palette = np.zeros((256, 3), np.uint8)
-    for ontology in parallel_domain4d.ontology_folder(scene).glob("*.json"):
-        for item in read_json(ontology, dict[str, Any])["items"]:
-            palette[item["id"]] = [item["color"][channel] for channel in "bgr"]
-    return palette
-
-
-def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height = round(_SHEET_WIDTH * picture.shape[0] / picture.shape[1])
-    return np.asarray(cv2.resize(picture, (_SHEET_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -25,11 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model.geometry import CameraMount
-from gcd_train.data.pairs import PairedClips
 from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RenderError
-from gcd_train.files import write_whole
-from gcd_train.look.clip import instance_colour
 from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene, rotations
 from gcd_train.scenes.driving import driving_scene
@@ -227,23 +224,3 @@ def _orbit(draw: Draw) -> Orbit:
         change=(azimuth_deg, elevation_deg, radius_m),
         frame_numbers=draw.frame_numbers,
     )
-
-
-def write_contact_sheet(folder: Path, out: Path, clips: int = 8) -> None:
-    """Source, target on its way and at its end, depth and classes of the first clips, one row a clip, as PNG.
-
-    Instances stand for the classes where the world has none.
-    """
-    data = PairedClips.open(folder, limit=clips)
-    colours = [kind.colour for kind in data.classes] or [instance_colour(number) for number in range(256)]
-    rows: list[NDArray[np.uint8]] = []
-    for clip in (data[number] for number in range(len(data))):
-        last = len(clip.target) - 1
-        far = clip.target_depth[last]
-        near = np.where(far > 0, 1 / np.maximum(far, 4.0), 0.0)
-        depth = np.repeat((near * 4 * 255).astype(np.uint8)[..., None], 3, -1)
-        labels = (clip.target_classes if data.classes else clip.target_instances)[last]
-        views = [clip.source[0], clip.source[last], *(clip.target[min(time, last)] for time in (0, 7, 13))]
-        rows.append(np.concatenate([*views, depth, np.array(colours, np.uint8)[labels]], axis=1))
-    _, picture = cv2.imencode(".png", np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    write_whole(out, picture.tobytes())
