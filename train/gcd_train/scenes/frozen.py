@@ -1,11 +1,10 @@
-"""A scene ready to draw: its triangles, where their bodies are, and which of them a view can leave out.
+"""A scene ready to draw: its triangles and where their bodies are.
 
 A scene folder keeps one as a file, so that a target view can be drawn exactly along any path, without simulating
 anything again.
 """
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from operator import attrgetter
@@ -21,7 +20,6 @@ from gcd_train.data.files import read_npz
 from gcd_train.errors import DataError
 from gcd_train.scenes.description import (
     DOMES,
-    STATIC,
     STREET,
     Colour,
     Extent,
@@ -48,10 +46,6 @@ VERTEX = np.dtype(
 Vertices = NDArray[np.void]
 
 _FORMAT = 2
-_CELL_M = 16.0
-"""Side of the squares on the ground by which what stands still is parted."""
-_SLACK_M = 0.01
-"""Added to every sphere: OpenGL places corners with 24 bits, here they are placed with 53."""
 
 
 class _Facts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -203,75 +197,9 @@ def runs_of(vertices: Vertices) -> list[Run]:
 
 def indexed(vertices: Vertices) -> tuple[Vertices, NDArray[np.int32]]:
     """Each vertex once, in the order of their first use, and which of them the triangles take: neighbours share."""
-    first, rank = _ranked(vertices)
-    return vertices[first], rank.astype(np.int32)
-
-
-def _ranked(rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows that differ, numbered as they first come: where each first stands, and the number of every row."""
-    raw = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * math.prod(rows.shape[1:]))))
+    raw = np.ascontiguousarray(vertices).view(np.dtype((np.void, VERTEX.itemsize)))
     _, first, which = np.unique(raw, return_index=True, return_inverse=True)
     order = np.argsort(first)
-    rank = np.empty_like(order)
+    rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order))
-    return first[order], rank[which.reshape(-1)]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Groups:
-    """Triangles that follow each other, are painted alike, ride on one body and stand near each other.
-
-    A camera on a street sees a quarter of a scene, the shadow map about half. What is left out lies outside of the
-    picture: the pictures are the same to the pixel.
-
-    ends: [G + 1] int, group g has the vertices ends[g] to ends[g + 1]. body: [G] int. centre: [G, 3], metres in the
-    body's frame, and radius: [G], metres, of a sphere that holds the group.
-    """
-
-    ends: NDArray[np.int64]
-    body: NDArray[np.int64]
-    centre: NDArray[np.float64]
-    radius: NDArray[np.float64]
-
-    def placed(self, poses: Floats) -> NDArray[np.float64]:
-        """Where the spheres are when the bodies are at `poses` [B, 3, 4] (world_from_body): [G, 3], metres."""
-        rows = poses[self.body].astype(np.float64)
-        return (rows[..., :3] @ self.centre[..., None])[..., 0] + rows[..., 3]
-
-    def within(self, clip_from_world: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which groups reach into the picture of a projection [4, 4], at `places` as `placed` gives them: bool [G]."""
-        last = clip_from_world[3]
-        planes = np.concatenate([last + clip_from_world[:3], last - clip_from_world[:3]])  # each >= 0 within [6, 4]
-        planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-        inside = places @ planes[:, :3].T + planes[:, 3]  # metres from each side of the picture [G, 6]
-        return (inside >= -self.radius[:, None]).all(1)
-
-    def stretches(self, shown: NDArray[np.bool_], first: int, count: int) -> Iterator[tuple[int, int]]:
-        """Of `count` vertices from `first`, whole groups, those `shown` [G]: first vertex and number of each piece."""
-        start, stop = np.searchsorted(self.ends, (first, first + count))
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], shown[start:stop], [False]])))
-        at = self.ends[start + edges].tolist()
-        for begin, end in zip(at[::2], at[1::2], strict=True):
-            yield begin, end - begin
-
-
-def grouped(vertices: Vertices, runs: Sequence[Run]) -> tuple[Vertices, Groups]:
-    """Vertices with those of a group beside each other, within the runs that they are drawn in, and the groups.
-
-    vertices: [N], runs: as `runs_of` gives them. Groups stand in the order of their first triangle.
-    """
-    triangles = vertices.reshape(-1, 3)
-    body = triangles["tags"][:, 0, 2].astype(np.int64)
-    cell = np.floor(triangles["position"][:, 0, :2] / _CELL_M).astype(np.int64) * (body == STATIC)[:, None]
-    run = np.repeat(np.arange(len(runs)), [each.count // 3 for each in runs])
-    first, group = _ranked(np.stack([run, body, cell[:, 0], cell[:, 1]], 1))
-    together = triangles[np.argsort(group, kind="stable")]
-    counts = 3 * np.bincount(group, minlength=len(first))
-    ends = np.concatenate([[0], np.cumsum(counts)])
-    corners, centre, radius = together["position"].reshape(-1, 3).astype(np.float64), np.empty((0, 3)), np.empty(0)
-    if len(first):
-        starts = ends[:-1]
-        centre = (np.minimum.reduceat(corners, starts) + np.maximum.reduceat(corners, starts)) / 2
-        away = np.linalg.norm(corners - np.repeat(centre, counts, axis=0), axis=1)
-        radius = np.maximum.reduceat(away, starts) + _SLACK_M
-    return together.reshape(-1), Groups(ends=ends, body=body[first], centre=centre, radius=radius)
+    return vertices[first[order]], rank[which.reshape(-1)]

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Extent, Floats, Light, Scene
-from gcd_train.scenes.frozen import VERTEX, FrozenScene, Groups, Run, freeze, grouped, indexed, runs_of
-from gcd_train.scenes.shaders import SHADELESS, SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
+from gcd_train.scenes.frozen import VERTEX, FrozenScene, Run, freeze, indexed, runs_of
+from gcd_train.scenes.shaders import SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
 
 
@@ -96,16 +96,11 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Uploaded:
-    """A scene in the context's memory: its triangles as each way of painting reads them, and as the shadow map does.
-
-    groups: which of them stand together. casting: bool [G], those that may cast a shadow.
-    """
+    """A scene in the context's memory: its triangles as each way of painting reads them, and as the shadow map does."""
 
     buffers: tuple[Any, Any]
-    groups: Groups
     runs: tuple[tuple[Run, Any], ...]
     shadow: Any
-    casting: NDArray[np.bool_]
 
     def release(self) -> None:
         for resource in (*(array for _, array in self.runs), self.shadow, *self.buffers):
@@ -163,14 +158,13 @@ class Renderer:
             self._set_scene(scene.light, scene.extent)
         try:
             for step in range(scene.frames):
-                places = drawn.groups.placed(scene.poses[step])
                 with self._context:
                     self._move(scene.poses[step])
-                    self._cast(scene, step, drawn, places)
+                    self._cast(scene, step, drawn)
                 for name, poses in cameras.items():
                     with self._context:
                         lens_deg = scene.hfov_deg if hfov_deg is None else hfov_deg[name]
-                        view = self._view(poses[step], lens_deg, scene.extent, drawn, places)
+                        view = self._view(poses[step], lens_deg, scene.extent, drawn)
                     yield step, name, view
         finally:
             with self._context:
@@ -178,15 +172,12 @@ class Renderer:
 
     def _uploaded(self, scene: FrozenScene) -> "_Uploaded":
         runs = runs_of(scene.vertices)
-        vertices, groups = grouped(scene.vertices, runs)
-        corners, indices = indexed(vertices)
+        corners, indices = indexed(scene.vertices)
         buffer, index = self._context.buffer(corners.tobytes()), self._context.buffer(indices.tobytes())
         return _Uploaded(
             buffers=(buffer, index),
-            groups=groups,
             runs=tuple((run, self._array(buffer, index, run)) for run in runs),
             shadow=self._context.vertex_array(self._shadow_program, [_taking(buffer, "position", "tags")], index),
-            casting=~np.isin(vertices["tags"][groups.ends[:-1], 3], SHADELESS),
         )
 
     def _array(self, buffer: Any, index: Any, run: Run) -> Any:
@@ -220,25 +211,18 @@ class Renderer:
         self._bodies.write(rows.tobytes())
         self._bodies.use(0)
 
-    def _cast(self, scene: FrozenScene, step: int, drawn: _Uploaded, places: NDArray[np.float64]) -> None:
+    def _cast(self, scene: FrozenScene, step: int, drawn: _Uploaded) -> None:
         sun_to, focus = np.asarray(scene.light.sun_to), scene.focus[step].astype(np.float64)
         light_from_world = sunlight_from_world(sun_to, focus, scene.extent)
         self._shadow_target.use()
         self._context.enable_only(self._context.DEPTH_TEST)
         self._shadow_target.clear(depth=1.0)
         _set(self._shadow_program, clip_from_world=light_from_world, bodies=0)
-        shown = drawn.groups.within(light_from_world, places) & drawn.casting
-        for first, count in drawn.groups.stretches(shown, 0, int(drawn.groups.ends[-1])):
-            drawn.shadow.render(vertices=count, first=first)
+        drawn.shadow.render()
         self._frame["light_from_world"] = light_from_world.T.ravel()
 
     def _view(
-        self,
-        world_from_camera: NDArray[np.float64],
-        hfov_deg: float,
-        extent: Extent,
-        drawn: _Uploaded,
-        places: NDArray[np.float64],
+        self, world_from_camera: NDArray[np.float64], hfov_deg: float, extent: Extent, drawn: _Uploaded
     ) -> Rendering:
         self._target.use()
         self._context.enable_only(self._context.DEPTH_TEST | self._context.CULL_FACE)
@@ -251,10 +235,8 @@ class Renderer:
         self._frame["ahead"][:3] = world_from_camera[:3, 2]
         self._frame_block.write(self._frame.tobytes())
         self._frame_block.bind_to_uniform_block(0)
-        shown = drawn.groups.within(clip_from_world, places)
         for run, array in drawn.runs:
-            for first, count in drawn.groups.stretches(shown, run.first, run.count):
-                array.render(vertices=count, first=first)
+            array.render(vertices=run.count, first=run.first)
         return self._read()
 
     def _read(self) -> Rendering:
