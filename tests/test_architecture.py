@@ -25,8 +25,8 @@ MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_expor
 MOST = [
     ("gcd_node", 59, 13_667),
     ("tests/node", 83, 14_664),
-    ("train/gcd_train", 148, 31_009),
-    ("tests/train", 90, 15_600),
+    ("train/gcd_train", 148, 30_811),
+    ("tests/train", 89, 15_441),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 
