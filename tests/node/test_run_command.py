@@ -14,19 +14,12 @@ from gcd_node.config import LifeConfig, ModelSection
 from gcd_node.session import load_model, model_threads
 
 
-def test_a_network_takes_half_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_takes_half_the_cores_or_so_many_threads_as_is_stated_and_opencv_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for cores, threads in ((1, 1), (2, 1), (8, 4)):
-        ours = set(range(cores))
-
-        def affinity(_: int, ours: set[int] = ours) -> set[int]:
-            return ours
-
-        monkeypatch.setattr(os, "sched_getaffinity", affinity)
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
         assert model_threads(ModelSection(weights="fake")) == threads
-        assert model_threads(ModelSection(weights="fake", threads=3)) == 3
-
-
-def test_a_loaded_model_and_the_pictures_around_it_are_computed_on_so_many_threads() -> None:
     before = torch.get_num_threads(), cv2.getNumThreads()
     wanted = max(before) + 1
     try:
