@@ -4,10 +4,9 @@ import io
 import json
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from gcd_node.errors import OutputError
 from gcd_node.health import Health, Level
 from gcd_node.image_io import ViewSaver
 from gcd_node.publisher import Publisher
+from gcd_node.sources.files import read_picture
 
 pytestmark = pytest.mark.timeout(60)
 SEEN = np.random.default_rng(0).integers(0, 3, (2, 16, 16), np.uint8)
@@ -47,10 +47,6 @@ def received(message: ViewMessage, *, skipped: int = 0) -> ReceivedView:
     return ReceivedView(message=message, age_ms=40.0, expired=False, skipped=skipped, restarted=False)
 
 
-def picture(path: Path) -> np.ndarray:
-    return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-
-
 def read_video(path: Path) -> np.ndarray:
     video = cv2.VideoCapture(str(path))
     frames = []
@@ -61,25 +57,16 @@ def read_video(path: Path) -> np.ndarray:
 
 def watch(folder: Path, options: list[str], *messages: ViewMessage | EndMessage, readers: int = 1) -> int:
     """The exit code of `gcd-node view` beside a publisher that sends these."""
-    codes: list[int] = []
     command = ["view", f"ipc://{folder}/data", "--timeout", "20", *options]
-    opened = partial(
-        Publisher,
-        PublishConfig(data=command[1], status=command[1] + ".status", min_subscribers=readers, end_delay_ms=0),
-        lockstep=True,
-        drain_ms=3000,
-    )
-    with opened() as publisher:
-        thread = threading.Thread(target=lambda: codes.append(run_app(command)), daemon=True)
-        thread.start()
+    endpoints = PublishConfig(data=command[1], status=command[1] + ".status", min_subscribers=readers, end_delay_ms=0)
+    with ThreadPoolExecutor() as pool, Publisher(endpoints, lockstep=True, drain_ms=3000) as publisher:
+        code = pool.submit(run_app, command)
         for message in messages:
             if isinstance(message, EndMessage):
                 publisher.end(message)
             else:
                 publisher.send(message)
-        thread.join(30)
-    (code,) = codes
-    return code
+        return code.result(30)
 
 
 def test_a_table_has_the_figures_of_each_topic() -> None:
@@ -107,16 +94,18 @@ def test_saved_pictures_and_video_are_the_published_pixels(tmp_path: Path, capsy
         *("top/000000_00.png", "top/000000_01.png", "top/000001_00.png", "top/000001_01.png"),
     ]
     assert np.array_equal(read_video(out / "top.mkv"), np.concatenate(sent))
-    assert np.array_equal(picture(out / "top" / "000001_01.png"), sent[1][1])
+    assert np.array_equal(read_picture(out / "top" / "000001_01.png"), sent[1][1])
 
 
-def test_a_watch_for_hatching_takes_windows_with_their_visibility(tmp_path: Path) -> None:
-    image = pixels(0, height=16, width=16)
-    messages = (window(0, images=image), class_map(0), visibility(0, seen=SEEN), end(), end(kind="vis"))
+def test_windows_whose_own_visibility_came_are_saved_hatched_too(tmp_path: Path) -> None:
+    shown = [pixels(i, height=16, width=16) for i in range(3)]
+    seen = [visibility(0, seen=SEEN), visibility(5, seen=SEEN)]  # the second is of another window
+    first, second, third = (window(i, images=images) for i, images in enumerate(shown))
+    messages = (first, class_map(0), seen[0], second, seen[1], third, end(), end(kind="vis"))
     options = ["--view", "top", "--hatch", "--save", str(tmp_path / "out")]
     assert watch(tmp_path, options, *messages, readers=2) == 0
-    assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), image)
-    assert np.array_equal(read_video(tmp_path / "out" / "top" / "hatched.mkv"), hatched(image, SEEN))
+    assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), np.concatenate(shown))
+    assert np.array_equal(read_video(tmp_path / "out" / "top" / "hatched.mkv"), hatched(shown[0], SEEN))
 
 
 def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Path) -> None:
@@ -130,10 +119,10 @@ def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Pa
     assert saver.files == len([path for path in tmp_path.rglob("*.*") if path.is_file()])
     folder = tmp_path / "top" / "cls"
     assert np.array_equal(np.load(folder / "000001.npy"), drawn[1])
-    shown = picture(folder / "000001_01.png")
+    shown = read_picture(folder / "000001_01.png")
     assert all((shown[drawn[1][1] == each.id] == each.colour).all() for each in CLASSES)
     assert np.array_equal(read_video(tmp_path / "top" / "cls.mkv")[3], shown)
-    legend = picture(folder / "legend.png").reshape(-1, 3)
+    legend = read_picture(folder / "legend.png").reshape(-1, 3)
     assert {each.colour for each in CLASSES} <= {tuple(pixel) for pixel in legend.tolist()}
     assert len(read_video(tmp_path / "top.mkv")) == 4
     assert np.array_equal(np.load(tmp_path / "top" / "vis" / "000002.npy"), SEEN)
@@ -141,17 +130,6 @@ def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Pa
     metres = 1 / np.load(tmp_path / "top" / "depth" / "000002.npy")
     assert metres.dtype == np.float32
     assert np.allclose(metres, 10, rtol=1e-3)
-
-
-def test_only_windows_whose_own_visibility_came_are_saved_hatched(tmp_path: Path) -> None:
-    shown = [pixels(i, height=16, width=16) for i in range(2)]
-    with ViewSaver(tmp_path, hatch=True) as saver:
-        saver.add(received(window(0, images=shown[0])))
-        saver.add(received(visibility(0, seen=SEEN)))
-        saver.add(received(window(1, images=shown[1])))
-        saver.add(received(visibility(5, seen=SEEN)))  # of another window
-    assert np.array_equal(read_video(tmp_path / "top.mkv"), np.concatenate(shown))
-    assert np.array_equal(read_video(tmp_path / "top" / "hatched.mkv"), hatched(shown[0], SEEN))
 
 
 def test_a_view_that_changes_its_size_and_a_folder_that_cannot_be_written_are_errors(tmp_path: Path) -> None:
@@ -250,62 +228,30 @@ def test_whatever_a_node_says_is_drawn_without_harm(fields: dict[str, Any]) -> N
     assert json.loads(json.dumps(board.record(10.0)))["node_id"] == "robot_7"
 
 
-@pytest.fixture
-def endpoint(tmp_path: Path) -> str:
-    return f"ipc://{tmp_path}/status"
-
-
-@pytest.fixture
-def silence(endpoint: str) -> Iterator[Callable[[], None]]:
-    """A node that repeats its status, meta and an event until this is called."""
-    stopped = threading.Event()
-    with Publisher(PublishConfig(data=endpoint + ".data", status=endpoint)) as publisher:
-
-        def speak() -> None:
-            while not stopped.wait(0.1):
-                publisher.note("status", origin(), working())
-                publisher.note("meta", origin(), {"fps": 10.0})
-                publisher.note("event", origin(), {"code": "SRC_LOST", "level": 2})
-
-        thread = threading.Thread(target=speak, daemon=True)
-        thread.start()
-
-        def silence() -> None:
-            stopped.set()
-            thread.join(20)
-
-        yield silence
-        silence()
-
-
-@pytest.mark.usefixtures("silence")
-def test_once_prints_a_table_or_one_line_of_json(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(["status", endpoint, "--once", "--timeout", "20"]) == 0
-    assert "state streaming, fps 10.0" in capsys.readouterr().out
-    assert run_app(["status", endpoint, "--once", "--json", "--timeout", "20"]) == 0
-    (line,) = map(json.loads, capsys.readouterr().out.splitlines())
-    assert (line["topic"], line["node_id"], line["stale"], line["level"]) == ("status", "gcd", False, 0)
-    assert line["source"]["fps"] == 10.0
-
-
-def test_once_ends_with_69_when_nobody_answers(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_prints_a_table_or_one_line_of_json_or_every_note_on_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    endpoint = f"ipc://{tmp_path}/status"
     assert run_app(["status", endpoint, "--once", "--timeout", "0.2"]) == 69
     assert capsys.readouterr().err.startswith(f"error: no status from {endpoint} within 0.2 s: is the node running")
-
-
-@pytest.mark.usefixtures("silence")
-def test_a_stream_of_json_has_every_note_on_its_line(endpoint: str) -> None:
-    command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
-        assert reader.stdout is not None
-        lines: dict[str, dict[str, Any]] = {}
-        while len(lines) < 3:
-            line = json.loads(reader.stdout.readline())
-            lines[line["topic"]] = line
-        reader.terminate()
+    with Publisher(PublishConfig(data=endpoint + ".data", status=endpoint)) as publisher:
+        publisher.note("status", origin(), working())  # each is kept for who comes later
+        publisher.note("meta", origin(), {"fps": 10.0})
+        publisher.note("event", origin(), {"code": "SRC_LOST", "level": 2})
+        assert run_app(["status", endpoint, "--once", "--timeout", "20"]) == 0
+        assert "state streaming, fps 10.0" in capsys.readouterr().out
+        assert run_app(["status", endpoint, "--once", "--json", "--timeout", "20"]) == 0
+        (line,) = map(json.loads, capsys.readouterr().out.splitlines())
+        assert (line["topic"], line["node_id"], line["stale"], line["level"]) == ("status", "gcd", False, 0)
+        assert line["source"]["fps"] == 10.0
+        command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
+            assert reader.stdout is not None
+            told = [json.loads(reader.stdout.readline()) for _ in range(3)]
+            reader.terminate()
+    lines = {line["topic"]: line for line in told}
     assert set(lines) == {"status", "meta", "event"}
-    assert lines["event"]["code"] == "SRC_LOST"
-    assert lines["meta"]["node_id"] == "gcd"
+    assert (lines["event"]["code"], lines["meta"]["node_id"]) == ("SRC_LOST", "gcd")
 
 
 @pytest.mark.parametrize(("known", "code"), [(True, 0), (False, 77)])
@@ -316,10 +262,8 @@ def test_a_node_that_asks_for_keys_is_reached_with_them_alone(
     clients = {(ours if known else other).public: Client(name="planner", role="viewer")}
     security = ServerSecurity(keys=node, find_client=clients.get)
     write_key_pair(tmp_path / "keys", ours)
-    opened = partial(
-        Publisher, PublishConfig(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0"), security=security
-    )
-    with opened() as publisher:
+    endpoints = PublishConfig(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0")
+    with Publisher(endpoints, security=security) as publisher:
         publisher.note("status", origin(), working())
         assert publisher.status_endpoint is not None
         command = ["status", publisher.status_endpoint, "--once", "--timeout", "20"]
