@@ -11,17 +11,9 @@ import psutil
 import torch
 
 from gcd_client.protocol import ClientError
-from gcd_model import (
-    CheckpointError,
-    ModelError,
-    Traits,
-    default_precision,
-    inspect_weights,
-    is_export,
-    weights_path,
-)
+from gcd_model import CheckpointError, ModelError, Traits, default_precision, inspect_weights, is_export, weights_path
 from gcd_node.auth import load_server_security
-from gcd_node.config import NodeConfig
+from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError, NodeError, SourceError
 from gcd_node.frame import SourceInfo
 from gcd_node.preprocess import in_words
@@ -32,8 +24,6 @@ from gcd_node.stream_context import family_name, prepare_stream
 from gcd_node.views import LiveConfig, VirtualViews
 
 Verdict: TypeAlias = Literal["ok", "warning", "failed"]
-
-_BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -51,8 +41,8 @@ class _DoubtfulError(Exception):
 
 
 def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator[Finding]:
-    """Look at endpoints, source, weights, memory and views, in this order, and where recordings go, if anywhere; each
-    as soon as it is known.
+    """Look at endpoints, source, weights and views, in this order, and where recordings go, if anywhere; each as soon
+    as it is known.
 
     free_memory: bytes, on the model's device; measured if left out. What follows from something that failed is left
         out.
@@ -63,8 +53,6 @@ def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator
         yield _finding("record", look.record)
     yield _finding("source", look.source)
     yield _finding("weights", look.weights)
-    if look.traits is not None and look.weight_bytes:
-        yield _finding("memory", partial(look.memory, look.traits))
     if look.traits is not None and look.info is not None:
         yield _finding("views", partial(look.views, look.traits, look.info))
 
@@ -79,16 +67,12 @@ def _finding(topic: str, look: Callable[[], str]) -> Finding:
 
 
 class _Look:
-    """Each method looks at one thing and says in words what it is; some leave what others go on from.
-
-    weight_bytes: the weights in the precision they will be used in; 0 if they had to be loaded to know.
-    """
+    """Each method looks at one thing and says in words what it is; some leave what others go on from."""
 
     def __init__(self, config: NodeConfig, free_memory: int | None) -> None:
         self._config, self._free_memory = config, free_memory
         self.info: SourceInfo | None = None
         self.traits: Traits | None = None
-        self.weight_bytes = 0
 
     def endpoints(self) -> str:
         with open_session(self._config) as (_, publisher, control):
@@ -130,33 +114,32 @@ class _Look:
             # Only loading says whether weights and adapter belong together, or onnxruntime takes an export here.
             traits = load_model(section).traits
         else:
-            report = inspect_weights(
-                weights_path(section.weights),
-                family=section.family,
-                head_width=section.head_width,
-                image_heads=section.image_heads,
-            )
-            device = section.device
-            if device == "auto":
-                device = "cuda" if torch.cuda.is_available() else "cpu"
-            precision = section.dtype or default_precision(torch.device(device), live=report.family == "live")
-            traits = Traits.of(report, sha256_12=report.sha256_12, precision=precision, device=device)
-            self.weight_bytes = report.parameters * _BYTES.get(precision, 4)
+            traits = self._inspected(section)
         self.traits = traits.streaming()
         if is_random:
             raise _DoubtfulError(f"{section.weights}: these weights are random, so every picture is noise")
-        return f"{traits.name}, family {family_name(traits)}, {traits.precision}"
+        return f"{traits.name}, family {family_name(traits)}, {traits.precision} on {traits.device}"
 
-    def memory(self, traits: Traits) -> str:
-        needed, free = self.weight_bytes, self._free_memory
-        on_gpu = traits.device.startswith("cuda")
+    def _inspected(self, section: ModelSection) -> Traits:
+        """What loading would say. Raises CheckpointError, also if the weights alone are more than the free memory."""
+        report = inspect_weights(
+            weights_path(section.weights),
+            family=section.family,
+            head_width=section.head_width,
+            image_heads=section.image_heads,
+        )
+        device = section.device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        precision = section.dtype or default_precision(torch.device(device), live=report.family == "live")
+        needed, free = report.parameters * (4 if precision == "float32" else 2), self._free_memory
         if free is None:
-            free = torch.cuda.mem_get_info(traits.device)[0] if on_gpu else psutil.virtual_memory().available
-        line = f"weights take {needed / 2**30:.2f} GiB in {traits.precision}, {free / 2**30:.2f} are free on "
-        line += f"{traits.device if on_gpu else 'cpu'}; what the model needs to compute comes on top and is not counted"
+            on_gpu = device.startswith("cuda")
+            free = torch.cuda.mem_get_info(device)[0] if on_gpu else psutil.virtual_memory().available
         if needed > free:
-            raise CheckpointError(f"{line}. Free some, or use bfloat16 or a smaller model")
-        return line
+            sizes = f"the weights take {needed / 2**30:.2f} GiB in {precision}, {free / 2**30:.2f} are free on {device}"
+            raise CheckpointError(f"{sizes}; free some, or use bfloat16 or a smaller model")
+        return Traits.of(report, sha256_12=report.sha256_12, precision=precision, device=device)
 
     def views(self, traits: Traits, info: SourceInfo) -> str:
         config = self._config
@@ -164,8 +147,7 @@ class _Look:
         VirtualViews(traits).sync(LiveConfig(config).settings(), context.mount)
         frames, names = traits.config.frames, ", ".join(config.view)
         line = f"{names}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {context.fps:g} FPS"
-        camera = in_words(context.mount, config.source.pose, traits)
-        line += f"; {camera}" if camera else ""
+        line = "; ".join(filter(None, (line, in_words(context.mount, config.source.pose, traits))))
         if context.ood:
             raise _DoubtfulError(f"{line}; outside what {traits.name} was trained with: {', '.join(context.ood)}")
         return line

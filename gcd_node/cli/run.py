@@ -90,7 +90,7 @@ def apply_scheduling(life: LifeConfig) -> None:
 def check(config: ConfigPath, changes: Changes = None, print_config: PrintConfig = False) -> None:
     """Look at all that a launch file needs, before anything is started; loads no weights.
 
-    Endpoints, camera or recording, weights, memory and views. Ends with what a start would fail with: 65 weights, 66 a
+    Endpoints, camera or recording, weights and memory, views. Ends with what a start would fail with: 65 weights, 66 a
     recording, 69 no camera, 73 an endpoint, 78 a setting.
     """
     settings = _settings(config, changes, print_config)
