@@ -108,7 +108,7 @@ def status(
 
     The live table ends with Ctrl-C. With --json each status, event and meta note is a line of its own.
     """
-    where, board, console = resolve_endpoint(endpoint, "status"), StatusBoard(timeout), Console()
+    where, board, console = resolve_endpoint(endpoint, "status"), StatusBoard(timeout), Console(markup=False)
     until_s = time.monotonic() + timeout
     with ExitStack() as stack:
         notes = stack.enter_context(StatusSubscriber(endpoint, keys=client_keys(key_folder, node_key)))
@@ -224,8 +224,11 @@ class StatusBoard:
         return self._status is None or now_s - self._heard_s > self._stale_after_s
 
     def level(self, now_s: float) -> Level:
-        """As the node said, or STALE."""
-        return Level.STALE if self._status is None or self.stale(now_s) else _level(self._status.fields.get("level"))
+        """As the node said, anything else than a level counting as an error; or STALE."""
+        if self._status is None or self.stale(now_s):
+            return Level.STALE
+        told = self._status.fields.get("level")
+        return Level(told) if told in tuple(Level) else Level.ERROR
 
     def record(self, now_s: float) -> dict[str, Any]:
         """The last status for a program: as it came, with the node's name, its age in ms, and STALE where it is."""
@@ -235,21 +238,17 @@ class StatusBoard:
         header, age_ms = self._status.header, round(1000 * (now_s - self._heard_s))
         return {**self._status.fields, "node_id": header.node_id, "boot_id": header.boot_id, "age_ms": age_ms, **now}
 
-    def render(self, now_s: float, where: str = "") -> Table | Text:
+    def render(self, now_s: float, where: str = "") -> Table:
         """For rich: the level, every field of the status under its name, and the latest events. where: the endpoint,
         named while nothing has come."""
-        level = self.level(now_s)
-        if self._status is None:
-            return Text(f"no status yet from {_shown(where)}: is the node running?", _STYLES[level])
-        node, grid = _shown(self._status.header.node_id), Table.grid(padding=(0, 2))
-        silence = f"  silent for {now_s - self._heard_s:.0f} s" if self.stale(now_s) else ""
-        grid.add_row(Text(level.name, _STYLES[level]), Text(node + silence))
-        for name, text in _facts(self._status.fields):
-            grid.add_row(Text(name, "bold"), Text(text))
-        for heard_s, fields in reversed(self._events):
-            style = _STYLES[_level(fields.get("level"))]
-            grid.add_row(Text(f"{now_s - heard_s:.0f} s ago", "dim"), Text(_pairs(fields), style))
-        return grid
+        level, rows = self.level(now_s), [("", f"no status yet from {_shown(where)}: is the node running?")]
+        if self._status is not None:
+            silence = f"  silent for {now_s - self._heard_s:.0f} s" if self.stale(now_s) else ""
+            rows = [(level.name, _shown(self._status.header.node_id) + silence), *_facts(self._status.fields)]
+        rows += [(f"{now_s - heard_s:.0f} s ago", _pairs(fields)) for heard_s, fields in reversed(self._events)]
+        shown = table(rows)
+        shown.rows[0].style = _STYLES[level]
+        return shown
 
 
 def _facts(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -264,14 +263,6 @@ def _facts(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _pairs(pairs: Mapping[str, Any]) -> str:
     return ", ".join(f"{_shown(key)} {_shown(value)}" for key, value in pairs.items() if value not in (None, []))
-
-
-def _level(value: object) -> Level:
-    """A level as a node wrote it; anything else counts as an error."""
-    try:
-        return Level(value)  # pyright: ignore[reportArgumentType]  whatever came
-    except ValueError:
-        return Level.ERROR
 
 
 def _shown(value: object) -> str:
