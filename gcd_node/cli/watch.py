@@ -4,9 +4,6 @@ both. Needs no torch."""
 import json
 import math
 import os
-import signal
-import sys
-import threading
 import time
 import webbrowser
 from collections import Counter, deque
@@ -152,17 +149,12 @@ def viewer(
     from gcd_node.viewer.feed import NodeEndpoints  # the server's libraries: the tables need none
     from gcd_node.viewer.server import ViewerServer
 
-    ended, keys = threading.Event(), client_keys(key_folder, node_key)
-    if ends_with_stdin:
-        threading.Thread(target=lambda: (sys.stdin.buffer.read(), ended.set()), daemon=True).start()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda _number, _frame: ended.set())
-    commands = None if control == "none" else control
-    with ViewerServer(http, NodeEndpoints(data=data, status=status_endpoint, control=commands, keys=keys)) as server:
-        typer.echo(f"page {server.operator_url}", err=True)  # nowhere else is the token shown
-        if show and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
-            webbrowser.open(server.operator_url)
-        ended.wait()
+    commands, keys = None if control == "none" else control, client_keys(key_folder, node_key)
+    server = ViewerServer(http, NodeEndpoints(data=data, status=status_endpoint, control=commands, keys=keys))
+    typer.echo(f"page {server.operator_url}", err=True)  # nowhere else is the token shown
+    if show and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")):
+        webbrowser.open(server.operator_url)
+    server.run(ends_with_stdin=ends_with_stdin)
 
 
 class ViewTable:

@@ -6,11 +6,13 @@ opened only for the page that was served under that very Host (Origin). Whoever 
 """
 
 import asyncio
+import contextlib
 import http
 import logging
 import re
 import secrets
-import threading
+import signal
+import sys
 from importlib.resources import files
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -22,7 +24,7 @@ from gcd_node.viewer.feed import MAX_REQUEST, TRY_LATER, Browser, NodeEndpoints,
 
 MOST_BROWSERS = 8  # feeds that are served at a time
 _FEED = "/feed"
-_PING_S, _CLOSE_S, _JOIN_S = 5.0, 1.0, 5.0
+_PING_S, _CLOSE_S = 5.0, 1.0
 _HOST = re.compile(r"(127(\.[0-9]{1,3}){3}|localhost|\[::1\])(:[0-9]{1,5})?")
 _TUNNEL = "from elsewhere use a tunnel: ssh -L 8470:127.0.0.1:8470 ROBOT, then open http://127.0.0.1:8470 there"
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
@@ -46,7 +48,7 @@ _SILENT.propagate = False
 
 
 class ViewerServer:
-    """Serves in a thread of its own until it is closed. Use it as a context manager.
+    """The page of a node and the feeds of those who look at it.
 
     http: "127.0.0.1:PORT"; port 0 takes a free one. token: what makes an operator; left out, new with every start.
 
@@ -57,42 +59,35 @@ class ViewerServer:
 
     def __init__(self, http: str, node: NodeEndpoints, token: str | None = None) -> None:
         self._node, self._token = node, token or secrets.token_urlsafe(24)
-        self._page = load_page()
+        self._page, self._link = load_page(), None
         self._listening = listen(http, "[viewer] http")
         host, port = self._listening.getsockname()[:2]
         self.url = f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
         """Who opens this may look."""
-        self._started = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="viewer server", daemon=True)
-        self._thread.start()
-        self._started.wait()
-
-    @property
-    def operator_url(self) -> str:
+        self.operator_url = f"{self.url}#token={self._token}"
         """Who opens this may command. Browsers send what follows the # to nobody."""
-        return f"{self.url}#token={self._token}"
 
     @property
     def browsers(self) -> int:
         """Feeds that are open."""
-        return len(self._link.browsers)
+        return 0 if self._link is None else len(self._link.browsers)
 
-    def close(self) -> None:
-        """End all feeds, within a few seconds whatever the browsers do; a second call does nothing."""
-        if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._closing.set)
-            self._thread.join(_JOIN_S)
+    def run(self, *, ends_with_stdin: bool = False) -> None:
+        """Serve until SIGINT or SIGTERM, or until stdin, a pipe, is closed. Main thread only."""
 
-    def __enter__(self) -> "ViewerServer":
-        return self
+        async def serve_until_told() -> None:
+            loop, serving = asyncio.get_running_loop(), asyncio.create_task(self.serve())
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.add_signal_handler(number, serving.cancel)
+            if ends_with_stdin:
+                loop.add_reader(sys.stdin, lambda: (loop.remove_reader(sys.stdin), serving.cancel()))  # nobody writes
+            with contextlib.suppress(asyncio.CancelledError):
+                await serving
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        asyncio.run(serve_until_told())
 
-    # What follows runs in the event loop.
-
-    async def _serve(self) -> None:
-        self._loop, self._closing = asyncio.get_running_loop(), asyncio.Event()
+    async def serve(self) -> None:
+        """Until it is cancelled; then all feeds end within a few seconds, whatever the browsers do."""
         self._link = NodeLink(self._node)
         try:
             async with serve(
@@ -107,11 +102,9 @@ class ViewerServer:
                 close_timeout=_CLOSE_S,
                 max_size=MAX_REQUEST,
                 logger=_SILENT,
-            ):
-                self._started.set()
-                await self._closing.wait()
+            ) as server:
+                await server.serve_forever()
         finally:
-            self._started.set()
             await self._link.close()
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
@@ -131,6 +124,7 @@ class ViewerServer:
 
     async def _feed(self, connection: ServerConnection) -> None:
         """One browser, until it has gone."""
+        assert self._link is not None
         if self.browsers >= MOST_BROWSERS:
             return await connection.close(TRY_LATER, f"{MOST_BROWSERS} pages are open already; close one of them")
         try:

@@ -1,5 +1,6 @@
 """Clients of a page's server that are no browser, good ones and bad ones, and a server for them."""
 
+import asyncio
 import base64
 import contextlib
 import http.client
@@ -7,6 +8,7 @@ import json
 import os
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -28,8 +30,30 @@ def endpoints_in(folder: Path, *, control: bool = True) -> NodeEndpoints:
     return NodeEndpoints(data=f"{at}/data", status=f"{at}/status", control=f"{at}/control" if control else None)
 
 
-def viewer_of(folder: Path) -> ViewerServer:
-    return ViewerServer("127.0.0.1:0", endpoints_in(folder), TOKEN)
+class Served(ViewerServer):
+    """In a thread; use it as a context manager."""
+
+    def __enter__(self) -> "Served":
+        started = threading.Event()
+
+        async def main() -> None:
+            self._loop, self._serving = asyncio.get_running_loop(), asyncio.create_task(self.serve())
+            started.set()
+            await asyncio.wait([self._serving])
+
+        self._thread = threading.Thread(target=lambda: asyncio.run(main()), daemon=True)
+        self._thread.start()
+        started.wait()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._serving.cancel)
+        self._thread.join(WAIT_S)
+        assert not self._thread.is_alive()
+
+
+def viewer_of(folder: Path, *, control: bool = True) -> Served:
+    return Served("127.0.0.1:0", endpoints_in(folder, control=control), TOKEN)
 
 
 def host_of(viewer: ViewerServer) -> str:
