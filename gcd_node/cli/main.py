@@ -25,14 +25,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "check": ("run:check", "Look at all that a launch file needs, before anything is started; loads no weights."),
     "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
     "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
-    "replay": (
-        "run:replay_launch",
-        "Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.",
-    ),
-    "diff": (
-        "run:diff",
-        "Compare two runs window by window: identical, or how far apart, where first, and what they were made from.",
-    ),
+    "replay": ("run:replay_launch", "Replay a launch file's recording in lockstep into a run that can be compared."),
+    "diff": ("run:diff", "Compare two runs: identical, or how far apart, where first, and what they were made from."),
     "status": ("watch:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),
     "synthesize": (
         "offline:synthesize",
@@ -124,16 +118,11 @@ def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: 
 
 @contextlib.contextmanager
 def progress_bar(first: str) -> Generator[Callable[[str, int, int], None]]:
-    """A bar on a terminal. Gives what moves it: what is being done, how much of it is done, and how much there is."""
+    """On a terminal. Gives what moves it: what is being done, how much of it is done, and how much there is."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}")
-    console = Console(stderr=True, markup=False)
-    hidden = not console.is_terminal
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=hidden) as bar:
-        task = bar.add_task(first, total=None)
-        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
+    with Console(stderr=True, markup=False).status(first) as status:
+        yield lambda what, done, total: status.update(f"{what}, {done} of {total}")
 
 
 def _print_version(wanted: bool) -> None:

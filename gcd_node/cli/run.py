@@ -139,7 +139,7 @@ def replay_launch(
     out: Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")],
     changes: Changes = None,
 ) -> None:
-    """Replay a launch file's recording in lockstep, as fast as the model goes, into a run that can be compared.
+    """Replay a launch file's recording in lockstep into a run that can be compared.
 
     RUN gets manifest.json (what it was made from, and a SHA-256 of every view of every window) and the pixels without
     loss. It appears when it is complete. Opens no socket; the same machine gives the same hashes every time.
@@ -168,7 +168,7 @@ def diff(
     ] = 0.0,
     as_json: Annotated[bool, Option("--json", help="Print the whole comparison as one line of JSON.")] = False,
 ) -> None:
-    """Compare two runs window by window: identical, or how far apart, where first, and what they were made from.
+    """Compare two runs: identical, or how far apart, where first, and what they were made from.
 
     Ends with 0 if they are identical or near enough, with 1 if not, with 65 or 66 if one is damaged or missing.
     """

@@ -3,7 +3,6 @@ hostile clients can do with both."""
 
 import contextlib
 import logging
-import re
 import socket
 import time
 import zlib
@@ -154,19 +153,6 @@ def test_every_file_is_served_with_headers_that_let_nothing_else_in_and_none_hol
         assert TOKEN not in body.decode() + str(headers)
     assert HEADERS["Content-Security-Policy"].startswith("default-src 'none'")
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
-
-
-def test_the_page_needs_nothing_from_elsewhere_and_nothing_inline() -> None:
-    page = {path: body.decode() for path, (body, _) in load_page().items()}
-    assert {"/", "/viewer.css", "/main.js"} <= set(page)
-    elsewhere = re.compile(r"(?<!xmlns=')(?:https?:)?//(?!www\.w3\.org/2000/svg)[a-z0-9]", re.IGNORECASE)
-    for path, text in page.items():
-        code = re.sub(r"^\s*//.*$|\s//\s.*$", "", text, flags=re.MULTILINE) if path.endswith(".js") else text
-        found = [line for line in code.splitlines() if elsewhere.search(line) and "location.host" not in line]
-        assert found == [], path
-        assert "innerHTML" not in code
-        assert "eval(" not in code
-    assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\sstyle=|\son[a-z]+=", page["/"])
 
 
 @pytest.mark.parametrize(
