@@ -1,6 +1,6 @@
 """What a page is sent of a node, and what it may ask: reads the node's sockets as any client, and carries commands.
 
-From the page: one JSON object in a text message, one of Hello, Watch, Ask, Got.
+From the page: a Request as JSON in a text message.
 To the page: JSON objects with a `type` in text messages, and pictures in binary ones: how long it waited here in ms as
 a 32-bit little-endian float, the length of a JSON header as such an integer, that header, and what it describes.
 """
@@ -16,7 +16,7 @@ import zlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, TypeAlias, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -46,31 +46,20 @@ _WAITED, _LENGTH = struct.Struct("<f"), struct.Struct("<I")
 _LOG = logging.getLogger(__name__)
 
 
-class Hello(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag="hello"):
-    """Who it is. token: makes it an operator; without one it is a viewer."""
+class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a browser says.
 
+    "hello": who it is; with the `token` it is an operator, without one a viewer. "watch": which `view` to send from now
+    on. "ask": a command; its `id` comes back with the reply. "got": a picture has been shown, more may come.
+    """
+
+    type: Literal["hello", "watch", "ask", "got"]
     token: Annotated[str, Meta(max_length=128)] | None = None
-
-
-class Watch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag="watch"):
-    """Which view to send from now on."""
-
-    view: Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")]
-
-
-class Ask(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag="ask"):
-    """A command. id: comes back with its reply."""
-
-    id: Annotated[int, Meta(ge=0, le=2**31)]
-    verb: Annotated[str, Meta(max_length=32)]
+    view: Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")] | None = None
+    id: Annotated[int, Meta(ge=0, le=2**31)] = 0
+    verb: Annotated[str, Meta(max_length=32)] = ""
     args: dict[str, Any] = {}
 
-
-class Got(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type", tag="got"):
-    """The oldest picture on the way has been shown; more may come."""
-
-
-Request: TypeAlias = Hello | Watch | Ask | Got
 
 _REQUESTS = msgspec.json.Decoder(Request)
 
@@ -169,15 +158,15 @@ class NodeLink:
         for topic in topics - self._readers.keys():
             self._readers[topic] = asyncio.create_task(_kept_up("/".join(topic), self._read_view, *topic))
 
-    async def ask(self, ask: Ask, role: Role) -> str:
+    async def ask(self, asked: Request, role: Role) -> str:
         """Carry a command to the node; the reply, a refusal too."""
         try:
-            reply = await self._request(ask, role)
+            reply = await self._reply(asked, role)
             fields = {"ok": reply.ok, "code": reply.code, "message": reply.message, "result": reply.result}
         except (ControlError, AuthError) as error:
             code = Code.FORBIDDEN if isinstance(error, AuthError) else error.code or "NO_ANSWER"
             fields = {"ok": False, "code": code, "message": str(error), "result": None}
-        return text_message("reply", {"id": ask.id, "verb": ask.verb, **fields})
+        return text_message("reply", {"id": asked.id, "verb": asked.verb, **fields})
 
     async def close(self) -> None:
         """Stop reading."""
@@ -186,16 +175,16 @@ class NodeLink:
             reader.cancel()
         await asyncio.wait(readers)
 
-    async def _request(self, ask: Ask, role: Role) -> Reply:
-        if ask.verb not in _LOOKING and (role != "operator" or ask.verb not in _STEERING):
+    async def _reply(self, asked: Request, role: Role) -> Reply:
+        if asked.verb not in _LOOKING and (role != "operator" or asked.verb not in _STEERING):
             known = f"a page asks for {', '.join(_LOOKING)}; opened with its token also for {', '.join(_STEERING)}"
-            raise ControlError(f"{known}; not for {ask.verb!r}", Code.FORBIDDEN)
+            raise ControlError(f"{known}; not for {asked.verb!r}", Code.FORBIDDEN)
         endpoint = self._node.control
         if endpoint is None:
             raise ControlError("this node takes no commands: it has no [control] endpoint", Code.FORBIDDEN)
         keys = self._node.keys_for(endpoint)
         with ControlClient(endpoint, keys=keys, timeout_s=_REPLY_S, attempts=1) as client:
-            return await client.request_async(ask.verb, ask.args)
+            return await client.request_async(asked.verb, asked.args)
 
     async def _read_view(self, view: str, kind: ViewKind) -> None:
         await asyncio.sleep(_SETTLE_S)  # a reader that was just cancelled still lets go of a file that this one may get
@@ -305,20 +294,19 @@ class Browser:
         self._unseen += 1
         return _WAITED.pack(1000 * (time.monotonic() - since_s)) + what
 
-    async def _take(self, request: Request) -> None:
-        match request:
-            case Hello(token=token):
-                right = secrets.compare_digest((token or "").encode(errors="replace"), self._token.encode())
-                self._role = "operator" if right else "viewer"
-                refused = token is not None and not right
-                self.put("role", text_message("role", {"role": self._role, "refused": refused}))
-            case Watch(view=view):
-                self.view = view
-                self._link.read_what_is_watched()
-            case Ask() as ask:
-                self.put(f"reply/{ask.id}", await self._link.ask(ask, self._role))
-            case Got():
-                self.shown()
+    async def _take(self, said: Request) -> None:
+        if said.type == "hello":
+            right = secrets.compare_digest((said.token or "").encode(errors="replace"), self._token.encode())
+            self._role = "operator" if right else "viewer"
+            refused = said.token is not None and not right
+            self.put("role", text_message("role", {"role": self._role, "refused": refused}))
+        elif said.type == "watch":
+            self.view = said.view
+            self._link.read_what_is_watched()
+        elif said.type == "ask":
+            self.put(f"reply/{said.id}", await self._link.ask(said, self._role))
+        else:
+            self.shown()
 
     async def _send(self) -> None:
         """Send what waits, and a beat twice a second; who takes nothing for 5 s is cut off."""
