@@ -43,7 +43,7 @@ def test_a_real_node_is_measured_under_the_published_names(tmp_path: Path) -> No
     launch = tmp_path / "launch.toml"
     launch.write_text(f'[source]\nkind = "synthetic"\n[model]\nweights = "{write_tiny(tmp_path)}"\n[view.top]\n')
     out = tmp_path / "bench.json"
-    options = ["--set", "model.threads=1", "--seconds", "6", "--json", str(out)]
+    options = ["--set", "model.threads=1", "--seconds", "12", "--json", str(out)]
     assert run_app(["bench", str(launch), "--rate", "50", *options]) == 0
     figures = json.loads(out.read_text())
     assert figures["metadata"]["BenchmarkMetadata.INPUT_DATA_PATH"] == "synthetic"
