@@ -245,12 +245,12 @@ class StatusBoard:
 
 def _facts(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """A line for the plain values of a mapping, and lines of their own for each mapping in it."""
-    pending = [("node", fields)]
+    pending = [("", fields)]
     for name, mapping in pending:
         nested = {key: value for key, value in mapping.items() if isinstance(value, Mapping)}
-        pending += nested.items()
+        pending += ((f"{name} {key}".strip(), value) for key, value in nested.items())
         if text := _pairs({key: value for key, value in mapping.items() if key not in nested}):
-            yield _shown(name), text
+            yield _shown(name or "node"), text
 
 
 def _pairs(pairs: Mapping[str, Any]) -> str:
