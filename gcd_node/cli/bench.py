@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -36,8 +36,6 @@ _FIRST_VIEW_S, _IDLE_S, _END_S, _POLL_S = 180.0, 2.0, 20.0, 0.05
 _FEWEST_VIEWS = 3  # jitter is a difference of differences
 _MEBIBYTE = 2**20
 
-Stream: TypeAlias = Annotated[bool, Option("--stream", help="One run alone, at the source's own rate.")]
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Arrival:
@@ -56,7 +54,7 @@ def bench(
         list[float] | None, Option("--rate", min=0.1, help="Input rate for latency, Hz; 5, 10 and 15. Again for more.")
     ] = None,
     seconds: Annotated[float, Option(min=1.0, help="How long each run is watched after its first view.")] = 20.0,
-    stream: Stream = False,
+    stream: Annotated[bool, Option("--stream", help="One run alone, at the source's own rate.")] = False,
     changes: Changes = None,
     json_file: Annotated[
         Path | None, Option("--json", help="Also a file, in the names of Isaac ROS Benchmark.")

@@ -16,14 +16,13 @@ from gcd_node.verbs import VERBS, text_arguments
 
 keys = typer.Typer(no_args_is_help=True, help="CURVE keys, for nodes that are reached over a network.")
 
-Settings: TypeAlias = Annotated[list[str] | None, Argument(metavar="[KEY=VALUE]...", help="The verb's arguments.")]
 KeyFolder: TypeAlias = Annotated[Path | None, Option("--keys", help="Our key folder, as `gcd-node keys new` makes it.")]
 NodeKey: TypeAlias = Annotated[str | None, Option(help="The node's public key, or its file.")]
 
 
 def ctl(
     verb: Annotated[str, Argument(metavar="VERB", help=f"One of {', '.join(VERBS)}.")],
-    settings: Settings = None,
+    settings: Annotated[list[str] | None, Argument(metavar="[KEY=VALUE]...", help="The verb's arguments.")] = None,
     endpoint: Annotated[str, Option(help="The node's control endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")] = "ipc",
     json: Annotated[bool, Option("--json", help="Print the whole reply as one line of JSON.")] = False,
     dry_run: Annotated[bool, Option("--dry-run", help="Check everything, change nothing.")] = False,

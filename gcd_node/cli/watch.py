@@ -38,8 +38,6 @@ _STYLES = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Lev
 _TITLE = "Virtual views: generated pixels, never evidence of free space"
 
 Endpoint: TypeAlias = Annotated[str, Argument(metavar="ENDPOINT", help="ipc, ipc://PATH or tcp://HOST:PORT.")]
-Status: TypeAlias = Annotated[str, Option("--status", help="Its status endpoint.")]
-Control: TypeAlias = Annotated[str, Option(help="Its control endpoint; none to look only.")]
 
 
 def view(
@@ -138,8 +136,8 @@ def _live(console: Console, draw: Callable[[], RenderableType]) -> Live:
 def viewer(
     http: Annotated[str, Option(help="Where to serve the page: 127.0.0.1:PORT.")] = "127.0.0.1:8470",
     data: Annotated[str, Option(help="The node's data endpoint: ipc, ipc://PATH or tcp://HOST:PORT.")] = "ipc",
-    status_endpoint: Status = "ipc",
-    control: Control = "ipc",
+    status_endpoint: Annotated[str, Option("--status", help="Its status endpoint.")] = "ipc",
+    control: Annotated[str, Option(help="Its control endpoint; none to look only.")] = "ipc",
     key_folder: KeyFolder = None,
     node_key: NodeKey = None,
     show: Annotated[bool, Option("--open", help="Open the page in a browser, where there is a screen.")] = False,
