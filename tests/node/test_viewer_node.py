@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import Bench, Camera, until
+from media import environment
 from msgspec.structs import replace
 from rig import Rig
 from viewer_clients import TOKEN, WAIT_S, answer, farewell, hear, open_feed, raw_feed, role, say, send_raw, viewer_of
@@ -182,11 +183,9 @@ def test_a_launch_file_with_a_page_starts_a_viewer_that_ends_with_the_node(end: 
         "    assert not [each for each in threading.enumerate() if each.name.startswith('viewer')]\n"
         "    sys.stdin.read()\n"
     )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(Path(__file__).parent), *sys.path))}
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], env=environment, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    with process:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], env=environment(), stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         url = printed_page(process)
         assert is_served(url)
         if end == "killed":
@@ -202,9 +201,9 @@ def test_the_demo_opens_its_page_and_ends_with_ctrl_c(tmp_path: Path) -> None:
     browser.write_text(f"#!/bin/sh\necho $1 > {opened}\n")
     browser.chmod(0o700)
     command = [sys.executable, "-m", "gcd_node", "demo", "--open"]
-    environment = os.environ | {"BROWSER": str(browser), "DISPLAY": ":0"}
+    screen = os.environ | {"BROWSER": str(browser), "DISPLAY": ":0"}
     with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command, env=screen, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         url = printed_page(process)
         with open_feed(url) as feed:
