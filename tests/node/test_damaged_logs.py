@@ -185,7 +185,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
         chunk(b"".join(channel("n" * 60_000 + str(i), i) for i in range(1000))) * 9
     ),
     "notes about itself that unfold to gigabytes": lambda: (
-        chunk(record(12, text("gcd-node") + struct.pack("<I", 8 + BIG) + text("") + text("v" * BIG))) * 20
+        chunk(record(12, text("gcd-node/source") + struct.pack("<I", 8 + BIG) + text("") + text("v" * BIG))) * 20
     ),
     "a length of gigabytes": lambda: struct.pack("<BQ", 12, 20) + struct.pack("<I", 0xFFFFFFF0) + bytes(1000),
     "records without end that were never sent": lambda: record(200, b"") * 3_000_000,
