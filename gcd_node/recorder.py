@@ -158,7 +158,8 @@ class Recorder:
         """Frames are of this source from here on. lens: the calibration in use for its pictures."""
         self._source = replace(info, lens=lens)
         if "inputs" in self._config.record.what:
-            facts = {"kind": info.kind, "id": info.id, "stamp_uncertainty_us": str(info.stamp_uncertainty_us)}
+            facts = {"topic": IMAGE_TOPIC, "kind": info.kind, "id": info.id}
+            facts["stamp_uncertainty_us"] = str(info.stamp_uncertainty_us)
             if lens is None and (hfov_deg := self._config.source.hfov_deg or info.hfov_deg):
                 facts["hfov_deg"] = repr(hfov_deg)
             self._put("/src/camera_info", 0, lambda file: file.describe("gcd-node/source", facts), is_head=True)
@@ -299,8 +300,6 @@ class Recorder:
         self._files.append(file)
         facts = {f"version/{package}": version(package) for package in _PACKAGES}
         facts |= {"node_id": config.node_id, "boot_id": self._boot_id, "proto": PROTO}
-        if "inputs" in config.record.what:
-            facts["input_topic"] = IMAGE_TOPIC
         file.describe("gcd-node", facts)
         file.attach("config.toml", "application/toml", to_toml(config).encode())
         with self._changed:

@@ -78,8 +78,8 @@ class LogMessage:
 class LogReader:
     """One reading of a log. `messages` gives those of KINDS.
 
-    topics: every one so far, and the type of its messages. metadata: what a recording of this node says of itself, by
-    name. trouble: why a file of it ended early, "" if none did.
+    topics: every one so far, and the type of its messages. recorded: what a recording of this node says of its input.
+    trouble: why a file of it ended early, "" if none did.
     """
 
     def __init__(self, path: Path, search_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
@@ -93,7 +93,7 @@ class LogReader:
         self._files, self._search_s, self._stopped = _files_of(path), search_s, stopped
         self._kept_bytes, self.trouble = 0, ""
         self.topics: dict[str, str] = {}
-        self.metadata: dict[str, dict[str, str]] = {}
+        self.recorded: dict[str, str] = {}
         self.renew()
 
     def renew(self) -> None:
@@ -129,9 +129,8 @@ class LogReader:
                 if isinstance(record, Message) and record.channel_id in readable:
                     times = {"log_ns": record.log_time, "sent_ns": record.publish_time}
                     yield readable[record.channel_id](data=record.data, sequence=record.sequence, **times)
-                elif isinstance(record, Metadata) and record.name.startswith("gcd-node"):
-                    self._keep(record)
-                    self.metadata[record.name] = record.metadata
+                elif isinstance(record, Metadata) and record.name == "gcd-node/source":
+                    self.recorded = record.metadata
                 elif isinstance(record, Schema | Channel) and known.get(key := (type(record), record.id)) != record:
                     self._keep(record)  # many writers repeat them
                     known[key] = record
@@ -165,7 +164,7 @@ class LogReader:
             else:
                 yield record
 
-    def _keep(self, record: McapRecord) -> None:
+    def _keep(self, record: Schema | Channel) -> None:
         self._kept_bytes += len(msgspec.json.encode(vars(record)))
         if self._kept_bytes > _MAX_KEPT:
             raise ValueError(f"topics and definitions alone are more than {_MAX_KEPT} bytes")

@@ -178,13 +178,9 @@ class _Survey:
                 break
         return troubles
 
-    def _own(self, name: str) -> dict[str, str]:
-        """What a recording of this node says of itself; nothing of other logs."""
-        return self._reader.metadata.get(name, {})
-
     def _usable(self) -> list[str]:
         """Topics whose pictures can be decoded, and are wanted; of a recording of this node its input."""
-        wanted = self._wanted or self._own("gcd-node").get("input_topic")
+        wanted = self._wanted or self._reader.recorded.get("topic")
         return [name for name in self._first if wanted in (None, name)]
 
     def _describe(self, path: Path, picture: Image, codec: str) -> SourceInfo:
@@ -207,11 +203,12 @@ class _Survey:
             lens=self.cameras.lens(self.topic, (width, height)),
             stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if self.header_stamps else round(1e6 / fps),
         )
-        facts = self._own("gcd-node/source") if self.topic == self._own("gcd-node").get("input_topic") else {}
+        recorded = self._reader.recorded
         with contextlib.suppress(KeyError, ValueError):  # none was written, or by somebody else
-            info = replace(info, stamp_uncertainty_us=int(facts["stamp_uncertainty_us"]))
-            if 0 < (hfov_deg := float(facts["hfov_deg"])) < 180:
-                info = replace(info, hfov_deg=hfov_deg)
+            if self.topic == recorded["topic"]:
+                info = replace(info, stamp_uncertainty_us=int(recorded["stamp_uncertainty_us"]))
+                if 0 < (hfov_deg := float(recorded["hfov_deg"])) < 180:
+                    info = replace(info, hfov_deg=hfov_deg)
         return info
 
 

@@ -27,16 +27,11 @@ from gcd_node.sources.logs import LogSource
 
 START_NS, PERIOD_NS = 1_750_000_000_123_456_789, 100_000_000
 TOPIC = "/front/image_raw/compressed"
-IMAGE = "sensor_msgs/msg/Image"
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
-INFO = "sensor_msgs/msg/CameraInfo"
-ODOMETRY = "nav_msgs/msg/Odometry"
-TF = "tf2_msgs/msg/TFMessage"
-STRING = "std_msgs/msg/String"
+WORDS = ("std_msgs/msg/String", {"data": "hello"})
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 Fields = dict[str, Any]
-Sent = tuple[str, str, Fields]
-"""Topic, type and fields."""
+Said = tuple[str, Fields]
+"""Type and fields of a message."""
 
 
 def at(i: float) -> int:
@@ -55,21 +50,26 @@ def header(stamp_ns: int, frame_id: str = "front_optical") -> Fields:
     return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame_id}
 
 
-def compressed(image: Image, stamp_ns: int, format_: str = "bgr8; jpeg compressed bgr8") -> Fields:
-    suffix = ".png" if "png" in format_ else ".jpg"
-    return {"header": header(stamp_ns), "format": format_, "data": coded(image, suffix)}
+def compressed(
+    image: Image, stamp_ns: int, format_: str = "bgr8; jpeg compressed bgr8", data: bytes | None = None
+) -> Said:
+    """data: in place of the coded picture."""
+    data = coded(image, ".png" if "png" in format_ else ".jpg") if data is None else data
+    return "sensor_msgs/msg/CompressedImage", {"header": header(stamp_ns), "format": format_, "data": data}
 
 
-def raw(pixels: np.ndarray, encoding: str, stamp_ns: int = START_NS, width: int = 0, height: int = 0) -> Fields:
+def raw(pixels: np.ndarray, encoding: str, stamp_ns: int = START_NS, width: int = 0, height: int = 0) -> Said:
     """Of rows; width and height where they are not those of the array."""
     sizes = {"height": height or pixels.shape[0], "width": width or pixels.shape[1], "step": pixels.strides[0]}
-    return {"header": header(stamp_ns), "encoding": encoding, "data": pixels.tobytes(), **sizes}
+    fields = {"header": header(stamp_ns), "encoding": encoding, "data": pixels.tobytes(), **sizes}
+    return "sensor_msgs/msg/Image", fields
 
 
-def odometry(x: float, stamp_ns: int, yaw_deg: float = 0.0) -> Fields:
+def odometry(x: float, stamp_ns: int, yaw_deg: float = 0.0) -> Said:
     half = np.radians(yaw_deg) / 2
     pose = {"position": {"x": x}, "orientation": {"z": float(np.sin(half)), "w": float(np.cos(half))}}
-    return {"header": header(stamp_ns, "odom"), "child_frame_id": "base_link", "pose": {"pose": pose}}
+    fields = {"header": header(stamp_ns, "odom"), "child_frame_id": "base_link", "pose": {"pose": pose}}
+    return "nav_msgs/msg/Odometry", fields
 
 
 def transform(parent: str, child: str, x: float, turn: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> Fields:
@@ -79,12 +79,13 @@ def transform(parent: str, child: str, x: float, turn: Sequence[float] = (0.0, 0
 
 def camera_info(
     width: int, height: int, *, focal: float = 60.0, d: Sequence[float] = (-0.1, 0.01, 0.001, 0.002, 0.0)
-) -> Fields:
+) -> Said:
     cx, cy = width / 2, height / 2
     k = [focal, 0.0, cx, 0.0, focal + 1, cy, 0.0, 0.0, 1.0]
     p = [focal - 5, 0.0, cx, 0.0, 0.0, focal - 4, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
     sizes = {"height": height, "width": width}
-    return {"header": header(START_NS), "distortion_model": "plumb_bob", "d": list(d), "k": k, "p": p, **sizes}
+    fields = {"header": header(START_NS), "distortion_model": "plumb_bob", "d": list(d), "k": k, "p": p, **sizes}
+    return "sensor_msgs/msg/CameraInfo", fields
 
 
 @contextmanager
@@ -109,21 +110,21 @@ def write_log(path: Path, images: Sequence[Image], **options: Any) -> Path:
     """JPEG pictures at 10 a second, numbered. options: of ros_log()."""
     with ros_log(path, **options) as say:
         for i, image in enumerate(images):
-            say(TOPIC, COMPRESSED, compressed(image, at(i)), sequence=i)
+            say(TOPIC, *compressed(image, at(i)), sequence=i)
     return path
 
 
-def of_pictures(path: Path, pictures: Sequence[Fields], kind: str = COMPRESSED) -> LogSource:
+def of_pictures(path: Path, pictures: Sequence[Said]) -> LogSource:
     """A log of these on /front/image, open."""
     with ros_log(path) as say:
-        for fields in pictures:
-            say("/front/image", kind, fields)
+        for picture in pictures:
+            say("/front/image", *picture)
     return LogSource(path)
 
 
 def write_bag(
     path: Path,
-    messages: Sequence[Sent],
+    messages: Sequence[tuple[str, Said]],
     storage: StoragePlugin = StoragePlugin.SQLITE3,
     compression: CompressionMode = CompressionMode.NONE,
 ) -> Path:
@@ -136,7 +137,7 @@ def write_bag(
         writer.set_compression(Bag1Writer.CompressionFormat.BZ2)
     with writer:
         connections: dict[str, Any] = {}
-        for i, (topic, kind, fields) in enumerate(messages):
+        for i, (topic, (kind, fields)) in enumerate(messages):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=ros1_types() if is_ros1 else TYPES)
             data = serialize_dynamic(kind, TYPES.generate_msgdef(kind, ros_version=2)[0])[kind](fields)

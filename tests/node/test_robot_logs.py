@@ -16,14 +16,9 @@ from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from mcap.writer import CompressionType
 from media import HEIGHT, WIDTH, flat, ramp
 from robot_logs import (
-    COMPRESSED,
-    IMAGE,
-    INFO,
-    ODOMETRY,
-    STRING,
-    TF,
     TOPIC,
-    Fields,
+    WORDS,
+    Said,
     at,
     camera_info,
     coded,
@@ -54,16 +49,16 @@ def near(image: Image, colour: tuple[int, int, int] = COLOUR, tolerance: int = 8
 
 
 def test_every_container_gives_each_picture_with_its_own_stamp_and_number(tmp_path: Path) -> None:
-    sent = [("/front/camera_info", INFO, camera_info(WIDTH, HEIGHT))]
-    sent += [("/front/image", COMPRESSED, compressed(image, at(i))) for i, image in enumerate(ramp(COUNT))]
+    sent = [("/front/camera_info", camera_info(WIDTH, HEIGHT))]
+    sent += [("/front/image", compressed(image, at(i))) for i, image in enumerate(ramp(COUNT))]
     written = [write_bag(tmp_path / "log.bag", sent)]
     for storage, mode in product(StoragePlugin, (CompressionMode.NONE, CompressionMode.MESSAGE)):
         written.append(write_bag(tmp_path / f"{storage.name}_{mode.name}", sent, storage, mode))
     for compression in CompressionType:
         written.append(tmp_path / f"{compression.name}.mcap")
         with ros_log(written[-1], compression=compression) as say:
-            for i, message in enumerate(sent):
-                say(*message, sequence=max(0, i - 1))
+            for i, (topic, message) in enumerate(sent):
+                say(topic, *message, sequence=max(0, i - 1))
     for path in (*written, tmp_path / "SQLITE3_MESSAGE" / "SQLITE3_MESSAGE.db3"):
         source = LogSource(path)
         frames = list(source.frames())
@@ -76,7 +71,7 @@ def test_every_container_gives_each_picture_with_its_own_stamp_and_number(tmp_pa
 
 
 def test_a_bag_that_was_packed_whole_is_to_be_unpacked(tmp_path: Path) -> None:
-    sent = [(TOPIC, COMPRESSED, compressed(BLACK, at(i))) for i in range(2)]
+    sent = [(TOPIC, compressed(BLACK, at(i))) for i in range(2)]
     path = write_bag(tmp_path / "bag", sent, compression=CompressionMode.FILE)
     with pytest.raises(SourceError, match="zstd -d"):
         LogSource(path)
@@ -95,7 +90,7 @@ def test_the_split_files_of_a_bag_are_played_by_their_numbers(tmp_path: Path) ->
 def test_numbers_rise_and_without_stamps_the_time_of_sending_counts(tmp_path: Path) -> None:
     with ros_log(tmp_path / "log.mcap") as say:
         for i, number in enumerate([0, 1, 5, 3, 0]):  # two were lost; a recorder began again
-            say(TOPIC, COMPRESSED, compressed(BLACK, 0), log_ns=at(i), sequence=number)
+            say(TOPIC, *compressed(BLACK, 0), log_ns=at(i), sequence=number)
     source = LogSource(tmp_path / "log.mcap")
     played = enumerate([0, 1, 5, 6, 7])
     assert [(frame.seq, frame.stamp_ns) for frame in source.frames()] == [(number, at(i)) for i, number in played]
@@ -140,7 +135,7 @@ LAYOUTS = {  # rows of bytes, from the definitions and not from OpenCV
 def test_red_stays_red_in_every_layout(tmp_path: Path) -> None:
     for encoding, rows in LAYOUTS.items():
         pictures = [raw(rows, encoding, at(i), width=WIDTH, height=HEIGHT) for i in range(2)]
-        source = of_pictures(tmp_path / "log.mcap", pictures, IMAGE)
+        source = of_pictures(tmp_path / "log.mcap", pictures)
         assert source.info.codec == encoding
         assert all(near(frame.image[2:-2, 2:-2]) for frame in source.frames())
     swapped = "rgb8; jpeg compressed rgb8"  # the coder was handed RGB and took it for BGR
@@ -154,7 +149,7 @@ def test_padding_at_the_end_of_rows_is_left_out_and_grey_becomes_rgb(tmp_path: P
     image = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
     padded, grey = np.pad(image.reshape(HEIGHT, -1), ((0, 0), (0, 20))), np.ascontiguousarray(image[:, :, 0])
     pictures = [raw(padded, "rgb8", at(i), width=WIDTH) for i in range(2)] + [raw(grey, "mono8", at(2))]
-    frames = list(of_pictures(tmp_path / "log.mcap", pictures, IMAGE).frames())
+    frames = list(of_pictures(tmp_path / "log.mcap", pictures).frames())
     np.testing.assert_array_equal(frames[0].image, image)
     np.testing.assert_array_equal(frames[2].image, np.repeat(grey[:, :, None], 3, axis=2))
 
@@ -195,12 +190,12 @@ def test_video_in_a_log_is_read_frame_by_frame(tmp_path: Path) -> None:
 # --- depth and odometry ------------------------------------------------------------------------------------------
 
 
-def companions(path: Path, more: list[tuple[str, str, Fields, float]]) -> list[Frame]:
-    """Four black frames, at 0 to 3 periods, and what else was recorded: topic, type, fields, and when that was."""
-    sent = [(TOPIC, COMPRESSED, compressed(BLACK, at(i)), float(i)) for i in range(4)]
+def companions(path: Path, more: list[tuple[str, Said, float]]) -> list[Frame]:
+    """Four black frames, at 0 to 3 periods, and what else was recorded: topic, message, and when that was."""
+    sent = [(TOPIC, compressed(BLACK, at(i)), float(i)) for i in range(4)]
     with ros_log(path) as say:
-        for topic, kind, fields, when in sorted([*sent, *more], key=lambda each: each[3]):
-            say(topic, kind, fields, log_ns=at(when))
+        for topic, message, when in sorted([*sent, *more], key=lambda each: each[2]):
+            say(topic, *message, log_ns=at(when))
     names = ({topic: topic for topic, *_ in more}.get(name) for name in ("/depth", "/odom"))
     return list(LogSource(path, topic=TOPIC, depth_topic=next(names), odometry_topic=next(names)).frames())
 
@@ -210,10 +205,10 @@ def test_frames_carry_the_depth_that_was_stamped_nearest_to_them_in_metres(tmp_p
         return np.full((HEIGHT // 2, WIDTH // 2), millimetres, np.uint16)  # half the size, as many cameras send it
 
     more = [
-        ("/depth", IMAGE, raw(flat_depth(1000), "16UC1", at(0.1)), 0.1),
-        ("/depth", IMAGE, raw(flat_depth(1200), "16UC1", at(0.9)), 2.2),  # recorded late
-        ("/depth", IMAGE, raw(flat_depth(2000).astype(np.float32) / 1000, "32FC1", at(2.3)), 2.4),
-        ("/depth", IMAGE, raw(flat_depth(9000), "16UC1", at(3.6)), 3.6),  # too far from any picture
+        ("/depth", raw(flat_depth(1000), "16UC1", at(0.1)), 0.1),
+        ("/depth", raw(flat_depth(1200), "16UC1", at(0.9)), 2.2),  # recorded late
+        ("/depth", raw(flat_depth(2000).astype(np.float32) / 1000, "32FC1", at(2.3)), 2.4),
+        ("/depth", raw(flat_depth(9000), "16UC1", at(3.6)), 3.6),  # too far from any picture
     ]
     frames = companions(tmp_path / "log.mcap", more)
     assert stamps(frames) == [at(i) for i in range(4)]
@@ -233,8 +228,8 @@ def test_compressed_depth_is_read_and_holes_stay_holes(tmp_path: Path) -> None:
         ("16UC1; png compressed", b"", 1.5),
         ("32FC1; compressedDepth png", b"\0" * 4 + struct.pack("<ff", a, b), a / (1500 - b)),
     ):
-        fields = compressed(BLACK, at(1)) | {"format": format_, "data": head + coded(levels, ".png")}
-        found = companions(tmp_path / "log.mcap", [("/depth", COMPRESSED, fields, 1.0)])[1].depth
+        sent = compressed(BLACK, at(1), format_, head + coded(levels, ".png"))
+        found = companions(tmp_path / "log.mcap", [("/depth", sent, 1.0)])[1].depth
         assert found is not None
         np.testing.assert_allclose(found[1:], metres, rtol=1e-6)
         assert not found[0].any()
@@ -243,9 +238,9 @@ def test_compressed_depth_is_read_and_holes_stay_holes(tmp_path: Path) -> None:
 def test_frames_carry_the_camera_s_pose_by_odometry_and_static_transforms(tmp_path: Path) -> None:
     optical = (-0.5, 0.5, -0.5, 0.5)  # of a camera that looks ahead, by REP 103
     transforms = [transform("base_link", "mast", 2.0), transform("mast", "front_optical", 0.5, optical)]
-    more = [("/tf_static", TF, {"transforms": transforms}, -1.0)]
-    more += [("/odom", ODOMETRY, odometry(float(i), at(i + 0.2), yaw_deg=90.0), i + 0.2) for i in range(3)]
-    more += [("/odom", ODOMETRY, odometry(9.0, at(i + 0.4)), i + 0.4) for i in range(3)]  # farther from the picture
+    more = [("/tf_static", ("tf2_msgs/msg/TFMessage", {"transforms": transforms}), -1.0)]
+    more += [("/odom", odometry(float(i), at(i + 0.2), yaw_deg=90.0), i + 0.2) for i in range(3)]
+    more += [("/odom", odometry(9.0, at(i + 0.4)), i + 0.4) for i in range(3)]  # farther from the picture
     poses = [frame.odometry for frame in companions(tmp_path / "log.mcap", more)]
     for i, world_from_camera in enumerate(poses[:3]):
         assert world_from_camera is not None
@@ -262,9 +257,9 @@ def test_of_several_topics_one_must_be_named(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with ros_log(path) as say:
         for i in range(4):
-            say("/front/image", COMPRESSED, compressed(flat(200, 0, 0), at(i)))
-            say("/rear/image", COMPRESSED, compressed(flat(0, 0, 200), at(i)))
-            say("/words", STRING, {"data": "hello"})
+            say("/front/image", *compressed(flat(200, 0, 0), at(i)))
+            say("/rear/image", *compressed(flat(0, 0, 200), at(i)))
+            say("/words", *WORDS)
     for topic, depth_topic in ((None, None), ("/words", None), ("/rear/image", "/none")):
         with pytest.raises(SourceError, match="/rear/image"):  # which it has
             LogSource(path, topic=topic, depth_topic=depth_topic)
@@ -275,9 +270,9 @@ def test_pictures_that_begin_late_are_found_and_one_is_too_few(tmp_path: Path) -
     for count, error in ((0, SourceError), (1, TooShortError), (3, None)):
         with ros_log(tmp_path / "log.mcap") as say:
             for _ in range(100):
-                say("/words", STRING, {"data": "hello"})
+                say("/words", *WORDS)
             for i in range(count):
-                say(TOPIC, COMPRESSED, compressed(BLACK, at(i)))
+                say(TOPIC, *compressed(BLACK, at(i)))
         with nullcontext() if error is None else pytest.raises(error):
             assert LogSource(tmp_path / "log.mcap").topic == TOPIC
 
@@ -299,8 +294,8 @@ CALIBRATIONS = [
 def test_the_calibration_that_belongs_to_the_pictures_and_fits_them_is_used(tmp_path: Path) -> None:
     for topic, info_topic, info, lens in CALIBRATIONS:
         with ros_log(tmp_path / "log.mcap") as say:
-            say(info_topic, INFO, info)
+            say(info_topic, *info)
             for i in range(3):
-                say(topic, COMPRESSED, compressed(BLACK, at(i)))
+                say(topic, *compressed(BLACK, at(i)))
         found = LogSource(tmp_path / "log.mcap").info.lens
         assert lens == (None if found is None else (found.width, found.fx, found.fy, found.distortion))

@@ -174,7 +174,7 @@ def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
     with ros_log(folder / "log.mcap") as say:
         for i in range(COUNT):
             stamp_ns = START_NS + i * period_ns
-            say(TOPIC, "sensor_msgs/msg/CompressedImage", compressed(RED, stamp_ns), log_ns=stamp_ns, sequence=i)
+            say(TOPIC, *compressed(RED, stamp_ns), log_ns=stamp_ns, sequence=i)
     return play("mcap", folder / "log.mcap", slow)
 
 
