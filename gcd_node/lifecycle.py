@@ -133,7 +133,7 @@ class Transitions:
         self._info: SourceInfo | None = None
         self._first = (0, 0)
         self._interrupted = False
-        self._stuck: list[Stream] = []
+        self._stuck: Stream | None = None
         self.stream: Stream | None = None
         self.summary = Summary()
         self.failure: Exception | None = None
@@ -153,8 +153,7 @@ class Transitions:
     @property
     def left_behind(self) -> bool:
         """Whether a thread that should have ended still has not."""
-        self._stuck = [stream for stream in self._stuck if not stream.join(0.0)]
-        return bool(self._stuck)
+        return self._stuck is not None and not self._stuck.join(0.0)
 
     def configure(self) -> None:
         """Load the model, and check the views. A recording is opened, so that a bad one is known at once. Raises
@@ -209,7 +208,7 @@ class Transitions:
             stream.interrupt()
         if not self._has_ended(stream):
             _LOG.error("a thread of the stream does not end; it is left behind")
-            self._stuck.append(stream)
+            self._stuck = stream
         self.stream = None
         self._info, self._first = stream.context.source, stream.next
         self.summary, self.failure = stream.summary(), stream.failure
@@ -236,7 +235,7 @@ class Transitions:
         if stream is not None:
             stream.interrupt()
             if not stream.join(patience_s):
-                self._stuck.append(stream)
+                self._stuck = stream
         self._release()
 
     def _has_ended(self, stream: Stream) -> bool:

@@ -132,7 +132,8 @@ class Stream:
     def start(self) -> None:
         """Begin. Frames are read while the model warms up: its first window is a new one, and no camera's own buffers
         grow old."""
-        self._raise_flags((), self.context.ood)
+        for code in self.context.ood:
+            self._health.raise_reason(code, Level.WARN)
         self.notice_change()
         for thread in self._threads:
             thread.start()
@@ -257,15 +258,11 @@ class Stream:
         now = prepare_stream(self._live.config, before.traits, info, boot_id=before.boot_id, before=before)
         self._contexts = [*self._contexts[1 - _KEPT_EPOCHS :], (self._builder.epoch, now)]
         self._builder.run_at(now.fps, info.fps_nominal)
-        self._raise_flags(before.ood, now.ood)
-        self.notice_change()
-
-    def _raise_flags(self, before: tuple[str, ...], now: tuple[str, ...]) -> None:
-        """What lies outside the trained domain, in the node's health."""
-        for code in set(before) - set(now):
+        for code in before.ood:
             self._health.clear_reason(code)
-        for code in now:
+        for code in now.ood:
             self._health.raise_reason(code, Level.WARN)
+        self.notice_change()
 
     def _work(self) -> None:
         try:
