@@ -40,24 +40,29 @@ TOPIC = b"view/top/win".ljust(32, b"\0")
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    compiler = shutil.which("g++")
-    look = [compiler or "g++", "-E", "-x", "c++", "-include", "zmq.h", "/dev/null"]
-    if compiler is None or subprocess.run(look, capture_output=True, timeout=60, check=False).returncode:
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    look = ["g++", "-E", "-x", "c++", "-include", "zmq.h", "/dev/null"]
+    if shutil.which("g++") is None or subprocess.run(look, capture_output=True, check=False).returncode:
         pytest.skip("needs g++ and libzmq3-dev: apt install g++ libzmq3-dev")
     built = tmp_path_factory.mktemp("cpp") / "gcd-subscriber"
-    command = [compiler, *FLAGS, str(SOURCE), "-lzmq", "-o", str(built)]
+    command = ["g++", *FLAGS, str(SOURCE), "-lzmq", "-o", str(built)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 0, done.stderr
     return built
 
 
 @dataclass
-class Sender:
-    """Publishes whatever bytes it is told to, and loses none."""
+class Client:
+    """The program, and a socket that publishes whatever bytes it is told to, and loses none."""
 
+    program: Path
     endpoint: str
     socket: "zmq.Socket[bytes]"
+
+    def start(self, *options: str, endpoint: str = "") -> "subprocess.Popen[str]":
+        """Its two outputs in one; every line leaves at once, so that their order is kept."""
+        command = [str(self.program), "--endpoint", endpoint or self.endpoint, "--view", "top", *options]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def wait_for(self, topic: bytes = TOPIC) -> None:
         heard = b""
@@ -69,22 +74,33 @@ class Sender:
         for part in parts:
             self.socket.send(part)
 
+    def told_of(self, *parts: bytes, options: Sequence[str] = ()) -> list[str]:
+        """What it says of all these messages, the end of the stream left out."""
+        process = self.start("--every", *options)
+        self.wait_for()
+        self.send(*parts, ENDING)
+        *lines, last = lines_of(process)
+        assert last == "end view=top kind=win window=0"
+        return lines
+
+    def told_of_map(self, message: ViewMessage, folder: Path) -> str:
+        """What it says of one message of its kind."""
+        kind = message.topic.rpartition("/")[2]
+        process = self.start("--every", "--kind", kind, "--timeout", "1", "--ppm", str(folder))
+        self.wait_for(message.topic.encode().ljust(32, b"\0"))
+        self.send(encode(message))
+        return lines_of(process, 69)[0]
+
 
 @pytest.fixture
-def sender(tmp_path: Path) -> Iterator[Sender]:
+def client(program: Path, tmp_path: Path) -> Iterator[Client]:
     context = zmq.Context()
     socket = context.socket(zmq.XPUB)
     socket.set(zmq.SNDHWM, 0)
     socket.set(zmq.XPUB_VERBOSE, 1)
-    socket.bind(f"ipc://{tmp_path}/data")
-    yield Sender(f"ipc://{tmp_path}/data", socket)
+    socket.bind(f"ipc://{tmp_path}/sent")
+    yield Client(program, f"ipc://{tmp_path}/sent", socket)
     context.destroy(linger=0)
-
-
-def start(client: Path, endpoint: str, *options: str) -> "subprocess.Popen[str]":
-    """The client, its two outputs in one; every line leaves at once, so that their order is kept."""
-    command = [str(client), "--endpoint", endpoint, "--view", "top", *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def lines_of(process: "subprocess.Popen[str]", code: int = 0) -> list[str]:
@@ -104,16 +120,6 @@ def sent(message: ViewMessage, sequence: int) -> bytes:
 ENDING = encode(replace(end(), sequence=1000))
 
 
-def heard(client: Path, sender: Sender, parts: Sequence[bytes], *options: str) -> list[str]:
-    """What the client says of all these messages, the end of the stream left out."""
-    process = start(client, sender.endpoint, "--every", *options)
-    sender.wait_for()
-    sender.send(*parts, ENDING)
-    lines = lines_of(process)
-    assert lines[-1] == "end view=top kind=win window=0"
-    return lines[:-1]
-
-
 # Against the live node.
 
 
@@ -124,7 +130,7 @@ def fnv(image: NDArray[np.uint8]) -> str:
     return f"{number:016x}"
 
 
-def test_both_languages_read_the_same_from_a_live_node(client: Path, tmp_path: Path) -> None:
+def test_both_languages_read_the_same_from_a_live_node(client: Client, tmp_path: Path) -> None:
     frames = [np.random.default_rng(i).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8) for i in range(86)]
     write_video(tmp_path / "v.mkv", frames, 10.0)
     text = f"""
@@ -146,8 +152,8 @@ def test_both_languages_read_the_same_from_a_live_node(client: Path, tmp_path: P
     endpoint = config.publish.data
     (tmp_path / "pictures").mkdir()
     with Publisher(config.publish, lockstep=True) as publisher, ViewSubscriber(endpoint, "top", conflate=False) as ours:
-        every = start(client, endpoint, "--every", "--ppm", str(tmp_path / "pictures"))
-        newest = start(client, endpoint)
+        every = client.start("--every", "--ppm", str(tmp_path / "pictures"), endpoint=endpoint)
+        newest = client.start(endpoint=endpoint)
         reader = threading.Thread(target=lambda: views.extend(ours), daemon=True)
         reader.start()
         made_node(config, FakeSynthesizer(traits("driving")), open_source(config.source), publisher).run()
@@ -189,7 +195,7 @@ def expected(view: ReceivedView) -> dict[str, str]:
 # What it remembers, and what it leaves out.
 
 
-def test_gaps_restarts_and_old_revisions_are_noticed(client: Path, sender: Sender) -> None:
+def test_gaps_restarts_and_old_revisions_are_noticed(client: Client) -> None:
     parts = [
         sent(window(0, view_rev=3), 10),
         sent(window(1, view_rev=3), 14),
@@ -197,7 +203,7 @@ def test_gaps_restarts_and_old_revisions_are_noticed(client: Path, sender: Sende
         sent(window(2, view_rev=2), 15),
         sent(window(3, boot_id=OTHER_BOOT), 0),
     ]
-    lines = heard(client, sender, parts)
+    lines = client.told_of(*parts)
     assert [line.split()[0] for line in lines] == [*["view=top"] * 2, *["dropped"] * 2, "restarted", "view=top"]
     assert [fields_of(lines[i])["skipped"] for i in (0, 1, 5)] == ["0", "3", "0"]
     assert lines[2].endswith("rule=sequence seen before")
@@ -205,50 +211,39 @@ def test_gaps_restarts_and_old_revisions_are_noticed(client: Path, sender: Sende
     assert lines[4] == f"restarted boot_id={OTHER_BOOT}"
 
 
-def test_what_is_too_old_is_left_out_and_a_clock_ahead_makes_nothing_younger(client: Path, sender: Sender) -> None:
+def test_what_is_too_old_is_left_out_and_a_clock_ahead_makes_nothing_younger(client: Client) -> None:
     ahead, long_ago = window(1, age_ms=5000.0), window(2)
     ahead = replace(ahead, header=replace(ahead.header, t_publish_ns=ahead.header.t_publish_ns + 3_600_000_000_000))
     long_ago = replace(long_ago, header=replace(long_ago.header, t_publish_ns=1_700_000_000_000_000_000))
-    lines = heard(client, sender, [sent(ahead, 1), sent(long_ago, 2), sent(window(3, age_ms=50_000_000.0), 3)])
+    lines = client.told_of(sent(ahead, 1), sent(long_ago, 2), sent(window(3, age_ms=50_000_000.0), 3))
     assert fields_of(lines[0])["age_ms"] == "5000.0"
     assert lines[1].endswith("rule=expired: valid_for_ms is over")
     assert float(fields_of(lines[2])["age_ms"]) >= 50_000_000
-    lines = heard(client, sender, [sent(window(4, age_ms=50_000_000.0), 4)], "--max-age-ms", "40000000")
+    lines = client.told_of(sent(window(4, age_ms=50_000_000.0), 4), options=["--max-age-ms", "40000000"])
     assert lines[0].endswith("rule=older than --max-age-ms")
 
 
-def test_jpeg_is_written_as_it_came(client: Path, sender: Sender, tmp_path: Path) -> None:
+def test_jpeg_is_written_as_it_came(client: Client, tmp_path: Path) -> None:
     message = jpeg_window()
-    lines = heard(client, sender, [sent(message, 0)], "--ppm", str(tmp_path))
+    lines = client.told_of(sent(message, 0), options=["--ppm", str(tmp_path)])
     told = fields_of(lines[0])
     assert (told["encoding"], told["mean"], told["hash"]) == ("jpeg", "-", "-")
     written = b"".join((tmp_path / f"top_win_000000_0{i}.jpg").read_bytes() for i in range(2))
     assert written == message.payload
 
 
-def read_map(client: Path, sender: Sender, message: ViewMessage, folder: Path) -> list[str]:
-    """What the client says of one message of its kind."""
-    kind = message.topic.rpartition("/")[2]
-    process = start(client, sender.endpoint, "--every", "--kind", kind, "--timeout", "1", "--ppm", str(folder))
-    sender.wait_for(message.topic.encode().ljust(32, b"\0"))
-    sender.send(encode(message))
-    return lines_of(process, 69)
-
-
-def test_maps_are_written_as_grey(client: Path, sender: Sender, tmp_path: Path) -> None:
+def test_maps_are_written_as_grey(client: Client, tmp_path: Path) -> None:
     for kind, made in (("cls", class_map), ("vis", visibility)):
         message = made(5)
-        told = fields_of(read_map(client, sender, message, tmp_path)[0])
+        told = fields_of(client.told_of_map(message, tmp_path))
         assert (told["kind"], told["shape"], told["encoding"]) == (kind, "2x4x6x1", "class8")
         assert (tmp_path / f"top_{kind}_000005_01.pgm").read_bytes() == b"P5\n6 4\n255\n" + bytes(message.payload[24:])
 
 
-def test_every_depth_is_read_as_in_python_and_one_that_is_none_dropped(
-    client: Path, sender: Sender, tmp_path: Path
-) -> None:
+def test_every_depth_is_read_as_in_python_and_one_that_is_none_dropped(client: Client, tmp_path: Path) -> None:
     every = np.arange(0x7C00, dtype="<u2").view("<f2").reshape(2, 128, 124)  # all halves that are finite and positive
     message = depth(5, inverse=every)
-    told = fields_of(read_map(client, sender, message, tmp_path)[0])
+    told = fields_of(client.told_of_map(message, tmp_path))
     assert float(told["mean"]) == pytest.approx(inverse_depth(message).mean(dtype=np.float64), abs=1e-5)
     for index in range(2):
         head, pixels = (tmp_path / f"top_depth_000005_0{index}.pfm").read_bytes().split(b"-1.0\n", 1)
@@ -256,7 +251,7 @@ def test_every_depth_is_read_as_in_python_and_one_that_is_none_dropped(
         assert np.array_equal(np.frombuffer(pixels, "<f4").reshape(128, 124)[::-1], inverse_depth(message)[index])
     for value in (-0.5, np.nan, np.inf):
         wrong = depth(inverse=np.array([[[0.5, value]]], "<f2"))
-        assert read_map(client, sender, wrong, tmp_path)[0].endswith("rule=7: inverse depth is negative or not finite")
+        assert client.told_of_map(wrong, tmp_path).endswith("rule=7: inverse depth is negative or not finite")
 
 
 # Messages somebody has tampered with.
@@ -319,8 +314,8 @@ BROKEN = {
 }
 
 
-def test_each_rule_of_the_protocol_drops_its_message_in_both_languages(client: Path, sender: Sender) -> None:
-    lines = heard(client, sender, [*BROKEN.values(), GOOD])
+def test_each_rule_of_the_protocol_drops_its_message_in_both_languages(client: Client) -> None:
+    lines = client.told_of(*BROKEN.values(), GOOD)
     told = [line.partition("rule=")[2] for line in lines[:-1]]
     assert all(said.startswith(rule) for said, rule in zip(told, BROKEN, strict=True)), lines
     assert lines[-1].startswith("view=top")
@@ -329,21 +324,19 @@ def test_each_rule_of_the_protocol_drops_its_message_in_both_languages(client: P
             decode(part)
 
 
-def test_a_message_in_parts_is_none_and_what_follows_is_read(client: Path, sender: Sender) -> None:
-    process = start(client, sender.endpoint, "--every")
-    sender.wait_for()
-    sender.socket.send_multipart([GOOD, sent(window(1), 1)])
-    sender.send(sent(window(2), 2), ENDING)
+def test_a_message_in_parts_is_none_and_what_follows_is_read(client: Client) -> None:
+    process = client.start("--every")
+    client.wait_for()
+    client.socket.send_multipart([GOOD, sent(window(1), 1)])
+    client.send(sent(window(2), 2), ENDING)
     lines = lines_of(process)
     assert [line.partition("rule=")[2] for line in lines[:2]] == ["1: a message of several parts"] * 2
     assert fields_of(lines[2])["window"] == "2"
 
 
-def test_hundreds_of_mutated_messages_crash_nothing_and_what_python_accepts_is_accepted(
-    client: Path, sender: Sender
-) -> None:
+def test_hundreds_of_mutated_messages_crash_nothing_and_what_python_accepts_is_accepted(client: Client) -> None:
     parts = [*islice(mutated_messages(), ROUNDS // 2), *islice(mutated_headers(), ROUNDS // 2)]
-    lines = [line for line in heard(client, sender, parts) if not line.startswith("restarted")]
+    lines = [line for line in client.told_of(*parts) if not line.startswith("restarted")]
     accepted = 0
     for part, line in zip(parts, lines, strict=True):
         dropped = line.partition("rule=")[2][:2] in {f"{rule}:" for rule in range(1, 8)}
@@ -379,17 +372,17 @@ def mutated_headers() -> Iterator[bytes]:
 # Its options.
 
 
-def test_silence_ends_it_if_wanted_and_the_runtime_folder_is_found(client: Path, tmp_path: Path) -> None:
+def test_silence_ends_it_if_wanted_and_the_runtime_folder_is_found(client: Client, tmp_path: Path) -> None:
     environment = os.environ | {"RUNTIME_DIRECTORY": f"{tmp_path}:/other"}
-    command = [client, "--timeout", "0.2"]
+    command = [client.program, "--timeout", "0.2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, env=environment, check=False)
     assert done.returncode == 69
     assert done.stderr.startswith(f"nothing from ipc://{tmp_path}/data")
 
 
-def test_a_signal_ends_it_in_order(client: Path, sender: Sender) -> None:
+def test_a_signal_ends_it_in_order(client: Client) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
-        process = start(client, sender.endpoint)
-        sender.wait_for()
+        process = client.start()
+        client.wait_for()
         process.send_signal(number)
         assert lines_of(process) == []
