@@ -181,16 +181,17 @@ def _strided(images: Iterator[_Frame], request: ClipRequest, frames: int, path: 
 
 def _label(request: ClipRequest, source_fps: float | None, traits: Traits) -> float:
     """The frame rate the network is told: as asked, else the clip's own (the trained one it stands for)."""
-    if request.fps is None and source_fps is None:
+    if request.fps is not None:
+        return request.fps
+    if source_fps is None:
         return traits.fps
-    own = request.fps or (source_fps or 0.0) / request.stride
-    near = [rate for rate in traits.rates if abs(own / rate - 1) <= _RATE_TOLERANCE]
-    if not near and traits.rates:
-        rates = ", ".join(f"{rate:g}" for rate in traits.rates)
-        _LOG.warning("the clip runs at %g frames per second; %s was trained at %s", own, traits.name, rates)
-    if request.fps is not None or not near:
-        return own
-    return min(near, key=lambda rate: abs(own - rate))
+    own = source_fps / request.stride
+    nearest = min(traits.rates, key=lambda rate: abs(own - rate), default=own)
+    if abs(own / nearest - 1) <= _RATE_TOLERANCE:
+        return nearest
+    rates = ", ".join(f"{rate:g}" for rate in traits.rates)
+    _LOG.warning("the clip runs at %g frames per second; %s was trained at %s", own, traits.name, rates)
+    return own
 
 
 # The view.
