@@ -8,10 +8,9 @@ import json
 import re
 import runpy
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,16 +21,16 @@ import cv2
 import numpy as np
 import pytest
 import zmq
+from fakes import Steady
 from msgspec.structs import replace
+from rig import Rig
 from ros_stand_in import ROS, STORE, RosNode
 from wire_messages import CLASSES, OTHER_BOOT, class_map, depth, jpeg_window, numbers, origin, visibility, window
 
 from gcd_client import AuthError, ViewSubscriber
-from gcd_client.control import Code
 from gcd_client.images import depth_m
 from gcd_client.protocol import Message, StatusMessage, encode
-from gcd_node.control import ControlServer, Outcome
-from gcd_node.lifecycle import PATHS, Lifecycle, State
+from gcd_node.lifecycle import PATHS, State
 from gcd_node.sources.logs import pose_of
 
 PACKAGE = Path(__file__).parents[2] / "launch" / "ros2" / "gcd_views"
@@ -166,7 +165,8 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    endpoints = {name: f"ipc://{tmp_path}/{name}" for name in ("data", "status", "control")}
+    endpoints = {name: f"ipc://{tmp_path}/{name}" for name in ("data", "status")}
+    endpoints["control"] = f"ipc://{tmp_path}/node/control"
     monkeypatch.setattr(RosNode, "parameters", {**endpoints, "max_age_ms": 1_000_000})  # an integer, as a user writes
     monkeypatch.setattr(bridge, "_RETRY_S", 0.05)
     made = Bench(bridge.GcdViews(), tmp_path)
@@ -259,25 +259,7 @@ def test_a_view_id_that_is_none_never_becomes_a_topic(bench: Bench) -> None:
     assert {topic.split("/")[1] for topic in bench.node.topics if topic[0] == "~"} == {"top"}
 
 
-@dataclass
-class Life:
-    """The lifecycle of a node behind its control socket; each transition takes a moment."""
-
-    life: Lifecycle = field(default_factory=Lifecycle)
-
-    def handle(self, command: Any, role: str) -> Outcome:
-        if command.verb == "state":
-            return Outcome(result={})
-        if command.verb == "shutdown":
-            return Outcome(code=Code.ACCEPTED)
-        if self.life.refusal(command.verb) is not None:
-            return Outcome(code=Code.WRONG_STATE)
-        self.life.begin(command.verb)
-        threading.Timer(0.2, setattr, (self.life, "state", PATHS[command.verb][2])).start()
-        return Outcome(code=Code.ACCEPTED)
-
-
-def test_lifecycle_services_command_the_node(bench: Bench, tmp_path: Path) -> None:
+def test_lifecycle_services_command_the_node(bench: Bench) -> None:
     def call(service: str, **request: Any) -> Any:
         return bench.node.services[f"~/{service}"](SimpleNamespace(**request), SimpleNamespace())
 
@@ -285,9 +267,8 @@ def test_lifecycle_services_command_the_node(bench: Bench, tmp_path: Path) -> No
         transition = messages.Transition(id=number, label="")
         return call("change_state", transition=transition).success
 
-    node = Life()
-    endpoint = f"ipc://{tmp_path}/control"
-    with ControlServer(endpoint, node.handle, lambda: node.life.state.label, lambda *_: None):
+    (bench.folder / "node").mkdir()
+    with Rig(bench.folder / "node", lambda _: Steady(), more="life = {autostart = false}"):
         assert call("get_state").current_state.label == "unconfigured"
         assert [change(number) for number in (3, 1, 3)] == [False, True, True]  # activate, configure, activate
         assert call("get_state").current_state.id == State.ACTIVE
