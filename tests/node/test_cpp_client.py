@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import subprocess
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count, islice
@@ -17,18 +16,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from fakes import HEIGHT, WIDTH, FakeSynthesizer, made_node, traits
+from cameras import until
+from fakes import HEIGHT, WIDTH, FakeSynthesizer, traits
 from media import write_video
 from msgspec.structs import replace
 from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator
 from numpy.typing import NDArray
+from rig import Rig
 from wire_messages import OTHER_BOOT, class_map, depth, end, jpeg_window, visibility, window
 
 from gcd_client.images import inverse_depth
 from gcd_client.protocol import MAGIC, PREFIX, MessageError, ViewMessage, decode, encode
-from gcd_client.subscriber import ReceivedView, ViewSubscriber
-from gcd_node.config import parse_config
-from gcd_node.publisher import Publisher
+from gcd_client.subscriber import ReceivedView
 from gcd_node.sources import open_source
 
 SOURCE = Path(__file__).parents[2] / "launch" / "clients" / "subscriber.cpp"
@@ -133,31 +132,16 @@ def fnv(image: NDArray[np.uint8]) -> str:
 def test_both_languages_read_the_same_from_a_live_node(client: Client, tmp_path: Path) -> None:
     frames = [np.random.default_rng(i).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8) for i in range(86)]
     write_video(tmp_path / "v.mkv", frames, 10.0)
-    text = f"""
-        [source]
-        path = "{tmp_path}/v.mkv"
-        pace = "lockstep"
-        [window]
-        fps = 5.0
-        stride = 20        # valid for 8 s: a slow machine must not let them expire
-        [model]
-        weights = "fake"
-        [view.top]
-        [publish]
-        data = "ipc://{tmp_path}/data"
-        status = "ipc://{tmp_path}/status"
-        min_subscribers = 3
-    """
-    config, views = parse_config(text, "test"), list[ReceivedView]()
-    endpoint = config.publish.data
     (tmp_path / "pictures").mkdir()
-    with Publisher(config.publish, lockstep=True) as publisher, ViewSubscriber(endpoint, "top", conflate=False) as ours:
+    source, endpoint = f'path = "{tmp_path}/v.mkv"\npace = "lockstep"', f"ipc://{tmp_path}/data"
+    # valid for 8 s: a slow machine must not let them expire
+    more = "window = {fps = 5.0, stride = 20}\npublish = {min_subscribers = 3}"
+    model = FakeSynthesizer(traits("driving"))
+    with Rig(tmp_path, open_source, model, config=source, views="[view.top]", more=more, once=True) as rig:
         every = client.start("--every", "--ppm", str(tmp_path / "pictures"), endpoint=endpoint)
         newest = client.start(endpoint=endpoint)
-        reader = threading.Thread(target=lambda: views.extend(ours), daemon=True)
-        reader.start()
-        made_node(config, FakeSynthesizer(traits("driving")), open_source(config.source), publisher).run()
-        reader.join(PATIENCE_S)
+        until(lambda: rig.ended)
+    views = rig.of("top")
     assert len(views) == 2
     *lines, last = lines_of(every)
     assert [fields_of(line) | {"age_ms": ""} for line in lines] == [expected(view) for view in views]
