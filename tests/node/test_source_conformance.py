@@ -120,7 +120,7 @@ def open_v4l2_camera(folder: Path, slow: bool) -> Generator[Opened]:
 
 @contextmanager
 def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
-    with serving(write_transport_stream(folder / "live.ts", [RED] * 600), burst=40) as server:
+    with serving(write_transport_stream(folder / "live.ts", [RED] * 600)) as server:
         source = open_source(RtspSource(url=server.url, open_timeout_s=OPEN_S))
         with closing(source, server.stall) as opened:
             yield opened

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
@@ -28,7 +27,6 @@ from gcd_node.sources.files import (
 from gcd_node.window import WindowBuilder
 
 COUNT = 12
-REAL = Path(__file__).parents[2].parent / "shared" / "real"
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "avi", "mkv", "webm"])
@@ -105,12 +103,11 @@ def test_a_video_cut_short_gives_what_is_left_and_says_so(tmp_path: Path, caplog
     assert "truncated" in caplog.text
 
 
-def bad_videos(folder: Path) -> dict[str, Path]:
-    """What cannot be opened as a video."""
-    whole = write_video(folder / "whole.mp4", ramp(10)).read_bytes()
+def test_a_bad_video_is_refused_in_one_line_when_it_is_opened(tmp_path: Path) -> None:
+    whole = write_video(tmp_path / "whole.mp4", ramp(10)).read_bytes()
     data_at = whole.index(b"mdat") + 4
     data_end = data_at - 8 + int.from_bytes(whole[data_at - 8 : data_at - 4], "big")
-    write_video(folder / "good.mkv", ramp(3))
+    write_video(tmp_path / "good.mkv", ramp(3))
     contents = {
         "empty.mp4": b"",
         "junk.mp4": b"\x07" * 5000,
@@ -124,34 +121,22 @@ def bad_videos(folder: Path) -> dict[str, Path]:
         "log.mcap": b"\x89MCAP0\r\n" + bytes(300),
     }
     for name, content in contents.items():
-        (folder / name).write_bytes(content)
-    return {name: folder / name for name in contents} | {"missing": folder / "none.mp4", "folder": folder}
-
-
-def test_a_bad_video_is_refused_in_one_line_when_it_is_opened(tmp_path: Path) -> None:
-    for path in bad_videos(tmp_path).values():
+        (tmp_path / name).write_bytes(content)
+    for name in (*contents, "missing.mp4", ""):
         with pytest.raises(SourceError) as caught:
-            VideoFile(path)
-        message = str(caught.value)
-        assert path.name in message
-        assert "\n" not in message
+            VideoFile(tmp_path / name)
+        assert name in str(caught.value)
+        assert "\n" not in str(caught.value)
         assert caught.value.exit_code == 66
 
 
 def test_the_decoder_itself_says_nothing(tmp_path: Path) -> None:
-    bad_videos(tmp_path)
-    code = (
-        "import sys; from pathlib import Path; from gcd_node.errors import SourceError\n"
-        "from gcd_node.sources.files import VideoFile\n"
-        "for path in map(Path, sys.argv[1:]):\n"
-        "    try: VideoFile(path)\n"
-        "    except SourceError: print(path.name)\n"
-    )
-    names = ["truncated.mp4", "head.mkv", "blank.mp4", "av1.mp4"]
-    command = [sys.executable, "-c", code, *(str(tmp_path / name) for name in names)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True, env=environment())
-    assert done.stdout.split() == names
-    assert done.stderr == ""
+    (tmp_path / "head.mkv").write_bytes(b"\x1a\x45\xdf\xa3" + bytes(400))
+    code = "from pathlib import Path; from gcd_node.sources.files import VideoFile; VideoFile(Path('head.mkv'))"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=tmp_path, env=environment())
+    assert "SourceError" in done.stderr
+    assert "EBML" not in done.stderr
 
 
 def test_a_video_that_vanishes_between_loops_is_lost(tmp_path: Path) -> None:
@@ -170,19 +155,14 @@ def test_pictures_are_sorted_as_people_count(tmp_path: Path) -> None:
     assert [path.name for path in list_pictures(folder)] == ["A1.png", "a2.PNG", "a02b.jpg", "a10.png", "b1.png"]
 
 
-def test_a_picture_of_another_size_is_named_when_it_comes(tmp_path: Path) -> None:
-    pictures = {f"{i}.png": flat(0, 0, 0) for i in range(3)}
-    folder = write_pictures(tmp_path, pictures | {"3.png": flat(0, 0, 0, width=60), "4.png": flat(0, 0, 0, width=50)})
-    with pytest.raises(SourceError):
-        list(ImageFolder(folder, fps=10.0).frames())
+OTHER = cv2.imencode(".png", flat(0, 0, 0, width=60))[1].tobytes()
 
 
-@pytest.mark.parametrize("damage", [lambda data: data[:60], lambda data: data[:20], lambda data: b"x" * 99])
-def test_a_damaged_picture_is_named(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-    folder = write_pictures(tmp_path, {f"{i}.png": noise for i in range(3)})
-    (folder / "1.png").write_bytes(damage((folder / "1.png").read_bytes()))
-    with pytest.raises(SourceError):
+@pytest.mark.parametrize("content", [OTHER, OTHER[:60], OTHER[:20], b"x" * 99], ids=["other size", *"abc"])
+def test_a_damaged_picture_or_one_of_another_size_is_named_when_it_comes(content: bytes, tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path, {f"{i}.png": flat(0, 0, 0) for i in range(3)})
+    (folder / "1.png").write_bytes(content)
+    with pytest.raises(SourceError, match=r"1\.png"):
         list(ImageFolder(folder, fps=10.0).frames())
 
 
@@ -209,17 +189,3 @@ def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(
 def test_only_packaged_files_are_found_under_package(name: str) -> None:
     with pytest.raises(SourceError):
         resolve_path(name)
-
-
-@pytest.mark.parametrize(
-    ("name", "count", "fps", "size"),
-    [("kubmv7_scn01992_v11.mp4", 60, 24.0, (576, 384)), ("pd_scn01969.mp4", 50, 10.0, (640, 480))],
-)
-def test_real_recordings_are_read_whole(name: str, count: int, fps: float, size: tuple[int, int]) -> None:
-    path = REAL / name
-    if not path.is_file():
-        pytest.skip(f"{path} is not there")
-    video = VideoFile(path)
-    frames = list(video.frames())
-    assert (video.info.width, video.info.height, video.info.fps_nominal, video.info.codec) == (*size, fps, "h264")
-    assert [frame.stamp_ns for frame in frames] == pytest.approx([i * 1e9 / fps for i in range(count)], abs=1000)

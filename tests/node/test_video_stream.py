@@ -51,27 +51,18 @@ def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated(url: str) ->
     assert SECRET not in str(caught.value)
 
 
-def held(arrivals_ms: list[float]) -> list[bool]:
-    backlog = Backlog(period_ns=40_000_000)
-    return [backlog.holds(round(arrival * 1e6)) for arrival in arrivals_ms]
-
-
 @pytest.mark.parametrize(
     ("arrivals_ms", "old"),
     [
         ([0.0, 1.0, 2.0, 3.0, 43.0, 83.0, 90.0], [0, 1, 2, 3]),  # what piled up before the start
         ([0.0, 40.0, 80.0, 900.0, 901.0, 902.0, 941.0], [0, 3, 4, 5]),  # and in a silence
         ([0.0, 40.0, 110.0, 115.0, 160.0, 239.0, 241.0], [0]),  # jitter is no burst
+        ([10.0 * i for i in range(220)], [*range(201)]),  # what never waits is believed after two seconds
     ],
 )
 def test_a_burst_is_old_and_what_follows_in_time_is_not(arrivals_ms: list[float], old: list[int]) -> None:
-    assert [i for i, flag in enumerate(held(arrivals_ms)) if flag] == old
-
-
-def test_a_stream_that_never_waits_is_believed_after_two_seconds() -> None:
-    flags = held([10.0 * i for i in range(220)])
-    assert flags.index(False) == 201
-    assert not any(flags[201:])
+    backlog = Backlog(period_ns=40_000_000)
+    assert [i for i, each in enumerate(arrivals_ms) if backlog.holds(round(each * 1e6))] == old
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +74,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def server(recording: Path) -> Iterator[RtspServer]:
-    with serving(recording, burst=40) as running:
+    with serving(recording) as running:
         yield running
 
 
@@ -115,7 +106,7 @@ def test_a_password_opens_the_stream_and_no_password_is_ever_repeated(
     recording: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
-    with serving(recording, burst=40, password=SECRET) as server:
+    with serving(recording, password=SECRET) as server:
         right = server.url.replace("//", f"//admin:{SECRET}@")
         source = open_stream(RtspSource(url=right, open_timeout_s=GUARD_S))
         assert next(source.frames()).size == (WIDTH, HEIGHT)
