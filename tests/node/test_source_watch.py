@@ -1,7 +1,11 @@
+"""A live source over all its openings: stalled, lost, opened again, given up, closed."""
+
 import threading
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -13,15 +17,9 @@ from gcd_node.errors import SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
 from gcd_node.sources import V4l2Source
-from gcd_node.sources.live import LiveCamera, SourceWatch, backoff_s, patience_s
+from gcd_node.sources.live import LiveCamera, SourceWatch, WatchListener, backoff_s, patience_s
 from gcd_node.sources.opencv import open_v4l2
 from gcd_node.window import Reason
-
-
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera is lost sooner than two seconds after its last frame."""
-    monkeypatch.setattr("gcd_node.sources.live._LOST_S", 0.3)
 
 
 @pytest.fixture(autouse=True)
@@ -30,19 +28,40 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gcd_node.sources.live.backoff_s", lambda *_: 0.02)
 
 
-@dataclass
-class Log:
-    """A listener that writes down what it is told."""
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera is lost sooner than two seconds after its last frame."""
+    monkeypatch.setattr("gcd_node.sources.live._LOST_S", 0.3)
 
-    states: list[SourceState] = field(default_factory=list)
-    details: list[str] = field(default_factory=list)
-    told: list[str] = field(default_factory=list)
-    heard: list[Frame] = field(default_factory=list)
-    unwanted: tuple[int, int] | None = None
-    infos: list[SourceInfo] = field(default_factory=list)
+
+class Reader:
+    """Iterates a watch in a thread, as the node does, and writes down what it is told."""
+
+    def __init__(
+        self,
+        first: FrameSource,
+        reopen: Callable[[SourceInfo], FrameSource],
+        unwanted: tuple[int, int],
+        **patience: Any,
+    ) -> None:
+        self.told: list[str] = []
+        self.details: list[str] = []
+        self.infos: list[SourceInfo] = []
+        self.heard, self.frames = list[Frame](), list[Frame]()
+        self.failure: Exception | None = None
+        self._unwanted = unwanted
+        self.watch = SourceWatch(first, reopen, self, V4l2Source(**patience))
+        self.thread = threading.Thread(target=self._read, daemon=True)
+        self.thread.start()
+
+    def _read(self) -> None:
+        try:
+            for frame in self.watch.frames():
+                self.frames.append(frame)
+        except Exception as error:
+            self.failure = error
 
     def source_state(self, state: SourceState, detail: str) -> None:
-        self.states.append(state)
         self.details.append(detail)
         self.told.append(state)
 
@@ -55,86 +74,72 @@ class Log:
     def source_opened(self, info: SourceInfo) -> bool:
         self.told.append("opened")
         self.infos.append(info)
-        return (info.width, info.height) != self.unwanted
+        return (info.width, info.height) != self._unwanted
 
-
-class Reader:
-    """Iterates a watch in a thread, as the node does."""
-
-    def __init__(self, first: FrameSource, bench: Bench | None = None, **patience: Any) -> None:
-        self.log = Log()
-        plugged = bench or Bench()
-        self.watch = SourceWatch(first, lambda _: plugged.open(), self.log, V4l2Source(**patience))
-        self.frames: list[Frame] = []
-        self.failure: Exception | None = None
-        self.thread = threading.Thread(target=self._read, daemon=True)
-        self.thread.start()
-
-    def _read(self) -> None:
-        try:
-            for frame in self.watch.frames():
-                self.frames.append(frame)
-        except Exception as error:
-            self.failure = error
-
-    def finish(self) -> "Reader":
+    def finish(self) -> None:
         self.thread.join(20)
         assert not self.thread.is_alive()
-        return self
+
+
+@contextmanager
+def watching(
+    first: FrameSource,
+    bench: Bench | Callable[[SourceInfo], FrameSource] | None = None,
+    unwanted: tuple[int, int] = (0, 0),
+    **patience: Any,
+) -> Iterator[Reader]:
+    """A reader, until the block is left; bench: what it is opened from again."""
+    plugged = bench or Bench()
+    reopen = (lambda _: plugged.open()) if isinstance(plugged, Bench) else plugged
+    reader = Reader(first, reopen, unwanted, **patience)
+    yield reader
+    reader.watch.close()
+    reader.finish()
 
 
 def test_a_silent_camera_stalls_and_goes_on() -> None:
     camera = Camera()
-    reader = Reader(camera, stall_ms=100.0)
-    camera.shoot()
-    until(lambda: "stalled" in reader.log.states)
-    camera.shoot()
-    until(lambda: len(reader.frames) == 2)
-    reader.watch.close()
-    reader.finish()
-    assert reader.log.states == ["connecting", "streaming", "stalled", "streaming"]
-    assert "SRC_LOST" not in reader.log.told
+    with watching(camera, stall_ms=100.0) as reader:
+        camera.shoot()
+        until(lambda: "stalled" in reader.told)
+        camera.shoot()
+        until(lambda: len(reader.frames) == 2)
+    assert reader.told == ["connecting", "opened", "streaming", "stalled", "streaming"]
 
 
 @pytest.mark.parametrize("ending", [SourceLostError("USB said goodbye"), SourceError("torn"), None])
 def test_a_camera_that_says_it_is_gone_is_believed_at_once(ending: Exception | None) -> None:
     camera, second = Camera(), Camera()
-    reader = Reader(camera, Bench(second))
-    camera.shoot()
-    camera.feed(ending)
-    until(lambda: "lost" in reader.log.states)
-    second.shoot()
-    until(lambda: len(reader.frames) == 2)
-    reader.watch.close()
-    reader.finish()
-    assert "stalled" not in reader.log.states
-    assert reader.log.details[reader.log.states.index("lost")] == str(ending or "the stream ended")
+    with watching(camera, Bench(second)) as reader:
+        camera.shoot()
+        camera.feed(ending)
+        until(lambda: "lost" in reader.told)
+        second.shoot()
+        until(lambda: len(reader.frames) == 2)
+    assert reader.told == ["connecting", "opened", "streaming", "lost", "SRC_LOST", "opened", "streaming"]
+    assert str(ending or "the stream ended") in reader.details
 
 
 @pytest.mark.usefixtures("impatient")
 def test_a_device_that_never_answers_again_is_left_behind() -> None:
     deaf, second = FakeVideoCapture(flat(9, 9, 9)), Camera()
-    first = open_v4l2(V4l2Source(device="/dev/null"), deaf.open)
-    reader = Reader(first, Bench(second), stall_ms=50.0)
-    until(lambda: reader.frames != [])
-    deaf.awake.clear()
-    until(lambda: len(reader.log.infos) == 2)
-    second.shoot()
-    until(lambda: reader.frames[-1].size == (96, 64))
-    deaf.awake.set()  # too late: nobody reads it any more
-    assert deaf.released.wait(20)
-    reader.watch.close()
-    reader.finish()
+    with watching(open_v4l2(V4l2Source(device="/dev/null"), deaf.open), Bench(second), stall_ms=50.0) as reader:
+        until(lambda: reader.frames != [])
+        deaf.awake.clear()
+        until(lambda: len(reader.infos) == 2)
+        second.shoot()
+        until(lambda: reader.frames[-1].size == (96, 64))
+        deaf.awake.set()  # too late: nobody reads it any more
+        assert deaf.released.wait(20)
     assert reader.frames[-1].size == (96, 64)
 
 
 def test_after_so_many_failed_attempts_in_a_row_it_is_given_up() -> None:
     camera, bench = Camera(), Bench()
-    reader = Reader(camera, bench, max_reconnects=3)
-    camera.shoot()
-    until(lambda: reader.frames != [])
-    camera.feed(SourceLostError("gone"))
-    reader.finish()
+    with watching(camera, bench, max_reconnects=3) as reader:
+        camera.shoot()
+        camera.feed(SourceLostError("gone"))
+        reader.finish()
     assert isinstance(reader.failure, SourceLostError)
     assert "3 attempts" in str(reader.failure)
     assert "there is no camera" in str(reader.failure)
@@ -144,39 +149,37 @@ def test_after_so_many_failed_attempts_in_a_row_it_is_given_up() -> None:
 @pytest.mark.usefixtures("impatient")
 def test_a_camera_that_opens_and_gives_nothing_counts_as_a_failed_attempt() -> None:
     camera, bench = Camera(), Bench(Camera(), Camera(), Camera())
-    reader = Reader(camera, bench, max_reconnects=2, open_timeout_s=0.05, stall_ms=10.0)
-    camera.shoot()
-    reader.finish()
+    with watching(camera, bench, max_reconnects=2, open_timeout_s=0.05, stall_ms=10.0) as reader:
+        camera.shoot()
+        reader.finish()
     assert isinstance(reader.failure, SourceLostError)
     assert len(bench.opened) == 2
 
 
 def test_frames_of_a_size_nobody_wants_are_told_of_and_not_given() -> None:
     camera = Camera()
-    reader = Reader(camera)
-    reader.log.unwanted = (48, 32)
-    for size in ((96, 64), (48, 32), (48, 32), (96, 64)):
-        camera.shoot(np.zeros((size[1], size[0], 3), np.uint8))
-    until(lambda: len(reader.log.heard) == 4)
-    until(lambda: len(reader.frames) == 2)
-    reader.watch.close()
-    reader.finish()
+    with watching(camera, unwanted=(48, 32)) as reader:
+        for size in ((96, 64), (48, 32), (48, 32), (96, 64)):
+            camera.shoot(np.zeros((size[1], size[0], 3), np.uint8))
+        until(lambda: len(reader.frames) == 2)
+    assert [frame.seq for frame in reader.heard] == [0, 1, 2, 3]
     assert [frame.seq for frame in reader.frames] == [0, 3]
-    assert reader.log.told == ["connecting", "opened", "streaming", *["SRC_FORMAT", "opened"] * 2]
+    assert reader.told == ["connecting", "opened", "streaming", *["SRC_FORMAT", "opened"] * 2]
     assert reader.watch.skipped == 2
 
 
 def test_a_fault_of_ours_in_a_source_is_not_taken_for_a_lost_camera() -> None:
     camera = Camera()
-    reader = Reader(camera, Bench(Camera()))
-    camera.feed(ZeroDivisionError("a bug"))
-    assert isinstance(reader.finish().failure, ZeroDivisionError)
+    with watching(camera, Bench(Camera())) as reader:
+        camera.feed(ZeroDivisionError("a bug"))
+        reader.finish()
+    assert isinstance(reader.failure, ZeroDivisionError)
 
 
 def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
     fake = FakeVideoCapture(flat(9, 9, 9), fps=200.0)
     camera = open_v4l2(V4l2Source(device="/dev/null"), fake.open)
-    watch = SourceWatch(camera, lambda _: Camera(), Log(), V4l2Source())
+    watch = SourceWatch(camera, lambda _: camera, create_autospec(WatchListener), V4l2Source())
     frames = watch.frames()
     seqs = [next(frames).seq]
     until(lambda: fake.grabbed > 50)
@@ -190,27 +193,23 @@ def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
     assert watch.skipped + len(seqs) == fake.grabbed + 1
 
 
-def test_closing_ends_a_silent_watch_and_one_that_looks_for_its_camera() -> None:
-    for lost in (False, True):
-        camera = Camera()
-        reader = Reader(camera, Bench())
+@pytest.mark.parametrize("lost", [False, True])
+def test_closing_ends_a_silent_watch_and_one_that_looks_for_its_camera(lost: bool) -> None:
+    camera = Camera()
+    with watching(camera) as reader:
         if lost:
             camera.feed(None)
-            until(lambda reader=reader: "lost" in reader.log.states)
+            until(lambda: "lost" in reader.told)
         started_s = time.monotonic()
-        reader.watch.close()
-        reader.finish()
-        assert time.monotonic() - started_s < 10
-        assert camera.closed.is_set()
+    assert time.monotonic() - started_s < 10
+    assert camera.closed.is_set()
 
 
 def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
     camera, late = Camera(), Camera()
-    asked, answer = threading.Event(), threading.Event()
-    asked_for: list[SourceInfo] = []
+    answer, asked_for = threading.Event(), list[SourceInfo]()
 
     def open_slowly() -> Camera:
-        asked.set()
         answer.wait(60)
         return late
 
@@ -218,18 +217,12 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
         asked_for.append(before)
         return LiveCamera("slow", open_slowly, open_timeout_s=60.0, hint="wait")
 
-    watch = SourceWatch(camera, reopen, Log(), V4l2Source())
-    left = threading.Thread(target=lambda: list(watch.frames()), daemon=True)
-    left.start()
-    camera.feed(None)
-    assert asked.wait(20)
-    watch.close()
-    left.join(20)
-    assert not left.is_alive()
+    with watching(camera, reopen):
+        camera.feed(None)
+        until(lambda: asked_for == [camera.info])
     assert not late.closed.is_set()
     answer.set()
     until(late.closed.is_set)  # nobody wants it any more
-    assert asked_for == [camera.info]
 
 
 def test_waiting_doubles_up_to_its_limit_and_never_passes_it(monkeypatch: pytest.MonkeyPatch) -> None:
