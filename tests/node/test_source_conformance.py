@@ -1,6 +1,6 @@
 """The contract of gcd_node.frame.FrameSource, one suite over every kind of source a launch file can name.
 
-Each kind is a row of KINDS: how to open one that shows flat red, how to silence it, and what it says if it is missing.
+KINDS says how to open one of each kind that shows flat red, and how to silence it, MISSING one that is not there.
 """
 
 import importlib.util
@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import get_args
@@ -23,7 +22,7 @@ from rtsp_server import serving, write_transport_stream
 
 from gcd_client import FramePusher
 from gcd_node.errors import SourceAbsentError, SourceError
-from gcd_node.frame import Frame, FrameSource, Image
+from gcd_node.frame import Frame, FrameSource
 from gcd_node.sources import (
     LIVE_KINDS,
     FileSource,
@@ -47,41 +46,12 @@ OPEN_S = 20.0
 GUARD_S = 30.0
 
 
-def nothing() -> None:
-    """A recording needs no silencing: opened slowly, it waits by itself."""
-
-
 Opened = tuple[FrameSource, Callable[[], None]]
 """A source, and what makes a live one silent."""
 
 
-def is_red(image: Image) -> None:
-    assert np.abs(image[8:-8, 8:-8].astype(int) - COLOUR).max() <= 8
-
-
-def is_striped(image: Image) -> None:
-    """Red stripes, not blue ones, are the brightest in red."""
-    red, green, blue = image[-1, np.argmax(image[-1, :, 0].astype(int) - image[-1, :, 2])].astype(int)
-    assert red > max(green, blue) + 100
-
-
-@dataclass(frozen=True, kw_only=True)
-class Kind:
-    """How the suite handles one kind of source.
-
-    open: with "slow" a recording plays in real time, a frame every 2 s; else it plays in lockstep. A live one gives
-        25 FPS, whichever.
-    missing: settings for one that is not there, and the error that says so.
-    """
-
-    open: Callable[[Path, bool], AbstractContextManager[Opened]]
-    missing: Callable[[Path], SourceConfig] | None = None
-    error: type[SourceError] = SourceError
-    check: Callable[[Image], None] = is_red
-
-
 @contextmanager
-def closing(source: FrameSource, hush: Callable[[], None] = nothing) -> Generator[Opened]:
+def closing(source: FrameSource, hush: Callable[[], None] = lambda: None) -> Generator[Opened]:
     try:
         yield source, hush
     finally:
@@ -178,25 +148,25 @@ def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
     return play("mcap", folder / "log.mcap", slow)
 
 
-KINDS: dict[SourceKind, Kind] = {
-    "file": Kind(open=open_file, missing=lambda folder: FileSource(path=str(folder / "none.mp4"))),
-    "folder": Kind(open=open_folder, missing=lambda folder: FolderSource(path=str(folder / "none"), fps=5.0)),
-    "synthetic": Kind(open=open_synthetic, check=is_striped),
-    "mcap": Kind(open=open_mcap, missing=lambda folder: McapSource(path=str(folder / "none.mcap"))),
-    "v4l2": Kind(
-        open=open_v4l2_camera, missing=lambda folder: V4l2Source(device=str(folder / "video7")), error=SourceAbsentError
-    ),
-    "rtsp": Kind(
-        open=open_rtsp, missing=lambda folder: RtspSource(url="rtsp://127.0.0.1:1/live"), error=SourceAbsentError
-    ),
-    "oak": Kind(
-        open=open_oak, missing=lambda folder: OakSource(device="14442C10NOSUCHDEVICE"), error=SourceAbsentError
-    ),
-    "push": Kind(
-        open=open_push,
-        missing=lambda folder: PushSource(endpoint=f"ipc://{folder}/frames", open_timeout_s=0.3),
-        error=SourceAbsentError,
-    ),
+KINDS: dict[SourceKind, Callable[[Path, bool], AbstractContextManager[Opened]]] = {
+    "file": open_file,
+    "folder": open_folder,
+    "synthetic": open_synthetic,
+    "mcap": open_mcap,
+    "v4l2": open_v4l2_camera,
+    "rtsp": open_rtsp,
+    "oak": open_oak,
+    "push": open_push,
+}
+"""With True a recording plays in real time, a frame every 2 s; else in lockstep. A live one gives 25 FPS, whichever."""
+MISSING: dict[SourceKind, Callable[[Path], SourceConfig]] = {
+    "file": lambda folder: FileSource(path=str(folder / "none.mp4")),
+    "folder": lambda folder: FolderSource(path=str(folder / "none"), fps=5.0),
+    "mcap": lambda folder: McapSource(path=str(folder / "none.mcap")),
+    "v4l2": lambda folder: V4l2Source(device=str(folder / "video7")),
+    "rtsp": lambda folder: RtspSource(url="rtsp://127.0.0.1:1/live"),
+    "oak": lambda folder: OakSource(device="14442C10NOSUCHDEVICE"),
+    "push": lambda folder: PushSource(endpoint=f"ipc://{folder}/frames", open_timeout_s=0.3),
 }
 LIVE: list[SourceKind] = [kind for kind in KINDS if kind in LIVE_KINDS]
 RECORDED: list[SourceKind] = [kind for kind in KINDS if kind not in LIVE_KINDS]
@@ -216,7 +186,7 @@ def test_every_kind_of_a_launch_file_is_in_this_suite() -> None:
 
 @every_kind
 def test_a_source_says_what_it_is_and_gives_such_frames(kind: SourceKind, tmp_path: Path) -> None:
-    with KINDS[kind].open(tmp_path, False) as (source, _):
+    with KINDS[kind](tmp_path, False) as (source, _):
         info = source.info
         assert (info.kind, info.clock) == (kind, "realtime" if kind in LIVE else "replay")
         assert info.fps_nominal == pytest.approx(25.0, rel=0.02)
@@ -231,12 +201,12 @@ def test_a_source_says_what_it_is_and_gives_such_frames(kind: SourceKind, tmp_pa
             assert (frame.image.dtype, frame.image.shape) == (np.uint8, (HEIGHT, WIDTH, 3))
             assert frame.size == (info.width, info.height)
             assert not frame.image.flags.writeable
-            KINDS[kind].check(frame.image)
+            assert kind == "synthetic" or np.abs(frame.image[8:-8, 8:-8].astype(int) - COLOUR).max() <= 8
 
 
 @live_kinds
 def test_a_slow_caller_of_a_camera_gets_the_newest_by_this_host_s_clock(kind: SourceKind, tmp_path: Path) -> None:
-    with KINDS[kind].open(tmp_path, False) as (source, _):
+    with KINDS[kind](tmp_path, False) as (source, _):
         first = next(iter(source.frames()))
         time.sleep(0.6)
         asked_ns = time.monotonic_ns()
@@ -249,7 +219,7 @@ def test_a_slow_caller_of_a_camera_gets_the_newest_by_this_host_s_clock(kind: So
 def test_a_recording_begins_again_with_every_look_and_a_slow_caller_misses_nothing(
     kind: SourceKind, tmp_path: Path
 ) -> None:
-    with KINDS[kind].open(tmp_path, False) as (source, _):
+    with KINDS[kind](tmp_path, False) as (source, _):
         first: list[Frame] = []
         for frame in source.frames():
             first.append(frame)
@@ -262,7 +232,7 @@ def test_a_recording_begins_again_with_every_look_and_a_slow_caller_misses_nothi
 
 @every_kind
 def test_closing_from_another_thread_ends_a_blocked_look_within_a_second(kind: SourceKind, tmp_path: Path) -> None:
-    with KINDS[kind].open(tmp_path, True) as (source, hush):
+    with KINDS[kind](tmp_path, True) as (source, hush):
         seen: list[Frame] = []
         errors: list[Exception] = []
         reader = threading.Thread(target=lambda: look(source, seen, errors), daemon=True)
@@ -283,7 +253,7 @@ def test_closing_from_another_thread_ends_a_blocked_look_within_a_second(kind: S
 def test_a_closed_source_stays_closed_for_a_look_that_was_given_up_and_a_new_one(
     kind: SourceKind, tmp_path: Path
 ) -> None:
-    with KINDS[kind].open(tmp_path, False) as (source, _):
+    with KINDS[kind](tmp_path, False) as (source, _):
         frames = source.frames()
         next(frames)
         source.close()
@@ -292,15 +262,13 @@ def test_a_closed_source_stays_closed_for_a_look_that_was_given_up_and_a_new_one
         assert list(source.frames()) == []
 
 
-@every_kind
+@each_of(MISSING)
 def test_what_is_missing_is_refused_in_one_line_and_in_time(kind: SourceKind, tmp_path: Path) -> None:
-    if (missing := KINDS[kind].missing) is None:
-        return
     begin = time.monotonic()
     with pytest.raises(SourceError) as caught:
-        _ = open_source(missing(tmp_path)).info
+        _ = open_source(MISSING[kind](tmp_path)).info
     assert time.monotonic() - begin < GUARD_S
-    assert type(caught.value) is KINDS[kind].error
+    assert type(caught.value) is (SourceAbsentError if kind in LIVE else SourceError)
     assert "\n" not in str(caught.value)
 
 
