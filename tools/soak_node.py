@@ -86,7 +86,7 @@ class CameraScript:
 class ScriptedDriver:
     """One opening of a CameraScript, as the Driver of a LiveCamera."""
 
-    fps = FPS
+    kind, id, fps = "v4l2", "scripted", FPS
 
     def __init__(self, script: CameraScript) -> None:
         self._script = script
@@ -98,9 +98,8 @@ class ScriptedDriver:
     def read(self) -> Frame | None:
         return next(self._played)
 
-    def describe(self, first: Frame, fps: float) -> SourceInfo:
-        width, height = self._script.size
-        return SourceInfo(kind="v4l2", id="scripted", width=width, height=height, fps_nominal=fps, clock="realtime")
+    def describe(self, info: SourceInfo) -> SourceInfo:
+        return info
 
     def close(self) -> None:
         """It holds nothing."""

@@ -84,16 +84,27 @@ class Recording:
             SourceError: the recording is damaged or gone.
         """
         period_ns = round(1e9 / self.info.fps_nominal)
-        due_ns, newest_ns = time.monotonic_ns(), None
-        for frame in self._played():
-            step_ns = 0 if newest_ns is None else frame.stamp_ns - newest_ns
-            due_ns += step_ns if 0 <= step_ns <= max(_LONGEST_STEP_NS, 2 * period_ns) else period_ns
-            newest_ns = frame.stamp_ns
-            if self._realtime and (left_ns := due_ns - time.monotonic_ns()) > 0:
-                self._stopped.wait(left_ns / 1e9)
-            if self._stopped.is_set():
+        seam_ns, longest_ns = max(_SEAM_NS, _SEAM_PERIODS * period_ns), max(_LONGEST_STEP_NS, 2 * period_ns)
+        due_ns, newest = time.monotonic_ns(), None
+        while not self._stopped.is_set():
+            begin_ns = begin_seq = None  # of this pass
+            for frame in self._one_pass():
+                if begin_ns is None or begin_seq is None:
+                    begin_ns = 0 if newest is None else newest.stamp_ns + seam_ns - frame.stamp_ns
+                    begin_seq = 0 if newest is None else newest.seq + 1 - frame.seq
+                frame = replace(frame, stamp_ns=frame.stamp_ns + begin_ns, seq=frame.seq + begin_seq)
+                step_ns = 0 if newest is None else frame.stamp_ns - newest.stamp_ns
+                due_ns += step_ns if 0 <= step_ns <= longest_ns else period_ns
+                newest = frame
+                if self._realtime and (left_ns := due_ns - time.monotonic_ns()) > 0:
+                    self._stopped.wait(left_ns / 1e9)
+                if self._stopped.is_set():
+                    return
+                yield frame
+            if begin_ns is None and not self._stopped.is_set():
+                raise SourceError(f"{self._name} gives no pictures any more; was it replaced while it was playing?")
+            if not self._loop:
                 return
-            yield frame
 
     def close(self) -> None:
         """End `frames` soon, from any thread."""
@@ -101,23 +112,6 @@ class Recording:
 
     def _one_pass(self) -> Iterator[Frame]:
         raise NotImplementedError
-
-    def _played(self) -> Iterator[Frame]:
-        """One pass, or pass after pass, each with a leap of the stamps after the one before."""
-        begin_ns, begin_seq = 0, 0
-        seam_ns = max(_SEAM_NS, round(_SEAM_PERIODS * 1e9 / self.info.fps_nominal))
-        while not self._stopped.is_set():
-            first = newest = None
-            for frame in self._one_pass():
-                first = frame if first is None else first
-                newest = replace(frame, stamp_ns=frame.stamp_ns + begin_ns, seq=frame.seq + begin_seq)
-                yield newest
-            if self._stopped.is_set() or (newest is not None and not self._loop):
-                return
-            if first is None or newest is None:
-                raise SourceError(f"{self._name} gives no pictures any more; was it replaced while it was playing?")
-            begin_ns = newest.stamp_ns + seam_ns - first.stamp_ns
-            begin_seq = newest.seq + 1 - first.seq
 
 
 class VideoFile(Recording):

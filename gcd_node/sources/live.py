@@ -36,9 +36,12 @@ Opener: TypeAlias = Callable[[SourceInfo], FrameSource]
 class Driver(Protocol):
     """A camera while it is open; one thread alone uses it.
 
+    kind, id: see SourceInfo. corrupt: pictures so far that arrived damaged.
     fps: the rate it states, None if it has to be measured; of interest once the first picture was read.
-    corrupt: pictures so far that arrived damaged.
     """
+
+    kind: SourceKind
+    id: str
 
     @property
     def fps(self) -> float | None: ...
@@ -49,8 +52,8 @@ class Driver(Protocol):
         """Wait for the next picture, or a moment; None: none came, or a damaged one. Raises SourceLostError."""
         ...
 
-    def describe(self, first: Frame, fps: float) -> SourceInfo:
-        """What is known of the camera once it has given its first picture."""
+    def describe(self, info: SourceInfo) -> SourceInfo:
+        """With what else is known of the camera once it has given its first picture."""
         ...
 
     def close(self) -> None:
@@ -169,7 +172,9 @@ class LiveCamera:
             return
         if (fps := driver.fps) is None:
             frame, fps = self._measured(driver, frame)
-        self._described = driver.describe(frame, fps)
+        width, height = frame.size
+        info = SourceInfo(kind=driver.kind, id=driver.id, width=width, height=height, fps_nominal=fps, clock="realtime")
+        self._described = driver.describe(info)
         while frame is not None:
             with self._changed:
                 self.skipped += self._is_read and len(self._waiting) == _WAITING

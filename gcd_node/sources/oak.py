@@ -10,7 +10,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, Image, LensModel, SourceInfo, depthai_lens
-from gcd_node.sources import OakSource
+from gcd_node.sources import OakSource, SourceKind
 from gcd_node.sources.live import LiveCamera
 
 if TYPE_CHECKING:
@@ -67,7 +67,8 @@ class _OakDriver:
         if isinstance(opened, Exception):
             raise opened
         self._stream, self._queue = opened
-        self.fps = self._stream.fps
+        self.kind: SourceKind = "oak"
+        self.id, self.fps = self._stream.id, self._stream.fps
         self._newest: dai.ImgFrame | None = None
 
     def read(self) -> Frame | None:
@@ -95,21 +96,13 @@ class _OakDriver:
         states = [f"device {each.lower()}" for each in self._states if each != "RUNNING"]
         return SourceLostError(f"OAK {self._stream.id} is lost: {(*states, reason)[0]}; check its cable and power")
 
-    def describe(self, first: Frame, fps: float) -> SourceInfo:
-        message, stream, size = self._newest, self._stream, first.size
+    def describe(self, info: SourceInfo) -> SourceInfo:
+        message = self._newest
         assert message is not None
-        fps = message.getFps() if message.getFps() > 0 else fps
-        exposure_known = message.getExposureTime() > timedelta(0)
-        return SourceInfo(
-            kind="oak",
-            id=stream.id,
-            width=size[0],
-            height=size[1],
-            fps_nominal=fps,
-            clock="realtime",
-            lens=self._lens(message, size),
-            stamp_uncertainty_us=_SYNCED_US if exposure_known else round(0.5e6 / fps),
-        )
+        fps = message.getFps() if message.getFps() > 0 else info.fps_nominal
+        uncertainty_us = _SYNCED_US if message.getExposureTime() > timedelta(0) else round(0.5e6 / fps)
+        lens = self._lens(message, (info.width, info.height))
+        return replace(info, fps_nominal=fps, lens=lens, stamp_uncertainty_us=uncertainty_us)
 
     def _lens(self, message: "dai.ImgFrame", size: tuple[int, int]) -> LensModel | None:
         """Of the picture itself, which knows what the sensor's mode cuts off; else of the device's memory."""

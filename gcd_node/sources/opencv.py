@@ -7,6 +7,7 @@ import os
 import re
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 from urllib.parse import urlsplit
@@ -36,16 +37,15 @@ OpenCapture: TypeAlias = Callable[..., cv2.VideoCapture]
 class _OpenCvDriver:
     """A cv2.VideoCapture as a Driver; each kind says how it is set up and what its stamps are.
 
-    kind, hint, uncertainty_us: of SourceInfo, and of messages. Sequence numbers count what the camera gives.
+    hint: of messages. Sequence numbers count what the camera gives.
     """
 
     kind: SourceKind
     hint: str
-    uncertainty_us = _STREAM_UNCERTAINTY_US
 
     def __init__(self, name: str, id_: str, fps: float | None, capture: cv2.VideoCapture) -> None:
         """name: of messages. fps: as the user states it. Raises SourceError as `set_up`."""
-        self.name, self._id, self.corrupt, self._seq = name, id_, 0, -1
+        self.name, self.id, self.corrupt, self._seq = name, id_, 0, -1
         self.stated_fps, self.capture, self.close = fps, capture, capture.release
         try:
             self.set_up()
@@ -77,17 +77,9 @@ class _OpenCvDriver:
         self.corrupt += image is None
         return None if image is None else Frame(image=image, stamp_ns=stamp_ns, seq=self._seq)
 
-    def describe(self, first: Frame, fps: float) -> SourceInfo:
-        return SourceInfo(
-            kind=self.kind,
-            id=self._id,
-            width=first.size[0],
-            height=first.size[1],
-            fps_nominal=fps,
-            clock="realtime",
-            codec=codec_name(self.capture.get(cv2.CAP_PROP_FOURCC)),
-            stamp_uncertainty_us=self.uncertainty_us,
-        )
+    def describe(self, info: SourceInfo) -> SourceInfo:
+        codec = codec_name(self.capture.get(cv2.CAP_PROP_FOURCC))
+        return replace(info, codec=codec, stamp_uncertainty_us=_STREAM_UNCERTAINTY_US)
 
 
 def codec_name(code: float) -> str | None:
@@ -148,7 +140,8 @@ def list_v4l2() -> list[Path]:
 class _V4l2Driver(_OpenCvDriver):
     """An open device. Stamps are the driver's, where they are of the monotonic clock; else the time of arrival."""
 
-    kind, hint = "v4l2", _DEVICE_HINT
+    kind: SourceKind = "v4l2"
+    hint = _DEVICE_HINT
 
     def __init__(self, name: str, id_: str, fps: float | None, capture: cv2.VideoCapture, config: V4l2Source) -> None:
         self._config, self._driver_stamps = config, False
@@ -184,10 +177,10 @@ class _V4l2Driver(_OpenCvDriver):
         self._driver_stamps = 0 <= arrival_ns - stated_ns <= _OLDEST_STAMP_NS
         return stated_ns if self._driver_stamps else arrival_ns
 
-    def describe(self, first: Frame, fps: float) -> SourceInfo:
+    def describe(self, info: SourceInfo) -> SourceInfo:
         # a driver stamps the begin or the end of a picture, no more than half a period from mid-exposure
-        self.uncertainty_us = round(1e6 / fps * (0.5 if self._driver_stamps else 2))
-        return super().describe(first, fps)
+        uncertainty_us = round(1e6 / info.fps_nominal * (0.5 if self._driver_stamps else 2))
+        return replace(super().describe(info), stamp_uncertainty_us=uncertainty_us)
 
 
 # Network streams.
@@ -272,7 +265,8 @@ class Backlog:
 class _StreamDriver(_OpenCvDriver):
     """An open stream. Stamps are times of arrival: a stream's own clock has no known beginning."""
 
-    kind, hint = "rtsp", _STREAM_HINT
+    kind: SourceKind = "rtsp"
+    hint = _STREAM_HINT
 
     def set_up(self) -> None:
         if not self.capture.isOpened():

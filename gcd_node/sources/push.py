@@ -4,8 +4,8 @@ The node binds, whoever has frames connects (gcd_client.FramePusher; docs/camera
 """
 
 import logging
-import math
 import time
+from dataclasses import replace
 
 import zmq
 
@@ -14,7 +14,7 @@ from gcd_client.protocol import MAX_HEADER, MAX_PAYLOAD, PREFIX, ClientError, Me
 from gcd_node.auth import EventSink, ServerSecurity, SocketGuard, unbind
 from gcd_node.errors import DepthError, SourceError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.sources import PushSource
+from gcd_node.sources import PushSource, SourceKind
 from gcd_node.sources.depth import clean_depth
 from gcd_node.sources.live import LiveCamera
 
@@ -24,7 +24,6 @@ _QUEUED = 2
 _FARTHEST_NS = 10_000_000_000  # a stamp that is farther from now is of another clock
 _UNCERTAINTY_US = 10_000
 _SILENT_S = 0.5  # a pusher that is silent for so long has made way for another one
-_WARN_EVERY_S = 10.0
 _HINT = "start who pushes them, or correct endpoint in [source]; state fps there if they come slowly"
 
 
@@ -49,15 +48,17 @@ class _PushDriver:
 
     def __init__(self, config: PushSource, security: ServerSecurity | None, on_event: EventSink | None) -> None:
         """Raises EndpointError, ConfigError, SetupError: see SocketGuard.bind()."""
+        self.kind: SourceKind = "push"
         self.fps, self.corrupt = config.fps, 0
         self._pusher, self._heard_s = "", 0.0
-        self._warned_s = -math.inf
+        self._warned = False
         self._guard = SocketGuard(security, on_event)
         try:
             self._socket = self._guard.context.socket(zmq.PULL)
             self._socket.set(zmq.RCVHWM, _QUEUED)
             self._socket.set(zmq.MAXMSGSIZE, PREFIX.size + MAX_HEADER + MAX_PAYLOAD)
             self._endpoint = self._guard.bind(self._socket, config.endpoint, "frames")
+            self.id = self._endpoint.rpartition("/")[2]
         except BaseException:
             self._guard.close()
             raise
@@ -78,26 +79,18 @@ class _PushDriver:
             self._warn(f"a pushed frame is refused: {error}")
             return None
 
-    def describe(self, first: Frame, fps: float) -> SourceInfo:
-        return SourceInfo(
-            kind="push",
-            id=self._endpoint.rpartition("/")[2],
-            width=first.size[0],
-            height=first.size[1],
-            fps_nominal=fps,
-            clock="realtime",
-            stamp_uncertainty_us=_UNCERTAINTY_US,
-        )
+    def describe(self, info: SourceInfo) -> SourceInfo:
+        return replace(info, stamp_uncertainty_us=_UNCERTAINTY_US)
 
     def close(self) -> None:
         unbind(self._socket, self._endpoint, 0)
         self._guard.close()
 
     def _warn(self, text: str) -> None:
-        """Of what may happen with every frame, only once in a while."""
-        if time.monotonic() - self._warned_s > _WARN_EVERY_S:
-            _LOG.warning("%s (the next such line in %g s at the earliest)", text, _WARN_EVERY_S)
-            self._warned_s = time.monotonic()
+        """Of what may happen with every frame, once."""
+        if not self._warned:
+            _LOG.warning("%s (told once, counted from here on)", text)
+        self._warned = True
 
     def _frame(self, pushed: PushedFrame) -> Frame:
         """Raises SourceError, MessageError: it is refused; SourceLostError: another camera takes over."""
