@@ -4,7 +4,6 @@ import contextlib
 import logging
 import math
 import os
-import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,35 +34,24 @@ OpenCapture: TypeAlias = Callable[..., cv2.VideoCapture]
 
 
 class _OpenCvDriver:
-    """A cv2.VideoCapture as a Driver; each kind says how it is set up and what its stamps are.
-
-    hint: of messages. Sequence numbers count what the camera gives.
-    """
+    """A cv2.VideoCapture, set up, as a Driver; each kind says what its stamps are. Sequence numbers count what the
+    camera gives."""
 
     kind: SourceKind
     hint: str
 
     def __init__(self, name: str, id_: str, fps: float | None, capture: cv2.VideoCapture) -> None:
-        """name: of messages. fps: as the user states it. Raises SourceError as `set_up`."""
+        """name: of messages. fps: as the user states it."""
         self.name, self.id, self.corrupt, self._seq = name, id_, 0, -1
         self.stated_fps, self.capture, self.close = fps, capture, capture.release
-        try:
-            self.set_up()
-        except BaseException:
-            capture.release()
-            raise
-
-    def set_up(self) -> None:
-        """Look at what was just opened, and set it up. Raises SourceError."""
-        raise NotImplementedError
-
-    def grab(self) -> int | None:
-        """Wait for the next picture. When it was taken, monotonic nanoseconds; None if the camera gives no more."""
-        raise NotImplementedError
 
     @property
     def fps(self) -> float | None:
         return sane_fps(self.capture.get(cv2.CAP_PROP_FPS)) or self.stated_fps
+
+    def grab(self) -> int | None:
+        """Wait for the next picture. When it was taken, monotonic nanoseconds; None if the camera gives no more."""
+        raise NotImplementedError
 
     def read(self) -> Frame | None:
         try:
@@ -124,12 +112,16 @@ def open_v4l2(config: V4l2Source, open_capture: OpenCapture = cv2.VideoCapture) 
     if not os.access(path, os.R_OK | os.W_OK):
         raise SourceError(f"{path} may not be used by this user; add the user to the group `video` and log in again")
     silence_opencv()
-    return LiveCamera(
-        f"the camera {path}",
-        lambda: _V4l2Driver(f"the camera {path}", path.name, config.fps, open_capture(str(path), cv2.CAP_V4L2), config),
-        open_timeout_s=config.open_timeout_s,
-        hint=_DEVICE_HINT,
-    )
+    name = f"the camera {path}"
+
+    def open_driver() -> _V4l2Driver:
+        capture = open_capture(str(path), cv2.CAP_V4L2)
+        if not capture.isOpened():
+            raise SourceAbsentError(f"{name} cannot be opened; {_DEVICE_HINT}")
+        _set_up(capture, config, name)
+        return _V4l2Driver(name, path.name, config.fps, capture)
+
+    return LiveCamera(name, open_driver, open_timeout_s=config.open_timeout_s, hint=_DEVICE_HINT)
 
 
 def list_v4l2() -> list[Path]:
@@ -137,36 +129,31 @@ def list_v4l2() -> list[Path]:
     return [*sorted(_DEVICES.glob("v4l/by-id/*")), *sorted(_DEVICES.glob("video*"))]
 
 
+def _set_up(capture: cv2.VideoCapture, config: V4l2Source, name: str) -> None:
+    """Ask for a pixel format first: sizes and rates depend on it. Then read everything back: drivers refuse silently.
+    name: of the camera, for messages."""
+    wanted: list[tuple[str, int, float | None]] = [
+        ("width", cv2.CAP_PROP_FRAME_WIDTH, config.width),
+        ("height", cv2.CAP_PROP_FRAME_HEIGHT, config.height),
+        ("frame rate", cv2.CAP_PROP_FPS, config.fps),
+    ]
+    if (config.width or 0) * (config.height or 0) > _RAW_PIXELS:  # raw, USB 2 has no room for it at a full rate
+        wanted.insert(0, ("pixel format", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")))
+    asked = [(what, prop, value) for what, prop, value in wanted if value is not None]
+    for _, prop, value in asked:
+        capture.set(prop, value)
+    for what, prop, value in asked:
+        if abs((given := capture.get(prop)) - value) > 0.01 * value:
+            shown = [codec_name(each) if prop == cv2.CAP_PROP_FOURCC else f"{each:g}" for each in (value, given)]
+            _LOG.warning("%s: asked for %s %s, it gives %s", name, what, *shown)
+
+
 class _V4l2Driver(_OpenCvDriver):
     """An open device. Stamps are the driver's, where they are of the monotonic clock; else the time of arrival."""
 
     kind: SourceKind = "v4l2"
     hint = _DEVICE_HINT
-
-    def __init__(self, name: str, id_: str, fps: float | None, capture: cv2.VideoCapture, config: V4l2Source) -> None:
-        self._config, self._driver_stamps = config, False
-        super().__init__(name, id_, fps, capture)
-
-    def set_up(self) -> None:
-        """Ask for a pixel format first: sizes and rates depend on it. Then read everything back: drivers refuse
-        silently."""
-        config, capture = self._config, self.capture
-        if not capture.isOpened():
-            raise SourceAbsentError(f"{self.name} cannot be opened; {_DEVICE_HINT}")
-        wanted: list[tuple[str, int, float | None]] = [
-            ("width", cv2.CAP_PROP_FRAME_WIDTH, config.width),
-            ("height", cv2.CAP_PROP_FRAME_HEIGHT, config.height),
-            ("frame rate", cv2.CAP_PROP_FPS, config.fps),
-        ]
-        if (config.width or 0) * (config.height or 0) > _RAW_PIXELS:  # raw, USB 2 has no room for it at a full rate
-            wanted.insert(0, ("pixel format", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")))
-        asked = [(name, prop, value) for name, prop, value in wanted if value is not None]
-        for _, prop, value in asked:
-            capture.set(prop, value)
-        for name, prop, value in asked:
-            if abs((given := capture.get(prop)) - value) > 0.01 * value:
-                shown = [codec_name(each) if prop == cv2.CAP_PROP_FOURCC else f"{each:g}" for each in (value, given)]
-                _LOG.warning("%s: asked for %s %s, it gives %s", self.name, name, *shown)
+    _driver_stamps = False
 
     def grab(self) -> int | None:
         if not self.capture.grab():
@@ -193,16 +180,14 @@ def shown_address(url: str) -> str:
         ConfigError: no URL of a stream. The message does not repeat it.
     """
     with contextlib.suppress(ValueError):  # of a port, or of brackets
-        scheme, _, rest = url.partition("://")
-        authority = re.split("[/?#]", rest, maxsplit=1)[0]
-        parts = urlsplit(f"{scheme}://{authority.rpartition('@')[2]}")  # users and passwords may hold brackets
-        has_place = bool(parts.hostname) or (parts.scheme == "udp" and parts.port is not None)
-        is_plain = rest.count("@") == authority.count("@") < 2 and url.split() == [url]
-        if parts.scheme in _SCHEMES and has_place and is_plain and parts.port != 0:
-            return parts.geturl()
+        parts = urlsplit(url)
+        place, is_plain = parts.netloc.rpartition("@")[2], url.count("@") == parts.netloc.count("@") < 2
+        has_place = parts.port != 0 and (parts.hostname is not None or parts.scheme == "udp")
+        if parts.scheme in _SCHEMES and has_place and is_plain and url.split() == [url]:
+            return f"{parts.scheme}://{place}"
     raise ConfigError(
         f"the url of a stream is scheme://user:password@host:port/path with one of {', '.join(_SCHEMES)}; in a "
-        "user name or password write @ as %40, / as %2F and : as %3A"
+        "user name or password write @ as %40, / as %2F, : as %3A and [ as %5B"
     )
 
 
@@ -221,16 +206,23 @@ def open_stream(
         ConfigError: no URL of a stream.
     """
     address = shown_address(config.url)
+    name = f"the stream {address}"
     parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, max(1, round(1000 * config.open_timeout_s))]
     parameters += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, max(1, round(1000 * read_timeout_s))]
     parameters += [cv2.CAP_PROP_N_THREADS, 1]  # every thread more delays pictures by one
 
     def open_driver() -> _StreamDriver:
         capture = open_capture(config.url, cv2.CAP_FFMPEG, parameters)
-        return _StreamDriver(f"the stream {address}", address.partition("://")[2], config.fps, capture)
+        if not capture.isOpened():
+            raise SourceAbsentError(f"{name} cannot be opened; {_STREAM_HINT}")
+        width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if width * height > MAX_PIXELS:
+            capture.release()
+            raise SourceError(f"{name} has {width:.0f} x {height:.0f} pixels, over {MAX_PIXELS}; choose a smaller one")
+        return _StreamDriver(name, address.partition("://")[2], config.fps, capture)
 
     silence_opencv()
-    return LiveCamera(f"the stream {address}", open_driver, open_timeout_s=config.open_timeout_s, hint=_STREAM_HINT)
+    return LiveCamera(name, open_driver, open_timeout_s=config.open_timeout_s, hint=_STREAM_HINT)
 
 
 class Backlog:
@@ -268,14 +260,8 @@ class _StreamDriver(_OpenCvDriver):
     kind: SourceKind = "rtsp"
     hint = _STREAM_HINT
 
-    def set_up(self) -> None:
-        if not self.capture.isOpened():
-            raise SourceAbsentError(f"{self.name} cannot be opened; {_STREAM_HINT}")
-        width, height = self.capture.get(cv2.CAP_PROP_FRAME_WIDTH), self.capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-        if width * height > MAX_PIXELS:
-            raise SourceError(
-                f"{self.name} states {width:.0f} x {height:.0f} pixels, over {MAX_PIXELS}; choose a smaller one"
-            )
+    def __init__(self, name: str, id_: str, fps: float | None, capture: cv2.VideoCapture) -> None:
+        super().__init__(name, id_, fps, capture)
         self._backlog = Backlog(period_ns=round(1e9 / (self.fps or 25.0)))
 
     def grab(self) -> int | None:

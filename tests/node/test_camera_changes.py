@@ -111,6 +111,7 @@ def test_pictures_the_model_cannot_be_given_are_refused_until_they_change_and_th
     assert (status["level"], status["source"]["state"]) == (2, "streaming")
     assert len({view.header.src.epoch for view in rig.of()}) == 2  # none of what was refused
     assert len(rig.events("SRC_REFUSED")) == 1
+    assert rig.statuses()[-1]["drops"]["source"] >= 15
 
 
 # Another rate, and what is told meanwhile.

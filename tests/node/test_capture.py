@@ -50,27 +50,20 @@ def test_a_lossless_slot_hands_over_everything_in_order() -> None:
 
 
 @pytest.mark.parametrize("ending", ["close", "finish"])
-def test_a_taker_who_waits_is_let_go(ending: str) -> None:
-    slot = WindowSlot()
+def test_who_waits_to_take_or_to_give_is_let_go(ending: str) -> None:
+    empty, full = WindowSlot(), WindowSlot(lossless=True)
     got: list[int | None] = []
-    taker = started(lambda: got.append(slot.take()))
-    time.sleep(0.05)
-    getattr(slot, ending)()
-    joined(taker)
-    assert got == [None]
-
-
-def test_a_giver_who_waits_is_let_go_when_the_taker_closes() -> None:
-    slot = WindowSlot(lossless=True)
     answers: list[bool] = []
-    giver = started(lambda: answers.extend([slot.put(1), slot.put(2)]))
+    taker = started(lambda: got.append(empty.take()))
+    giver = started(lambda: answers.extend([full.put(1), full.put(2)]))
     time.sleep(0.05)
-    assert answers == []
-    slot.close()
+    getattr(empty, ending)()
+    full.close()
+    joined(taker)
     joined(giver)
-    assert answers == [True, False]
-    assert slot.closed
-    assert slot.take() is None
+    assert (got, answers) == ([None], [True, False])
+    assert full.closed
+    assert full.take() is None
 
 
 def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_more_is_shown() -> None:

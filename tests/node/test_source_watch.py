@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from typing import Any
 from unittest.mock import create_autospec
 
-import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
 from fake_camera import FakeVideoCapture
@@ -41,15 +40,13 @@ class Reader:
         self,
         first: FrameSource,
         reopen: Callable[[SourceInfo], FrameSource],
-        unwanted: tuple[int, int],
         **patience: Any,
     ) -> None:
         self.told: list[str] = []
         self.details: list[str] = []
         self.infos: list[SourceInfo] = []
-        self.heard, self.frames = list[Frame](), list[Frame]()
+        self.frames: list[Frame] = []
         self.failure: Exception | None = None
-        self._unwanted = unwanted
         self.watch = SourceWatch(first, reopen, self, V4l2Source(**patience))
         self.thread = threading.Thread(target=self._read, daemon=True)
         self.thread.start()
@@ -66,7 +63,7 @@ class Reader:
         self.told.append(state)
 
     def source_frame(self, frame: Frame) -> None:
-        self.heard.append(frame)
+        """It is one of `frames` then."""
 
     def source_broken(self, reason: Reason) -> None:
         self.told.append(reason)
@@ -74,7 +71,7 @@ class Reader:
     def source_opened(self, info: SourceInfo) -> bool:
         self.told.append("opened")
         self.infos.append(info)
-        return (info.width, info.height) != self._unwanted
+        return True
 
     def finish(self) -> None:
         self.thread.join(20)
@@ -85,13 +82,12 @@ class Reader:
 def watching(
     first: FrameSource,
     bench: Bench | Callable[[SourceInfo], FrameSource] | None = None,
-    unwanted: tuple[int, int] = (0, 0),
     **patience: Any,
 ) -> Iterator[Reader]:
     """A reader, until the block is left; bench: what it is opened from again."""
     plugged = bench or Bench()
     reopen = (lambda _: plugged.open()) if isinstance(plugged, Bench) else plugged
-    reader = Reader(first, reopen, unwanted, **patience)
+    reader = Reader(first, reopen, **patience)
     yield reader
     reader.watch.close()
     reader.finish()
@@ -154,18 +150,6 @@ def test_a_camera_that_opens_and_gives_nothing_counts_as_a_failed_attempt() -> N
         reader.finish()
     assert isinstance(reader.failure, SourceLostError)
     assert len(bench.opened) == 2
-
-
-def test_frames_of_a_size_nobody_wants_are_told_of_and_not_given() -> None:
-    camera = Camera()
-    with watching(camera, unwanted=(48, 32)) as reader:
-        for size in ((96, 64), (48, 32), (48, 32), (96, 64)):
-            camera.shoot(np.zeros((size[1], size[0], 3), np.uint8))
-        until(lambda: len(reader.frames) == 2)
-    assert [frame.seq for frame in reader.heard] == [0, 1, 2, 3]
-    assert [frame.seq for frame in reader.frames] == [0, 3]
-    assert reader.told == ["connecting", "opened", "streaming", *["SRC_FORMAT", "opened"] * 2]
-    assert reader.watch.skipped == 2
 
 
 def test_a_fault_of_ours_in_a_source_is_not_taken_for_a_lost_camera() -> None:

@@ -1,7 +1,6 @@
 """Network cameras: a real RTSP server and a UDP sender on loopback; no password is ever repeated."""
 
 import logging
-import socket
 import subprocess
 import sys
 import threading
@@ -13,7 +12,7 @@ import cv2
 import pytest
 from fake_camera import FakeVideoCapture
 from media import HEIGHT, WIDTH, environment, flat
-from rtsp_server import RtspServer, serving, split_pictures, write_transport_stream
+from rtsp_server import RtspServer, serving, write_transport_stream
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.sources import RtspSource, open_source
@@ -138,29 +137,6 @@ def test_a_process_ends_although_a_read_never_returns(server: RtspServer) -> Non
     assert (process.returncode, out) == (0, "closed\n")
     assert errors.endswith("does not let go; its thread is left behind\n")
     assert errors.count("\n") == 1
-
-
-def test_a_udp_stream_is_read_with_the_same_code(recording: Path) -> None:
-    stop = threading.Event()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-
-        def send() -> None:
-            for picture in split_pictures(recording.read_bytes()):
-                sender.sendto(picture[: 7 * 188], ("127.0.0.1", port))
-                if stop.wait(0.02):
-                    return
-
-        thread = threading.Thread(target=send, daemon=True)
-        thread.start()
-        source = open_source(RtspSource(url=f"udp://127.0.0.1:{port}", open_timeout_s=GUARD_S))
-        assert next(source.frames()).size == (WIDTH, HEIGHT)
-        source.close()
-        stop.set()
-        thread.join(GUARD_S)
-    assert source.info.id == f"127.0.0.1:{port}"
 
 
 def test_a_stream_too_large_to_decode_is_refused() -> None:
