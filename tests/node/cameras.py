@@ -3,10 +3,13 @@
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
 
 import numpy as np
 
+from gcd_client import ClientKeys, FramePusher
 from gcd_node.errors import SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, Image, SourceInfo
 from gcd_node.sources.live import LiveCamera
@@ -92,6 +95,27 @@ class Bench:
             raise SourceAbsentError("there is no camera bench; there are: none") from None
         self.opened.append(camera)
         return camera
+
+
+@contextmanager
+def pushing(
+    endpoint: str, act: Callable[[FramePusher, int], object], keys: ClientKeys | None = None, fps: float = 50.0
+) -> Iterator[None]:
+    """Somebody calls `act` at this rate with a pusher of his own, and the number of the call."""
+    done, start_s = threading.Event(), time.monotonic()
+
+    def run() -> None:
+        with FramePusher(endpoint, keys=keys) as pusher:
+            for i in count():
+                act(pusher, i)
+                if done.wait(max(0.0, start_s + (i + 1) / fps - time.monotonic())):
+                    return
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    yield
+    done.set()
+    thread.join(20)
 
 
 def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:

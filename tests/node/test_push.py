@@ -5,14 +5,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zmq
-from cameras import until
+from cameras import pushing, until
 from media import environment, flat, write_video
 
 from gcd_client import AuthError, ClientKeys, FramePusher
@@ -31,27 +31,6 @@ GUARD_S = 30.0
 NODE, VIEWER, OPERATOR = (new_key_pair() for _ in range(3))
 CLIENTS = {VIEWER.public: Client(name="eye", role="viewer"), OPERATOR.public: Client(name="hand", role="operator")}
 SECURITY = ServerSecurity(keys=NODE, find_client=CLIENTS.get)
-
-
-@contextmanager
-def pushing(endpoint: str, act: Callable[[FramePusher, int], object], keys: ClientKeys | None = None) -> Iterator[None]:
-    """Somebody calls `act` at FPS with a pusher of his own."""
-    done = threading.Event()
-
-    def run() -> None:
-        with FramePusher(endpoint, keys=keys) as pusher:
-            for i in range(100_000):
-                act(pusher, i)
-                if done.wait(1 / FPS):
-                    return
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join(GUARD_S)
 
 
 def red(pusher: FramePusher, _: int) -> None:

@@ -8,14 +8,14 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, contextmanager
-from itertools import count, islice, pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import get_args
 
 import msgspec
 import numpy as np
 import pytest
-from cameras import until
+from cameras import pushing, until
 from fake_camera import FakeVideoCapture
 from media import HEIGHT, WIDTH, flat, write_pictures, write_video
 from rtsp_server import serving, write_transport_stream
@@ -113,27 +113,18 @@ def open_oak(folder: Path, slow: bool) -> Generator[Opened]:
 
 @contextmanager
 def open_push(folder: Path, slow: bool) -> Generator[Opened]:
-    """Somebody pushes on an even grid, before and after the node listens."""
-    endpoint, done, awake = f"ipc://{folder}/frames", threading.Event(), threading.Event()
+    """Somebody pushes, before and after the node listens; by stamps on an even grid."""
+    endpoint, awake, start_ns = f"ipc://{folder}/frames", threading.Event(), time.time_ns()
     awake.set()
 
-    def push() -> None:
-        with FramePusher(endpoint) as pusher:
-            start_ns = time.time_ns()
-            for i in count():
-                stamp_ns = start_ns + i * 40_000_000
-                if done.wait(max(0.0, (stamp_ns - time.time_ns()) / 1e9)):
-                    return
-                if awake.is_set():
-                    pusher.push(RED, stamp_ns)
+    def push(pusher: FramePusher, number: int) -> None:
+        if awake.is_set():
+            pusher.push(RED, start_ns + number * 40_000_000)
 
-    pushing = threading.Thread(target=push, daemon=True)
-    pushing.start()
-    source = open_source(PushSource(endpoint=endpoint, open_timeout_s=OPEN_S))
-    with closing(source, awake.clear) as opened:
-        yield opened
-    done.set()
-    pushing.join(GUARD_S)
+    with pushing(endpoint, push, fps=25.0):
+        source = open_source(PushSource(endpoint=endpoint, open_timeout_s=OPEN_S))
+        with closing(source, awake.clear) as opened:
+            yield opened
 
 
 def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
