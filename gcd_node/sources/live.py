@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
+from itertools import pairwise
 from statistics import median
 from typing import Protocol, TypeAlias
 
@@ -168,37 +169,29 @@ class LiveCamera:
             self._changed.notify_all()
 
     def _read(self, driver: Driver) -> None:
-        if (frame := self._next(driver)) is None:
-            return
-        if (fps := driver.fps) is None:
-            frame, fps = self._measured(driver, frame)
-        width, height = frame.size
-        info = SourceInfo(kind=driver.kind, id=driver.id, width=width, height=height, fps_nominal=fps, clock="realtime")
-        self._described = driver.describe(info)
-        while frame is not None:
+        first: list[Frame] = []  # pictures, until it is known at which rate they come
+        while not self._closed:
+            if (frame := driver.read()) is None:
+                continue
+            if self._described is None:
+                first.append(frame)
+                if driver.fps is None and len(first) <= _MEASURED_STEPS:
+                    continue
+                self._described = driver.describe(self._describe(driver, first))
+                first.clear()
             with self._changed:
                 self.skipped += self._is_read and len(self._waiting) == _WAITING
                 self._waiting.append(frame)
                 self._changed.notify_all()
-            frame = self._next(driver)
 
-    def _next(self, driver: Driver) -> Frame | None:
-        """The next sound picture; None once the camera was closed here."""
-        while not self._closed:
-            if (frame := driver.read()) is not None:
-                return frame
-        return None
-
-    def _measured(self, driver: Driver, newest: Frame) -> tuple[Frame, float]:
-        """The newest picture after a few, and the rate they came at."""
-        steps_ns: list[int] = []
-        while len(steps_ns) < _MEASURED_STEPS and (frame := self._next(driver)) is not None:
-            steps_ns.append((frame.stamp_ns - newest.stamp_ns) // max(frame.seq - newest.seq, 1))
-            newest = frame
-        fps = sane_fps(1e9 / max(median(steps_ns or [0]), 1))
+    def _describe(self, driver: Driver, first: list[Frame]) -> SourceInfo:
+        """By its first pictures, at the rate it states, or else they came at."""
+        steps_ns = [(b.stamp_ns - a.stamp_ns) // max(b.seq - a.seq, 1) for a, b in pairwise(first)]
+        fps = driver.fps or sane_fps(1e9 / max(median(steps_ns), 1))
         if fps is None:
             raise SourceError(f"{self._name} states no frame rate, and keeps to none; give fps in [source]")
-        return newest, fps
+        width, height = first[-1].size
+        return SourceInfo(kind=driver.kind, id=driver.id, width=width, height=height, fps_nominal=fps, clock="realtime")
 
 
 def sane_fps(stated: float) -> float | None:
@@ -221,21 +214,18 @@ def patience_s(config: LiveSource, fps: float) -> tuple[float, float]:
 
 
 class WatchListener(Protocol):
-    """Who is told how the source does; called from the thread that iterates `frames`, between two frames."""
+    """Who is told how the source does; called from the thread that iterates `frames`, between two frames.
 
-    def source_state(self, state: SourceState, detail: str) -> None:
-        """The source is in another state now. detail: why, in words; may be empty."""
+    source_state: another one now; detail: why, in words. source_frame: one arrived, before it is yielded.
+    source_broken: frames of before and after do not belong together.
+    source_opened: what comes next is of this source: the first, one opened again, or one of another format. Whether its
+        frames are wanted: else they are not yielded, until the format changes again. What this raises ends `frames`.
+    """
 
-    def source_frame(self, frame: Frame) -> None:
-        """A frame arrived, before it is yielded."""
-
-    def source_broken(self, reason: Reason) -> None:
-        """The stream was interrupted: frames of before and after do not belong together."""
-
-    def source_opened(self, info: SourceInfo) -> bool:
-        """What comes next is of this source: the first, one opened again, or one of another format. Whether its frames
-        are wanted: else they are not yielded, until the format changes again. What this raises ends `frames`."""
-        ...
+    def source_state(self, state: SourceState, detail: str) -> None: ...
+    def source_frame(self, frame: Frame) -> None: ...
+    def source_broken(self, reason: Reason) -> None: ...
+    def source_opened(self, info: SourceInfo) -> bool: ...
 
 
 class SourceWatch:
