@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gcd_node.errors import SourceError
 from gcd_node.frame import MAX_FPS, MAX_PIXELS, Frame, Image, SourceInfo
-from gcd_node.sources.opencv import codec_name, silence_opencv
+from gcd_node.sources.opencv import codec_name, silence_opencv, to_rgb
 
 _LOG = logging.getLogger(__name__)
 
@@ -157,9 +157,7 @@ class VideoFile(Recording):
                     stamp_ns = rising_stamp_ns(capture.get(cv2.CAP_PROP_POS_MSEC), stamp_ns, round(1e9 / fps))
                 else:
                     stamp_ns = round(seq * 1e9 / fps)
-                yield Frame(
-                    image=np.asarray(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB), np.uint8), stamp_ns=stamp_ns, seq=seq
-                )
+                yield Frame(image=to_rgb(read[1]), stamp_ns=stamp_ns, seq=seq)
             promised = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if not self._stopped.is_set() and seq + 1 < _COMPLETE * promised < 1e8:  # more is nonsense
             _LOG.warning("%s ended after %d of %d frames: it may be truncated", self._path, seq + 1, promised)
@@ -260,7 +258,7 @@ def read_picture(path: Path) -> Image:
     Raises:
         SourceError: missing, damaged, of no known kind, or more than MAX_PIXELS.
     """
-    return np.asarray(cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+    return to_rgb(_read(path, cv2.IMREAD_COLOR))
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
@@ -341,12 +339,10 @@ class MovingPattern(Recording):
         self.info = SourceInfo(
             kind="synthetic", id="pattern", width=width, height=height, fps_nominal=fps, clock="replay", hfov_deg=85.0
         )
-        stripes = np.array(_COLOURS)[np.arange(2 * width) * 8 // width % len(_COLOURS)]
+        stripes = np.array(_COLOURS)[np.arange(width) * 8 // width % len(_COLOURS)]
         self._pattern = (stripes * np.linspace(0.4, 1.0, height)[:, None, None]).astype(np.uint8)
 
     def _one_pass(self) -> Iterator[Frame]:
-        width = self.info.width
         for seq in count() if self._frames is None else range(self._frames):
-            left = seq * width // 128 % width
-            image = self._pattern[:, left : left + width].copy()
+            image = np.roll(self._pattern, -(seq * self.info.width // 128), axis=1)
             yield Frame(image=image, stamp_ns=round(seq * 1e9 / self.info.fps_nominal), seq=seq)

@@ -15,12 +15,12 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, TypeAlias
 
 import cv2
-import numpy as np
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
-from gcd_node.frame import Frame, Image, LensModel, SourceInfo, depthai_lens
+from gcd_node.frame import Frame, LensModel, SourceInfo, depthai_lens
 from gcd_node.sources import OakSource, SourceKind
 from gcd_node.sources.live import LiveCamera
+from gcd_node.sources.opencv import to_rgb
 
 if TYPE_CHECKING:
     import depthai as dai
@@ -124,12 +124,9 @@ class _OakDriver:
         import depthai as dai
 
         try:
-            pixels = message.getCvFrame()  # a copy, BGR whatever the message's own order, or grey
-            code = cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB
-            image: Image = np.asarray(cv2.cvtColor(pixels, code), np.uint8)
-        except (RuntimeError, cv2.error) as error:
+            image = to_rgb(message.getCvFrame())  # a copy, BGR whatever the message's own order, or grey
+        except (RuntimeError, cv2.error):
             self.corrupt += 1
-            _LOG.debug("OAK %s: picture %d is damaged: %s", self._stream.id, message.getSequenceNum(), error)
             return None
         self._newest = message
         stamp_us = message.getTimestamp(dai.CameraExposureOffset.MIDDLE) // _MICROSECOND

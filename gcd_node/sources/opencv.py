@@ -8,12 +8,13 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 from cv2.utils import logging as cv2_logging
+from numpy.typing import NDArray
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import MAX_PIXELS, Frame, Image, SourceInfo
@@ -90,6 +91,11 @@ def _retrieved(capture: cv2.VideoCapture) -> Image | None:
         return None
     if not good or picture.size == 0 or picture.dtype != np.uint8 or picture.shape[2:] not in ((), (3,)):
         return None
+    return to_rgb(picture)
+
+
+def to_rgb(picture: NDArray[Any]) -> Image:
+    """OpenCV's BGR or grey picture, u8, as RGB."""
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
 
 

