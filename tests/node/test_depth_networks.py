@@ -22,28 +22,24 @@ def network(
     takes: Sequence[Any] = (1, 3, "high", "wide"),
     gives: Sequence[Any] = (1, "high", "wide"),
     *,
-    operator: str = "ReduceMean",
-    kind: str = "FLOAT",
+    channels: Sequence[int] = (1,),
     outputs: int = 1,
 ) -> Path:
-    """An ONNX file whose depth is the mean of the colours: whatever a picture says. operator: another one instead."""
+    """An ONNX file whose depth is the mean of the colours: whatever a picture says. channels: the axes that the mean
+    is of."""
     onnx = pytest.importorskip("onnx", reason="needs the extra `onnx`")
     pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
-    of_type = getattr(onnx.TensorProto, kind)
-    keep = {"keepdims": int(len(gives) == 4)} if operator == "ReduceMean" else {}
-    numbers = {"ReduceMean": [1], "Reshape": list(gives)}.get(operator)
-    constants = [] if numbers is None else [onnx.numpy_helper.from_array(np.array(numbers, np.int64), "numbers")]
-    names = ["picture", *(each.name for each in constants)]
-    nodes = [onnx.helper.make_node(operator, names, [f"depth{i}"], **keep) for i in range(outputs)]
-    graph = onnx.helper.make_graph(
-        nodes,
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    keep, axes = int(len(gives) == 4), onnx.numpy_helper.from_array(np.array(channels, np.int64), "axes")
+    names = [f"depth{i}" for i in range(outputs)]
+    graph = helper.make_graph(
+        [helper.make_node("ReduceMean", ["picture", "axes"], [name], keepdims=keep) for name in names],
         "depth",
-        [onnx.helper.make_tensor_value_info(n, of_type, takes) for n in ("picture",)],
-        [onnx.helper.make_tensor_value_info(f"depth{i}", of_type, gives) for i in range(outputs)],
-        constants,
+        [helper.make_tensor_value_info("picture", kind, takes)],
+        [helper.make_tensor_value_info(name, kind, gives) for name in names],
+        [axes],
     )
-    opset = [onnx.helper.make_opsetid("", 20)]
-    onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9), path)
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9), path)
     return path
 
 
@@ -95,13 +91,11 @@ def test_without_ground_that_gives_a_scale_there_is_no_depth(tmp_path: Path, til
 @pytest.mark.parametrize(
     "other",
     [
-        {"takes": (1, 1, "high", "wide"), "operator": "Identity", "gives": (1, 1, "high", "wide")},
-        {"takes": (1, 3, "high", "wide"), "operator": "Identity", "gives": (1, 3, "high", "wide")},
-        {"takes": (1, 3, 56, 56), "kind": "FLOAT16", "gives": (1, 56, 56)},
+        {"takes": (1, 1, "high", "wide")},
+        {"gives": (1, 3, 1, "wide"), "channels": (2,)},
         {"outputs": 2},
-        {"gives": (1, 1, 70, 98), "operator": "Reshape"},
     ],
-    ids=["grey", "colours out", "float16", "two outputs", "fails"],
+    ids=["grey", "colours out", "two outputs"],
 )
 def test_a_network_of_another_signature_is_refused_by_what_it_has(tmp_path: Path, other: dict[str, Any]) -> None:
     path = network(tmp_path / "net.onnx", **other)

@@ -1,5 +1,7 @@
 """Where the source camera stands: on a sphere or on its vehicle, and which model takes which."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from fakes import Box, FakeSource, FakeSynthesizer, live_traits, made_node, traits
@@ -39,6 +41,10 @@ def matrices(box: Box) -> np.ndarray:
     return np.array(found).reshape(-1, 4, 4)
 
 
+def meta(box: Box) -> Any:
+    return next(fields for topic, fields in box.notes if topic == "meta")
+
+
 @pytest.mark.parametrize("pose", ["height_m = 2.4", "tilt_deg = 12.0", "left_m = 0.4\nforward_m = -1.0"])
 def test_the_view_stays_where_it_is_on_the_vehicle_however_the_camera_is_mounted(pose: str) -> None:
     _, usual = run(config(), live_traits())
@@ -47,6 +53,8 @@ def test_the_view_stays_where_it_is_on_the_vehicle_however_the_camera_is_mounted
     assert mount is not None
     moved = mount.vehicle_from_camera.numpy() @ matrices(box)
     assert moved == pytest.approx(CameraMount().vehicle_from_camera.numpy() @ matrices(usual), abs=1e-9)
+    told = meta(box)["mount"]
+    assert (told["height_m"], told["assumed"]) == (mount.height_m, False)
 
 
 def test_what_is_left_out_is_as_the_model_was_trained() -> None:
@@ -54,16 +62,6 @@ def test_what_is_left_out_is_as_the_model_was_trained() -> None:
     assert stated_mount(SourcePose(height_m=2.0), 70.0, live_traits()) == CameraMount(height_m=2.0, hfov_deg=70.0)
     assert stated_mount(SourcePose(), None, live_traits()) is None
     assert stated_mount(SourcePose(height_m=2.0), 60.0, traits()) is None
-
-
-def test_meta_tells_a_stated_mount() -> None:
-    _, box = run(config("height_m = 2.0"), live_traits())
-    meta = next(fields for topic, fields in box.notes if topic == "meta")
-    assert meta["mount"]["height_m"] == 2.0
-    assert meta["mount"]["assumed"] is False
-    _, box = run(config(), traits("driving"))
-    meta = next(fields for topic, fields in box.notes if topic == "meta")
-    assert (meta["mount"], meta["src_pose"]) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -86,6 +84,6 @@ def test_an_orbit_is_planned_from_where_the_camera_is_said_to_stand() -> None:
     assert source is not None
     assert (source.elevation_deg, source.radius_m) == (25.0, 13.0)
     assert model.clips[0].mount is None
-    told = {"el_deg": 25.0, "r": 13.0, "assumed": False}
-    meta = next(fields for topic, fields in box.notes if topic == "meta")
-    assert (meta["mount"], meta["src_pose"]) == (None, told)
+    assert (meta(box)["mount"], meta(box)["src_pose"]) == (None, {"el_deg": 25.0, "r": 13.0, "assumed": False})
+    _, box = run(config(), traits("driving"))
+    assert (meta(box)["mount"], meta(box)["src_pose"]) == (None, None)
