@@ -21,20 +21,16 @@ class FakeVideoCapture:
         self, picture: Image, *, fps: float = 25.0, stamps: str = "driver", fixed: dict[int, float] | None = None
     ) -> None:
         self.calls: list[tuple[int, float]] = []
-        self.opened_with: tuple[object, ...] = ()
         self.released = threading.Event()
         self.awake = threading.Event()
         self.awake.set()
-        self.gone = False
-        self.breaks = False
+        self.gone = self.breaks = False
         self.there = True
         self.damaged: set[int] = set()
         self.grabbed = -1
         self.stated_ms: list[float] = []
         self._picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-        self._fps = fps
-        self._stamps = stamps
-        self._fixed = fixed or {}
+        self._fps, self._stamps, self._fixed = fps, stamps, fixed or {}
         height, width = picture.shape[:2]
         self._values = {
             cv2.CAP_PROP_FRAME_WIDTH: float(width),
@@ -44,7 +40,6 @@ class FakeVideoCapture:
         } | self._fixed
 
     def open(self, name: str, backend: int, parameters: Sequence[int] = ()) -> "FakeVideoCapture":
-        self.opened_with = (name, backend, *parameters)
         return self
 
     def isOpened(self) -> bool:  # noqa: N802
@@ -59,10 +54,9 @@ class FakeVideoCapture:
     def get(self, prop: int) -> float:
         if prop != cv2.CAP_PROP_POS_MSEC:
             return self._values.get(prop, 0.0)
-        self.stated_ms.append(
-            {"driver": time.monotonic() * 1e3 - 5.0, "zero": 0.0, "wall": time.time() * 1e3}[self._stamps]
-        )
-        return self.stated_ms[-1]
+        stated_ms = {"driver": time.monotonic() * 1e3 - 5.0, "zero": 0.0, "wall": time.time() * 1e3}[self._stamps]
+        self.stated_ms.append(stated_ms)
+        return stated_ms
 
     def grab(self) -> bool:
         time.sleep(1.0 / self._fps)
