@@ -48,6 +48,7 @@ _NAMES: dict[str, Distortion] = {
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
+_LONGEST_SIDE = 65_536
 _SHAPE_TOLERANCE = 0.01
 _LARGEST_FILE = 16384
 _DEPTHAI_MODELS = {"Perspective": "rational_polynomial", "Fisheye": "equidistant"}
@@ -79,8 +80,11 @@ class LensModel:
 
     def __post_init__(self) -> None:
         is_finite = all(map(math.isfinite, (self.fx, self.fy, *self.coefficients)))
-        if not is_finite or min(self.width, self.height, self.fx, self.fy) <= 0:
-            raise ConfigError(f"sizes and focal lengths must be positive, and all numbers finite, got {self}")
+        is_size = 0 < self.width <= _LONGEST_SIDE and 0 < self.height <= _LONGEST_SIDE
+        if not is_finite or not is_size or min(self.fx, self.fy) <= 0:
+            raise ConfigError(
+                f"sizes must be 1 to {_LONGEST_SIDE} pixels, focal lengths positive, and all numbers finite, got {self}"
+            )
         if not (0 <= self.cx < self.width and 0 <= self.cy < self.height):
             raise ConfigError(f"the optical axis must lie in the picture, got {self}; calibrate the camera again")
         if len(self.coefficients) not in _COUNTS[self.distortion]:
@@ -177,7 +181,7 @@ def load_lens(path: Path) -> LensModel:
     """
     try:
         # the loader in C would end the process on deep nesting
-        content: Any = yaml.safe_load(read_small(path, _LARGEST_FILE))
+        content: dict[str, Any] = dict(yaml.safe_load(read_small(path, _LARGEST_FILE)))
         model = content.get("distortion_model") or content.get("camera_model") or "plumb_bob"
         bent = content.get("distortion_coefficients") or {"data": ()}
         info = {"distortion_model": str(model), "d": bent["data"], "k": content["camera_matrix"]["data"]}
@@ -185,15 +189,7 @@ def load_lens(path: Path) -> LensModel:
         lens = lens_of_message(SimpleNamespace(**info, **size))
     except (FileError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}; give a ROS camera_info YAML file") from error
-    except (
-        yaml.YAMLError,
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:
+    except (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ConfigError(f"{path} is not a ROS camera_info YAML file: {reason}") from error
     if lens is None:
