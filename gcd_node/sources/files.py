@@ -127,7 +127,7 @@ class VideoFile(Recording):
             SourceError: missing, empty, a folder, no video, truncated, or no frame of it can be decoded.
         """
         super().__init__(str(path), pace=pace, loop=loop)
-        self._path, self._stated_fps = path.resolve(), fps
+        self._path, self._stated_fps = path.absolute(), fps
         with open_video(self._path) as capture:
             first, codec = capture.read()[1], codec_name(capture.get(cv2.CAP_PROP_FOURCC))
             stated = capture.get(cv2.CAP_PROP_FPS)
