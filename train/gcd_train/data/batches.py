@@ -18,9 +18,9 @@ from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
-from gcd_train.data.latents import EncodedClips, LatentRows
+from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader
-from gcd_train.data.sample import ClipSource, RepeatedClips, Samples, to_network
+from gcd_train.data.sample import Samples, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.recipe_data import LoaderRecipe
@@ -93,7 +93,7 @@ def _in_kept_precision(network: Callable[[Tensor], Made], frames: Tensor) -> Mad
 class EncodedBatches:
     """Batches of what the latents stage wrote."""
 
-    def __init__(self, clips: EncodedClips, config: ModelConfig, recipe: UNetRecipe, precision: Precision) -> None:
+    def __init__(self, clips: LatentClips, config: ModelConfig, recipe: UNetRecipe, precision: Precision) -> None:
         self._clips, self._recipe, self._precision = clips, recipe, precision
         self._conditioner = Conditioner(config, recipe, precision)
 
@@ -157,7 +157,7 @@ class SampleBatches(WholeClips):
 
     def __init__(
         self,
-        samples: Samples | ClipSource,
+        samples: Samples,
         networks: Networks,
         recipe: UNetRecipe,
         family: Family,
@@ -168,8 +168,7 @@ class SampleBatches(WholeClips):
         super().__init__(recipe)
         self._networks, self._precision = networks, precision
         self._conditioner = Conditioner(networks.config, recipe, precision, family)
-        each = RepeatedClips(samples) if isinstance(samples, ClipSource) else samples
-        self._loader = SampleLoader(each, seed, loader)
+        self._loader = SampleLoader(samples, seed, loader)
 
     def whole_clips(self, draws: Draws, count: int) -> Batch:
         """See BatchSource. Raises DataError if samples cannot be read or do not fit the model."""

@@ -14,16 +14,15 @@ emphasis    float16 [N, T, 1, h, w]         how much more a class counts, see `c
 
 import fcntl
 import hashlib
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Self, TypeVar
 
 import msgspec
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, load_file, save
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from gcd_model.errors import FileError
@@ -51,6 +50,8 @@ class Index(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 Kind = TypeVar("Kind", bound=Index)
+AnyShard = TypeVar("AnyShard", bound=Shard)
+_ANEW = "delete its folder and run `gcd-train train ... --stage latents`"
 
 
 def read_index(folder: Path, kind: type[Kind]) -> Kind | None:
@@ -72,12 +73,13 @@ def write_index(folder: Path, index: Index) -> None:
     write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)), lasting=True)
 
 
-def write_shard(folder: Path, name: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """Write a shard; returns the fields of its `Shard`. Raises RunError if it cannot be written."""
+def write_shard(folder: Path, name: str, tensors: dict[str, Tensor], kind: type[AnyShard], **facts: Any) -> AnyShard:
+    """Write a shard and say what it is, with some more facts. Raises RunError if it cannot be written."""
     content, file = save(tensors), f"{name}.safetensors"
     write_whole(folder / file, content, lasting=True)
     arrays = {name: tuple(values.shape) for name, values in sorted(tensors.items())}
-    return {"file": file, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content), "arrays": arrays}
+    digest = hashlib.sha256(content).hexdigest()
+    return kind(file=file, sha256=digest, bytes=len(content), arrays=arrays, **facts)
 
 
 def fault(folder: Path, shard: Shard) -> str | None:
@@ -93,26 +95,15 @@ def fault(folder: Path, shard: Shard) -> str | None:
     return None if same else f"{path} is damaged: its SHA-256 is not the one it was written with"
 
 
-def read_shard(folder: Path, shard: Shard) -> dict[str, Tensor]:
-    """The arrays of a shard, in memory. Raises DataError if it is missing or not as it was written."""
+def open_shard(folder: Path, shard: Shard, redo: str) -> dict[str, Tensor]:
+    """The arrays of a shard, mapped: read where they are used.
+
+    Raises DataError, with how to make it again, if it is missing or not as it was written.
+    """
     wrong = fault(folder, shard)
-    try:
-        if wrong is None:
-            return load((folder / shard.file).read_bytes())
-    except (OSError, SafetensorError) as error:
-        wrong = f"{folder / shard.file} cannot be read ({error})"
-    raise DataError(f"{wrong}; run the same `gcd-train cache` again, it makes this scene anew")
-
-
-def map_shard(folder: Path, shard: Shard) -> dict[str, Tensor]:
-    """The arrays of a shard, mapped: read where they are used. Raises RunError if it is missing or cut."""
-    path = folder / shard.file
-    try:
-        if not path.is_file() or path.stat().st_size != shard.bytes:
-            raise RunError(f"{path} is missing or not of the {shard.bytes} bytes that were written; delete {folder}")
-        return load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise RunError(f"{path} cannot be read ({error}); delete {folder} and encode the clips again") from error
+    if wrong is not None:
+        raise DataError(f"{wrong}; {redo}")
+    return load_file(folder / shard.file)
 
 
 @contextmanager
@@ -179,11 +170,11 @@ class LatentClips:
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Map the arrays. Raises RunError if the folder is unfinished or damaged."""
+        """Map the arrays. Raises RunError if the folder is unfinished, DataError for a damaged shard."""
         meta = read_index(folder, LatentsMeta)
         if meta is None or not meta.sensitivity:
             raise RunError(f"{folder} holds no finished latents; run `gcd-train train ... --stage latents`")
-        return cls(meta, [map_shard(folder, shard) for shard in meta.shards])
+        return cls(meta, [open_shard(folder, shard, _ANEW) for shard in meta.shards])
 
     def resident(self, device: torch.device) -> Self:
         """The same, held in the device's memory."""
@@ -193,15 +184,22 @@ class LatentClips:
     def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
         """The frames (clips[i], frames[i]), mirrored where the flag says so; all int64 or bool [N] on the CPU."""
 
+        part_of = torch.bucketize(clips, self._ends, right=True)
+        parts: list[int] = part_of.unique().tolist()
+        places = [(part_of == part).nonzero()[:, 0] for part in parts]
+        order = torch.cat(places).argsort()
+
         def at(name: str, *index: Tensor) -> Tensor | None:
+            """Rows of an array, which lie in several shards, in the order of `clips`."""
             if name not in self._shards[0]:
                 return None
-
-            def rows(part: int, numbers: Tensor, which: Tensor) -> tuple[Tensor]:
+            found: list[Tensor] = []
+            for part, which in zip(parts, places, strict=True):
                 values = self._shards[part][name]
-                return (values[tuple(each.to(values.device) for each in (numbers, *(i[which] for i in index)))],)
-
-            return _gathered(self._ends, clips, rows)[0].to(device)
+                numbers = clips[which] - (self._ends[part - 1] if part else 0)
+                found.append(values[tuple(each.to(values.device) for each in (numbers, *(i[which] for i in index)))])
+            rows = torch.cat(found)
+            return rows[order.to(rows.device)].to(device)
 
         side = mirrored.long()
         source, target, motion = at("source", side, frames), at("target", side, frames), at("motion")
@@ -223,66 +221,3 @@ class LatentClips:
     def names(self, clips: Tensor) -> tuple[str, ...]:
         """What the clips are called in messages: their seeds."""
         return tuple(f"clip {self.meta.seeds[number]}" for number in clips.tolist())
-
-
-class LatentVideos:
-    """Both sides of all pairs of some folders of latents; see `sample.VideoClips` for what they stand for.
-
-    scale: what the U-Net works on is this times what the condition encoder gives; see gcd_model.config.VAEConfig.
-    Both sides must have been encoded alike: by one autoencoder, without augmentation, targets as their mean.
-    """
-
-    def __init__(self, parts: Sequence[LatentClips], scale: float) -> None:
-        self._parts, self._scale = tuple(parts), scale
-        metas = [part.meta for part in parts]
-        self._ends = torch.tensor([2 * meta.clips for meta in metas]).cumsum(0)
-        sensitivities = zip(*(meta.sensitivity for meta in metas), strict=True)
-        self.meta = msgspec.structs.replace(
-            metas[0],
-            seeds=tuple(seed for meta in metas for seed in meta.seeds for _ in range(2)),
-            sensitivity=tuple(sum(row) / len(metas) for row in sensitivities),
-        )
-
-    def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
-        """The frames (clips[i], frames[i]) and, as their source, the first frame of the same video; see `LatentClips`.
-
-        clips: int64 [N], video 2n is the source's side of pair n, 2n + 1 the target's.
-        """
-
-        def rows(part: int, videos: Tensor, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            latents, flip = self._parts[part], mirrored[which]
-            now = latents.rows(videos // 2, frames[which], flip, device)
-            first = latents.rows(videos // 2, torch.zeros_like(videos), flip, device)
-            of_target = (videos % 2).bool().to(device)[:, None, None, None]
-            source = torch.where(of_target, first.target / self._scale, first.source)
-            return source, torch.where(of_target, now.target, now.source * self._scale), now.motion
-
-        source, target, motion = _gathered(self._ends, clips, rows)
-        return LatentRows(source=source, target=target, motion=motion, control=None, emphasis=None)
-
-    def names(self, clips: Tensor) -> tuple[str, ...]:
-        """What the videos are called in messages: the seed of their pair, and its side."""
-        numbers = clips.tolist()
-        return tuple(f"clip {self.meta.seeds[n]}, its {'target' if n % 2 else 'source'}" for n in numbers)
-
-
-EncodedClips: TypeAlias = LatentClips | LatentVideos
-"""Clips as the U-Net learns from them."""
-
-
-def _gathered(
-    ends: Tensor, clips: Tensor, rows: Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
-) -> tuple[Tensor, ...]:
-    """Rows of clips that lie in several parts, in the order of `clips`.
-
-    ends: behind the last clip of each part. rows: of a part, by the clips' numbers in it and their places in `clips`.
-    """
-    part_of = torch.bucketize(clips, ends, right=True)
-    parts: list[int] = part_of.unique().tolist()
-    places = [(part_of == part).nonzero()[:, 0] for part in parts]
-    firsts = [int(ends[part - 1]) if part else 0 for part in parts]
-    made = [rows(part, clips[at] - first, at) for part, first, at in zip(parts, firsts, places, strict=True)]
-    if len(made) == 1:
-        return made[0]
-    order = torch.cat(places).argsort()
-    return tuple(torch.cat(each)[order.to(each[0].device)] for each in zip(*made, strict=True))

@@ -13,17 +13,15 @@ from torch import Tensor
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
 from gcd_train.data.latents import (
-    EncodedClips,
     LatentClips,
     LatentsMeta,
-    LatentVideos,
     Shard,
-    map_shard,
+    open_shard,
     read_index,
     write_index,
     write_shard,
 )
-from gcd_train.data.sample import ClipSource, numbers_of, to_network
+from gcd_train.data.sample import Clips, numbers_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.recipe import LatentsRecipe, Recipe
 from gcd_train.stop import StopSignal
@@ -48,7 +46,7 @@ class LatentsJob:
 
     folder: Path
     networks: Networks
-    clips: ClipSource
+    clips: Clips
     recipe: LatentsRecipe
     conditioner: Conditioner
     class_weights: Sequence[ClassWeight]
@@ -85,14 +83,14 @@ def encode_clips(job: LatentsJob) -> None:
             _log.info("latents  clip %d of %d  %.2f clips/s  %.0f s left", number + 1, meta.clips, rate, left_s)
         if stopped or len(rows) == _SHARD or number + 1 == meta.clips:
             tensors = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
-            shard = Shard(**write_shard(job.folder, f"clips-{meta.done:06d}", tensors))
+            shard = write_shard(job.folder, f"clips-{meta.done:06d}", tensors, Shard)
             meta = msgspec.structs.replace(meta, shards=(*meta.shards, shard))
             write_index(job.folder, meta)
             rows.clear()
         if stopped:
             raise Interrupted(f"stopped after clip {number + 1} of {meta.clips} of latents; run again to go on")
-    parts = [map_shard(job.folder, shard)["target"] for shard in meta.shards[:_SENSITIVITY_CLIPS]]
-    target = torch.cat(parts)[:_SENSITIVITY_CLIPS, 0].float()
+    first = [open_shard(job.folder, shard, f"delete {job.folder}") for shard in meta.shards[:_SENSITIVITY_CLIPS]]
+    target = torch.cat([shard["target"] for shard in first])[:_SENSITIVITY_CLIPS, 0].float()
     write_index(job.folder, msgspec.structs.replace(meta, sensitivity=tuple(_sensitivity(job, target).tolist())))
 
 
@@ -100,7 +98,7 @@ def _description(job: LatentsJob) -> LatentsMeta:
     config = job.networks.config
     if len(job.clips) == 0:
         raise DataError("there are no clips to encode; generate some with `gcd-train generate driving`")
-    frames, height, width = job.clips.rgb(0)[0].shape[:3]
+    frames, height, width = job.clips.sample(0).source.shape[:3]
     if (frames, height, width) != (config.frames, config.height, config.width):
         raise DataError(
             f"clips must be {config.frames} frames of {config.width}x{config.height} for this model, "
@@ -109,7 +107,7 @@ def _description(job: LatentsJob) -> LatentsMeta:
     count = min(len(job.clips), job.recipe.limit or len(job.clips))
     return LatentsMeta(
         identity=job.identity,
-        seeds=tuple(job.clips.seed(number) for number in range(count)),
+        seeds=tuple(job.clips.seeds[:count]),
         frames=frames,
         flips=2 if job.recipe.flip else 1,
     )
@@ -118,8 +116,9 @@ def _description(job: LatentsJob) -> LatentsMeta:
 @torch.no_grad()
 def _encoded(job: LatentsJob, meta: LatentsMeta, number: int) -> dict[str, Tensor]:
     """One clip's row of every array."""
-    source, target = (job.precision.frames(to_network(side)) for side in job.clips.rgb(number))
-    path, draws = job.clips.trajectory(number), Draws(job.seed, "latents", number, job.precision.device)
+    sample = job.clips.sample(number)
+    source, target = (job.precision.frames(to_network(side)) for side in (sample.source, sample.target))
+    path, draws = sample.trajectory, Draws(job.seed, "latents", number, job.precision.device)
     sides = [False, True][: meta.flips]
     rows = {
         "source": torch.stack([_condition(job, source, draws, mirrored) for mirrored in sides]).half(),
@@ -173,55 +172,44 @@ def _sensitivity(job: LatentsJob, latents: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Encodings:
-    """A run's folders of latents, one for each set of clips.
+    """A run's folder of latents.
 
-    sets: of clips, one, or the pairs that a run takes as videos. folder: of the run's latents. shared: a folder that
-    several runs share, where each set lies under the name of what it belongs to; None for the run's own.
-    as_videos: whether both sides of the pairs count as videos.
+    folder: of the run's own. shared: a folder that several runs share, where each set of clips lies under the name of
+    what it belongs to; None for the run's own.
     """
 
     recipe: Recipe
     config: ModelConfig
     family: Family
     precision: Precision
-    sets: tuple[ClipSource, ...]
-    as_videos: bool
+    clips: Clips
     folder: Path
     shared: Path | None
     stop: StopSignal
 
     def encode(self, networks: Networks) -> None:
         """Write what is not there yet. Raises Interrupted, DataError, RunError, see `encode_clips`."""
-        recipe = self.recipe
-        for clips in self.sets:
-            identity = self._identity(networks, clips)
-            job = LatentsJob(
-                folder=self._place(identity),
-                networks=networks,
-                clips=clips,
-                recipe=self._latents,
-                precision=self.precision,
-                seed=recipe.seed,
-                conditioner=Conditioner(self.config, recipe.unet, self.precision, self.family),
-                class_weights=COLOUR_WEIGHTS[recipe.unet.loss.class_weights],
-                identity=identity,
-                stop=self.stop,
-            )
-            encode_clips(job)
+        recipe, identity = self.recipe, self._identity(networks)
+        job = LatentsJob(
+            folder=self._place(identity),
+            networks=networks,
+            clips=self.clips,
+            recipe=self._latents,
+            precision=self.precision,
+            seed=recipe.seed,
+            conditioner=Conditioner(self.config, recipe.unet, self.precision, self.family),
+            class_weights=COLOUR_WEIGHTS[recipe.unet.loss.class_weights],
+            identity=identity,
+            stop=self.stop,
+        )
+        encode_clips(job)
 
-    def opened(self, networks: Networks) -> EncodedClips:
-        """What the U-Net learns from. Raises RunError for latents of another autoencoder, or unfinished ones."""
-        if not self.as_videos:
-            return self.pairs(networks)
-        return LatentVideos([self._opened(networks, clips) for clips in self.sets], self.config.vae.scale)
+    def opened(self, networks: Networks) -> LatentClips:
+        """What the U-Net learns from.
 
-    def pairs(self, networks: Networks) -> LatentClips:
-        """The latents of the one set there is. Raises RunError as `opened`."""
-        (clips,) = self.sets
-        return self._opened(networks, clips)
-
-    def _opened(self, networks: Networks, clips: ClipSource) -> LatentClips:
-        identity = self._identity(networks, clips)
+        Raises RunError for latents of another autoencoder, or unfinished ones; DataError for damaged ones.
+        """
+        identity = self._identity(networks)
         place = self._place(identity)
         latents = LatentClips.open(place)
         if latents.meta.identity != identity:
@@ -232,16 +220,14 @@ class Encodings:
         return latents.resident(self.precision.device) if self.recipe.compute.resident else latents
 
     def _place(self, identity: str) -> Path:
-        if self.shared is not None:
-            return self.shared / identity
-        return self.folder if len(self.sets) == 1 else self.folder / identity
+        return self.folder if self.shared is None else self.shared / identity
 
-    def _identity(self, networks: Networks, clips: ClipSource) -> str:
+    def _identity(self, networks: Networks) -> str:
         recipe, config, family = self.recipe, self.config, self.family
         by_path = family.motion_bucket is None and family.limits is not None
         motion = family.name if by_path else None  # families with the recipe's number write the same latents
         steered = (config.camera, motion, recipe.unet.motion_bucket)
-        options = digest_of(self._latents, recipe.seed, clips.origin, steered, recipe.unet.loss.class_weights)
+        options = digest_of(self._latents, recipe.seed, self.clips.origin, steered, recipe.unet.loss.class_weights)
         return f"{autoencoder_digest(networks)}-{options}"
 
     @property

@@ -19,9 +19,8 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling
-from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read_scene_list, read_split
-from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
 from gcd_train.evaluation.protocol import (
@@ -239,7 +238,7 @@ def open_pairs(
         raise RecipeError("these clips have no vehicle to mount a camera on: leave out --declared-height and -tilt")
     declared = mount or CameraMount() if clips.camera == "none" else None
     some = chosen(clips, scenes=wanted, limit=choice.limit)
-    return PairedSet.of(some, declared=declared), tuple(notes.plain_lines())
+    return PairedSet.of(some, declared=declared), tuple(notes.lines())
 
 
 def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[EvaluationSet, tuple[str, ...]]:
@@ -283,7 +282,7 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
         identity=_identity(folder, scenes, cuts),
         semantic=cuts.semantic,
     )
-    return clips, (*notes.plain_lines(), *odd)
+    return clips, (*notes.lines(), *odd)
 
 
 def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | ParallelDomain4D:
@@ -315,11 +314,15 @@ def _sampling(cuts: SceneCuts, *, orbits: bool) -> OrbitSampling | DrivingSampli
     """How goals, first frames and strides are drawn."""
     usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
     frames = FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
+    move_time = None if cuts.gradual else 0
     if not orbits:
-        return DrivingSampling(gradual=cuts.gradual, frames=frames)
+        return DrivingSampling(move_time=move_time, frames=frames)
     azimuth_deg, elevation_deg = (180.0, 60.0) if cuts.far else (90.0, 30.0)
     return OrbitSampling(
-        max_azimuth_deg=azimuth_deg, max_elevation_deg=elevation_deg, gradual=cuts.gradual, frames=frames
+        max_azimuth_deg=azimuth_deg,
+        max_elevation_deg=elevation_deg,
+        move_time=None if cuts.gradual else 0,
+        frames=frames,
     )
 
 
