@@ -14,9 +14,9 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
+import psutil
 import torch
 
-from gcd_train.data.files import bytes_read
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90
@@ -26,6 +26,7 @@ from gcd_train.parallel import one_thread_each
 from gcd_train.pointcloud import published_picture
 from gcd_train.scenes.worlds import SCENE_WORLDS
 
+PROCESS = psutil.Process()
 FIRST_SEED = 3_000_000  # in no data set
 CLIP_FRAMES, TARGETS, TIME_STEPS = 14, 7, 6
 WORLDS = {"drop": (Kubric4D.open, MAX90), "driving": (ParallelDomain4D.open, DRIVING)}
@@ -80,9 +81,9 @@ def measure(place, name, edition, options):
     if form.frames == world.frames:
         pairs, read = ViewPairs(data, sampling), []
         for number in range(options.samples):
-            before = bytes_read(), time.process_time()
+            before = PROCESS.io_counters().read_chars, time.process_time()
             pairs.sample(number)
-            read.append(((bytes_read() - before[0]) / 1e6, time.process_time() - before[1]))
+            read.append(((PROCESS.io_counters().read_chars - before[0]) / 1e6, time.process_time() - before[1]))
         show(f"{what}: a training sample, read", "MB", [each for each, _ in read])
         show(f"{what}: a training sample, read and drawn", "CPU s", [each for _, each in read])
 

@@ -25,6 +25,7 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_train.data.pairs import PairedClip
+from gcd_train.data.sample import Sample
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.measure import predicted_and_measured as measured
 from gcd_train.evaluation.predictors import CameraPair, Predictor, pixel_rays
@@ -148,11 +149,17 @@ class PlaneClips:
     def __getitem__(self, number: int) -> PairedClip:
         return self.clips[number]
 
-    def rgb(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        return self.clips[number].source, self.clips[number].target
-
-    def target_classes(self, number: int) -> np.ndarray:
-        return self.clips[number].target_classes
+    def sample(self, number: int) -> Sample:
+        clip = self.clips[number]
+        return Sample(
+            source=clip.source,
+            target=clip.target,
+            target_classes=clip.target_classes,
+            source_from_target=self.trajectory(number).source_from_target.numpy(),
+            fps=self.fps,
+            scene="plane",
+            frame_numbers=tuple(range(self.frames)),
+        )
 
     @property
     def frames(self) -> int:

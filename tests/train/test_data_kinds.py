@@ -70,9 +70,9 @@ def test_kubric_is_split_by_number(kubric: Path) -> None:
     assert lengths(run) == (2, 1)
     assert run.batches is not None
     assert (run.clips.fps, run.valid.fps, run.valid.camera) == (12.0, 12.0, "spherical")
-    source, target = run.valid.rgb(0)
+    source, target = run.valid.sample(0).source, run.valid.sample(0).target
     assert source.shape == target.shape == (3, 32, 48, 3)
-    assert run.valid.trajectory(0).frames == 3
+    assert run.valid.sample(0).trajectory.frames == 3
 
 
 def test_points_are_drawn_on_the_device_that_the_recipe_names(kubric: Path) -> None:
@@ -81,7 +81,7 @@ def test_points_are_drawn_on_the_device_that_the_recipe_names(kubric: Path) -> N
         with pytest.raises(RecipeError, match=r"data\.splat_device"):
             opened(on_gpu, kubric)
         return
-    there, here = (opened(told, kubric).valid.rgb(0)[1] for told in (on_gpu, recipe(KUBRIC)))
+    there, here = (opened(told, kubric).valid.sample(0).target for told in (on_gpu, recipe(KUBRIC)))
     assert np.abs(there.astype(int) - here).mean() < 0.1
 
 

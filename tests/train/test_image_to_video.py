@@ -10,11 +10,10 @@ from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 
 from gcd_model import FAMILIES, load_synthesizer
 from gcd_model.networks import Networks, random_networks
-from gcd_train.data.files import Skips
 from gcd_train.data.latents import LatentClips, LatentVideos
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
 from gcd_train.data.open import DataPlaces, RunData, open_data
-from gcd_train.data.sample import ClipSource, Sample, VideoClips, VideoSamples
+from gcd_train.data.sample import Clips, video_clips
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe
@@ -31,7 +30,7 @@ def recipe(name: str, *changes: str) -> Recipe:
     return load_recipe(f"package:{name}", small=True, changes=[*SMALLER, *changes])
 
 
-def encoded(folder: Path, networks: Networks, told: Recipe, clips: ClipSource) -> LatentClips:
+def encoded(folder: Path, networks: Networks, told: Recipe, clips: Clips) -> LatentClips:
     assert told.latents is not None
     precision = Precision.of(told.compute)
     job = LatentsJob(
@@ -55,18 +54,18 @@ def encoded(folder: Path, networks: Networks, told: Recipe, clips: ClipSource) -
 
 def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> None:
     pairs, orbits = TinyClips(2), TinyOrbits(1)
-    videos = VideoClips([pairs, orbits])
+    videos = video_clips([pairs, orbits])
     assert len(videos) == 6
     for number in range(6):
-        first, video = videos.rgb(number)
-        assert (first == video[0]).all()
-        assert not (video == video[0]).all()
-        poses = videos.trajectory(number).source_from_target
-        assert torch.equal(poses, torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1))
-    shown = [videos.rgb(number)[1] for number in (0, 1, 2, 5)]
-    wanted = [pairs.rgb(0)[0], pairs.rgb(0)[1], orbits.rgb(0)[0], pairs.rgb(1)[1]]
+        video = videos.sample(number)
+        assert (video.source == video.target[0]).all()
+        assert not (video.target == video.target[0]).all()
+        assert (video.start, video.deltas, video.target_classes, video.visible) == (None, None, None, None)
+        assert np.array_equal(video.source_from_target, np.tile(np.eye(4), (FRAMES, 1, 1)))
+    shown = [videos.sample(number).target for number in (0, 1, 2, 5)]
+    wanted = [pairs.sample(0).source, pairs.sample(0).target, orbits.sample(0).source, pairs.sample(1).target]
     assert all(np.array_equal(one, other) for one, other in zip(shown, wanted, strict=True))
-    assert len({videos.seed(number) for number in range(6)}) == 6
+    assert len(set(videos.seeds)) == 6
 
 
 def test_encoded_pairs_read_as_videos_are_the_encoded_videos(tmp_path: Path) -> None:
@@ -75,7 +74,7 @@ def test_encoded_pairs_read_as_videos_are_the_encoded_videos(tmp_path: Path) -> 
     sets = (TinyClips(2), TinyClips(1, seed=7))
     parts = [encoded(tmp_path / str(number), networks, told, clips) for number, clips in enumerate(sets)]
     videos = LatentVideos(parts, networks.config.vae.scale)
-    again = encoded(tmp_path / "videos", networks, told, VideoClips(sets))
+    again = encoded(tmp_path / "videos", networks, told, video_clips(sets))
     place = {seed: number for number, seed in enumerate(again.meta.seeds)}
     order = [
         place[part * 10**15 + 2 * seed + side] for part in (0, 1) for seed in parts[part].meta.seeds for side in (0, 1)
@@ -92,50 +91,11 @@ def test_encoded_pairs_read_as_videos_are_the_encoded_videos(tmp_path: Path) -> 
     assert sum(videos.meta.sensitivity) == pytest.approx(sum(parts[0].meta.sensitivity), rel=1e-5)
 
 
-class TwoSamples:
-    """Samples with a path over the sphere."""
-
-    def __init__(self) -> None:
-        self.skips = Skips()
-
-    def __len__(self) -> int:
-        return 2
-
-    def sample(self, index: int) -> Sample:
-        source, target = TinyOrbits(2).rgb(index)
-        path = TinyOrbits(2).trajectory(index)
-        assert path.delta is not None
-        return Sample(
-            source=source,
-            target=target,
-            target_classes=np.zeros(target.shape[:3], np.uint8),
-            source_from_target=path.source_from_target.numpy(),
-            start=path.source,
-            deltas=path.delta.numpy(),
-            fps=12.0,
-            scene=f"scene {index}",
-            frame_numbers=(0, 2, 4, 6),
-            visible=np.ones(target.shape[:3], np.bool_),
-        )
-
-
-def test_samples_of_a_data_set_become_videos_that_nobody_steers() -> None:
-    videos = VideoSamples(TwoSamples())
-    assert len(videos) == 4
-    for index in range(4):
-        video, pair = videos.sample(index), TwoSamples().sample(index // 2)
-        assert np.array_equal(video.target, pair.target if index % 2 else pair.source)
-        assert (video.source == video.target[0]).all()
-        assert (video.start, video.deltas, video.target_classes, video.visible) == (None, None, None, None)
-        assert video.scene == pair.scene
-        assert np.array_equal(video.source_from_target, np.tile(np.eye(4), (FRAMES, 1, 1)))
-
-
 # examples
 
 
-def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[ClipSource, ...] = ()) -> Trainer:
-    videos = VideoClips(parts) if parts else None
+def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[Clips, ...] = ()) -> Trainer:
+    videos = video_clips(parts) if parts else None
     inputs = RunInputs(
         recipe=told,
         data=RunData(clips=videos or TinyClips(2), valid=videos or TinyClips(1, seed=9), parts=parts),

@@ -3,13 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 import torch
-from tiny_scenes4d import write_kubric
 from torch.testing import assert_close
 
 from gcd_model import FAMILIES, ModelConfig
@@ -18,12 +16,8 @@ from gcd_model.config import SMALL
 from gcd_model.networks import Networks, random_networks
 from gcd_train.data.batches import SampleBatches
 from gcd_train.data.files import Skips
-from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.loader import LoadedBatch, SampleLoader, SampleOrder
-from gcd_train.data.paths import FrameSampling, OrbitSampling
-from gcd_train.data.pictures import PictureOptions
-from gcd_train.data.sample import Sample, SampleClips, collate
-from gcd_train.data.views import ViewPairs
+from gcd_train.data.sample import Sample, collate
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.recipe import OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, LoaderRecipe
@@ -232,24 +226,3 @@ def test_what_samples_cannot_give_is_refused() -> None:
     unsteered = collate([replace(sample, deltas=None)])
     with pytest.raises(DataError, match="not on a sphere"):
         batches(model).batch(LoadedBatch(unsteered, (1,), 0.0), draws(0))
-
-
-# samples as clips
-
-
-def test_samples_are_clips_with_the_path_they_were_drawn_with(tmp_path: Path) -> None:
-    write_kubric(tmp_path, 2, frames=FRAMES + 1)
-    data = Kubric4D.open(tmp_path, cameras=[f"view{n}" for n in range(4)])
-    frames = FrameSampling(clip=FRAMES)
-    pairs = ViewPairs(data, OrbitSampling(frames=frames), 0, PictureOptions(size=(WIDTH, HEIGHT)), repeats=3)
-    clips = SampleClips(pairs, 2, camera="spherical", fps=24.0, origin="x")
-    sample, path = pairs.sample(1), clips.trajectory(1)
-    assert (len(clips), clips.fps, clips.classes, clips.mount, clips.camera) == (2, 24.0, (), None, "spherical")
-    assert path.delta is not None
-    np.testing.assert_array_equal(path.delta.numpy(), sample.deltas)
-    assert path.source == sample.start
-    assert path.at_goal == (False, False, True)
-    source, target = clips.rgb(1)
-    np.testing.assert_array_equal(source, sample.source)
-    np.testing.assert_array_equal(target, sample.target)
-    assert not clips.target_classes(1).any()

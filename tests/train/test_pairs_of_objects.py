@@ -11,13 +11,14 @@ import pytest
 from headless import needs_egl
 from stage_world import STAGE as FAST_STAGE
 from stage_world import stage as fast_stage
+from tiny_world import TinyOrbits
 from typer.testing import CliRunner
 
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_train.cli.main import app
 from gcd_train.data.pairs import PairedClips
-from gcd_train.data.sample import PaintedClips, SomeClips
+from gcd_train.data.sample import painted as painted_clips
 from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.scenes.description import Scene, SceneObject
@@ -116,7 +117,7 @@ def test_the_trajectory_is_the_way_between_the_cameras_on_disk(folder: Path) -> 
 def test_a_clip_does_not_depend_on_those_beside_it(folder: Path, tmp_path: Path) -> None:
     alone = PairedClips.open(written(tmp_path, ORBITS, range(4, 5)))
     beside = PairedClips.open(folder)
-    assert (alone.seed(0), alone.orbit(0)) == (beside.seed(4), beside.orbit(4))
+    assert (alone.seeds[0], alone.orbit(0)) == (beside.seeds[4], beside.orbit(4))
     for kind in ("source", "target", "target_depth", "target_instances"):
         np.testing.assert_array_equal(getattr(alone[0], kind), getattr(beside[4], kind))
 
@@ -173,12 +174,12 @@ def test_clips_of_several_folders_alternate(folder: Path, tmp_path: Path) -> Non
     assert len(both) == 8
     names = [both.scene(number)[0] for number in range(8)]
     assert [names[:4].count(name) for name in ("stage", "other")] == [3, 1]
-    assert len({both.seed(number) for number in range(8)}) == 8
-    assert {first.seed(number) for number in range(6)} < {both.seed(number) for number in range(8)}
+    assert len(set(both.seeds)) == 8
+    assert set(first.seeds) < set(both.seeds)
     assert both.origin != first.origin
     other = names.index("other")
     alone = PairedClips.open(tmp_path / "b")
-    np.testing.assert_array_equal(both.rgb(other)[1], alone.rgb(0)[1])
+    np.testing.assert_array_equal(both.sample(other).target, alone.sample(0).target)
     np.testing.assert_array_equal(both.trajectory(other).delta, alone.trajectory(0).delta)
     assert [clips.scene(3) for clips in (both, PairedClips.open([folder, tmp_path / "b"], limit=4))] == [
         both.scene(3)
@@ -205,26 +206,18 @@ def test_folders_that_differ_do_not_go_together(folder: Path, tmp_path: Path) ->
 
 
 @needs_egl
-def test_what_wraps_clips_tells_of_the_same_path(folder: Path) -> None:
-    clips = PairedClips.open(folder)
-    kept = SomeClips(clips, (5, 2), keep=True)
-    assert (kept.camera, kept.mount, kept.fps) == ("spherical", None, 12.0)
-    np.testing.assert_array_equal(kept.trajectory(0).delta, clips.trajectory(5).delta)
-    np.testing.assert_array_equal(kept.rgb(1)[0], clips.rgb(2)[0])
-    with pytest.raises(DataError, match="need"):
-        PaintedClips(clips)
-
-
-@needs_egl
 def test_painted_clips_show_classes_where_others_show_colours(tmp_path: Path) -> None:
     clips = PairedClips.open(written(tmp_path, driving_world(TINY, WorldOptions()), range(1)))
-    painted = PaintedClips(clips)
+    painted = painted_clips(clips)
+    with pytest.raises(DataError, match="need"):
+        painted_clips(TinyOrbits())
+    shown, sample = painted.sample(0), clips.sample(0)
     colours = np.array([kind.colour for kind in DRIVING_CLASSES], np.uint8)
-    np.testing.assert_array_equal(painted.rgb(0)[0], clips.rgb(0)[0])
-    np.testing.assert_array_equal(painted.rgb(0)[1], colours[clips.target_classes(0)])
+    np.testing.assert_array_equal(shown.source, sample.source)
+    np.testing.assert_array_equal(shown.target, colours[sample.target_classes])
     assert painted.origin != clips.origin
     expected = driving_trajectory(frames=3, move_time=2, mount=clips.mount).source_from_target
-    np.testing.assert_array_equal(painted.trajectory(0).source_from_target, expected)
+    np.testing.assert_array_equal(shown.source_from_target, expected)
 
 
 def test_things_keep_clear_of_the_cameras() -> None:
@@ -284,7 +277,7 @@ def test_the_command_makes_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     made = CliRunner().invoke(app, [*line, "--clips", "4"])
     assert made.exit_code == 0, made.output
     clips = PairedClips.open(data)
-    assert [clips.seed(number) for number in range(4)] == [15, 16, 17, 18]
+    assert clips.seeds[:4] == [15, 16, 17, 18]
     assert clips.scene(3) == ("drop", 6)
     refused = CliRunner().invoke(app, [*line, "--scenes", "2"])
     assert refused.exit_code == 78

@@ -131,7 +131,7 @@ def test_the_driving_source_stands_where_the_path_starts(root: Path) -> None:
     np.testing.assert_allclose(dataset.pose(dataset.scenes[0], "yaw-0"), draw.world_from_source, atol=1e-6)
 
 
-def test_exact_pairs_start_with_the_same_picture_and_read_hardly_anything(root: Path) -> None:
+def test_exact_pairs_start_with_the_same_picture(root: Path) -> None:
     dataset = ParallelDomain4D.open(root)
     sampling = replace(DRIVING, frames=CLIP)
     pairs = ViewPairs(dataset, sampling, 0, PictureOptions(size=(WIDTH, 24), exact=True, visible=True, class_ids=True))
@@ -144,7 +144,6 @@ def test_exact_pairs_start_with_the_same_picture_and_read_hardly_anything(root: 
     known = sample.target_classes[0] != 29  # the sky has no depth
     assert sample.visible[0][known].mean() > 0.98
     assert sample.visible[1].mean() < sample.visible[0].mean()
-    assert sample.bytes_read < 3_000_000
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(pairs)).sample(0).target, sample.target)
     splatted = ViewPairs(dataset, sampling, 0, PictureOptions(size=(WIDTH, 24), class_ids=True)).sample(0)
     assert np.abs(splatted.target.astype(int) - sample.target).mean() < 25

@@ -133,7 +133,7 @@ def test_growing_a_folder_makes_every_scene_once(tmp_path: Path) -> None:
     os.utime(abandoned, (0, 0))
     list(generate(tmp_path, TINY, range(1, 6), workers=1))
     clips = PairedClips.open(tmp_path)
-    assert [clips.seed(number) for number in range(len(clips))] == [0, 1, 2, 3, 4, 5]
+    assert list(clips.seeds) == [0, 1, 2, 3, 4, 5]
     assert not abandoned.exists()
 
 
@@ -143,7 +143,7 @@ def test_a_scene_in_two_shards_counts_once(tmp_path: Path) -> None:
     write_shard(tmp_path, TINY, range(1, 3))
     (tmp_path / "world.json").write_bytes(msgspec.json.encode(TINY))
     clips = PairedClips.open(tmp_path)
-    assert [clips.seed(number) for number in range(len(clips))] == [0, 1, 2]
+    assert list(clips.seeds) == [0, 1, 2]
 
 
 @needs_egl

@@ -1,7 +1,7 @@
 """Runs of small models that do more than show a road, at a tiny size: steered orbits, and painted classes."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -15,14 +15,15 @@ from torch import Tensor
 from gcd_model import FAMILIES, Clip, load_synthesizer
 from gcd_model.conditioning import micro_conditioning, spherical_features
 from gcd_model.config import DRIVING_CLASSES
-from gcd_model.geometry import SphericalDelta, Trajectory
+from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_train.data.batches import EncodedBatches, SampleBatches
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
 from gcd_train.data.loader import LoadedBatch
 from gcd_train.data.open import DataPlaces, RunData, open_data
-from gcd_train.data.sample import ClipSource, PaintedClips, SomeClips, collate, to_network
+from gcd_train.data.sample import Clips, MadeClips, Sample, collate, to_network
+from gcd_train.data.sample import painted as painted_clips
 from gcd_train.errors import DataError, Interrupted
 from gcd_train.recipe import ClassWeightsName, Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
@@ -67,9 +68,7 @@ def painted_recipe() -> Recipe:
     return small_recipe("tiny-painted", "driving-semantic", {"class_weights": "driving"})
 
 
-def trainer(
-    path: Path, recipe: Recipe, clips: ClipSource, valid: ClipSource, stop: StopSignal | None = None
-) -> Trainer:
+def trainer(path: Path, recipe: Recipe, clips: Clips, valid: Clips, stop: StopSignal | None = None) -> Trainer:
     return Trainer(
         RunInputs(recipe=recipe, data=RunData(clips=clips, valid=valid), folder=RunFolder(path), stop=stop or Never())
     )
@@ -80,7 +79,7 @@ def orbits(path: Path, stop: StopSignal | None = None) -> Trainer:
 
 
 def painted(path: Path) -> Trainer:
-    return trainer(path, painted_recipe(), PaintedClips(TinyClips()), PaintedClips(TinyClips(1, seed=9)))
+    return trainer(path, painted_recipe(), painted_clips(TinyClips()), painted_clips(TinyClips(1, seed=9)))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +106,7 @@ def measured(run: Path) -> dict[str, dict[str, float]]:
 def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None:
     synthesizer = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu")
     traits, clips = synthesizer.traits, TinyOrbits(1, seed=4)
-    features = synthesizer.encode(Clip(video=to_network(clips.rgb(0)[0]), fps=12.0))
+    features = synthesizer.encode(Clip(video=to_network(clips.sample(0).source), fps=12.0))
     near, far = (traits.plan_view(SphericalDelta(azimuth_deg=azimuth)) for azimuth in (5.0, 60.0))
     first, second = synthesizer.render(features, [near, far])
     assert first.video.shape == (FRAMES, 3, HEIGHT, WIDTH)
@@ -127,7 +126,7 @@ def test_what_steers_is_trained_too(orbit_run: Path) -> None:
 
 def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run: Path) -> None:
     synthesizer = load_synthesizer(painted_run / "tiny-painted.safetensors", device="cpu")
-    source, _ = TinyClips(1, seed=4).rgb(0)
+    source = TinyClips(1, seed=4).sample(0).source
     features = synthesizer.encode(Clip(video=to_network(source), fps=10.0))
     view = synthesizer.render(features, [synthesizer.traits.plan_view()])[0]
     assert view.classes is not None
@@ -151,7 +150,7 @@ def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tm
     recipe = msgspec.structs.replace(painted_recipe(), data=data)
     places = DataPlaces(data=tmp_path / "set")
     opened = open_data(recipe, model_config(recipe.model), FAMILIES["driving-semantic"], places)
-    truth = opened.valid.target_classes(0)
+    truth = opened.valid.sample(0).target_classes
     assert [kind.name for kind in opened.valid.classes] == ["Car", "Road", "Sky", "Void"]
     assert set(np.unique(truth).tolist()) == {0, 1, 2, 3}
     trainer(tmp_path / "run", recipe, opened.clips, opened.valid).run()
@@ -178,21 +177,25 @@ def test_a_resumed_run_on_orbits_equals_an_uninterrupted_one(orbit_run: Path, tm
     assert all(torch.equal(resumed[name], value) for name, value in whole.items())
 
 
-class Mirrored(SomeClips):
+def mirrored(clips: Clips) -> Clips:
     """Clips as seen in a mirror."""
 
-    def __init__(self, clips: ClipSource) -> None:
-        super().__init__(clips, range(len(clips)))
+    def make(number: int) -> Sample:
+        sample = clips.sample(number)
+        path = mirrored_path(sample.trajectory)
+        assert sample.target_classes is not None
+        return replace(
+            sample,
+            source=sample.source[:, :, ::-1],
+            target=sample.target[:, :, ::-1],
+            target_classes=sample.target_classes[:, :, ::-1],
+            source_from_target=path.source_from_target.numpy(),
+            deltas=None if path.delta is None else path.delta.numpy(),
+        )
 
-    def rgb(self, number: int, /) -> tuple[np.ndarray, np.ndarray]:
-        source, target = super().rgb(number)
-        return source[:, :, ::-1], target[:, :, ::-1]
-
-    def trajectory(self, number: int, /) -> Trajectory:
-        return mirrored_path(super().trajectory(number))
-
-    def target_classes(self, number: int, /) -> np.ndarray:
-        return super().target_classes(number)[:, :, ::-1]
+    return MadeClips(
+        make=make, seeds=clips.seeds, fps=clips.fps, camera=clips.camera, classes=clips.classes, origin="mirrored"
+    )
 
 
 @dataclass(frozen=True)
@@ -200,17 +203,17 @@ class Kind:
     """A recipe, its clips, and the clips in a mirror."""
 
     recipe: Recipe
-    clips: ClipSource
-    mirrored: ClipSource
+    clips: Clips
+    mirrored: Clips
 
 
 KINDS = {
-    "orbits": Kind(orbit_recipe(), TinyOrbits(), Mirrored(TinyOrbits())),
-    "painted": Kind(painted_recipe(), PaintedClips(TinyClips()), PaintedClips(Mirrored(TinyClips()))),
+    "orbits": Kind(orbit_recipe(), TinyOrbits(), mirrored(TinyOrbits())),
+    "painted": Kind(painted_recipe(), painted_clips(TinyClips()), painted_clips(mirrored(TinyClips()))),
 }
 
 
-def encoded(path: Path, recipe: Recipe, clips: ClipSource) -> LatentClips:
+def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
     """Latents of clips by a random autoencoder."""
     config = model_config(recipe.model)
     assert recipe.latents is not None
@@ -302,7 +305,7 @@ def test_people_and_vehicles_of_our_world_count_as_published(name: str, factor: 
         (painted_recipe(), TinyOrbits(), "its own"),
     ],
 )
-def test_clips_of_the_other_kind_are_refused(recipe: Recipe, clips: ClipSource, words: str, tmp_path: Path) -> None:
+def test_clips_of_the_other_kind_are_refused(recipe: Recipe, clips: Clips, words: str, tmp_path: Path) -> None:
     recipe = msgspec.structs.replace(recipe, unet=msgspec.structs.replace(recipe.unet, fps=clips.fps))
     with pytest.raises(DataError, match=words):
         trainer(tmp_path, recipe, clips, clips)

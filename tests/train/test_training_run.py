@@ -45,7 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_ends_in_a_weight_file_that_renders(run: Path) -> None:
     synthesizer = load_synthesizer(run / "tiny.safetensors", device="cpu")
-    source, _ = TinyClips(1, seed=4).rgb(0)
+    source = TinyClips(1, seed=4).sample(0).source
     features = synthesizer.encode(Clip(video=to_network(source), fps=10.0))
     view = synthesizer.render(features, [synthesizer.traits.plan_view()])[0]
     assert view.video.shape == (FRAMES, 3, HEIGHT, WIDTH)

@@ -178,16 +178,6 @@ def test_workers_of_a_loader_give_what_one_process_gives(driving_root: Path) -> 
     assert loaded[0].deltas is None
 
 
-def test_bytes_are_counted_for_each_sample(driving_root: Path) -> None:
-    pairs = driving_pairs(driving_root)
-    pairs.sample(0)  # reads calibration and ontology too
-    sample = pairs.sample(2)
-    layers = ("rgb", "depth", "semantic_segmentation_2d")
-    stems = [f"{10 * number + 5:018d}" for number in sample.frame_numbers]
-    files = [path for layer in layers for path in (driving_root / "scene_000004" / layer).glob("*/*")]
-    assert sample.bytes_read == sum(path.stat().st_size for path in files if path.stem in stems)
-
-
 def cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:100])
 

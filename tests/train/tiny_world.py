@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
-from gcd_model.config import DRIVING_CLASSES, CameraControl, SemanticClass
+from gcd_model.config import DRIVING_CLASSES, CameraControl
 from gcd_model.geometry import (
     CameraMount,
     Spherical,
@@ -16,7 +16,7 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
-from gcd_train.data.sample import ClipSource, Sample
+from gcd_train.data.sample import Clips, Sample
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import parse_recipe
 from gcd_train.training.checkpoint import SavedWeights, newest_weights
@@ -60,52 +60,38 @@ loss = { weight_limit = 5.0, sensitivity = true }
 """
 
 
-class TinyClips(ClipSource):
+class TinyClips(Clips):
     """Random gradients; the target is the source upside down."""
+
+    fps = 10.0
+    camera: CameraControl = "none"
+    classes = DRIVING_CLASSES
+    origin = "tiny"
 
     def __init__(self, count: int = 2, seed: int = 0) -> None:
         random = np.random.default_rng(seed)
         low = random.integers(0, 255, (count, FRAMES, 4, 8, 3), np.uint8)
         self._clips = low.repeat(HEIGHT // 4, axis=2).repeat(WIDTH // 8, axis=3)
         self._ids = (self._clips[..., 0] % len(DRIVING_CLASSES)).astype(np.uint8)
-
-    def __len__(self) -> int:
-        return len(self._clips)
-
-    @property
-    def classes(self) -> tuple[SemanticClass, ...]:
-        return DRIVING_CLASSES
-
-    fps = 10.0
-    camera: CameraControl = "none"
-    mount = CameraMount()
-    origin = "tiny"
-
-    def seed(self, number: int, /) -> int:
-        return 100 + number
+        self.seeds = range(100, 100 + count)
 
     def trajectory(self, number: int, /) -> Trajectory:
-        return driving_trajectory(frames=FRAMES, move_time=FRAMES - 1, mount=self.mount)
+        return driving_trajectory(frames=FRAMES, move_time=FRAMES - 1, mount=CameraMount())
 
     def sample(self, number: int, /) -> Sample:
-        source, target = self.rgb(number)
-        path, frames = self.trajectory(number), tuple(range(FRAMES))
+        number %= len(self)
+        path = self.trajectory(number)
         return Sample(
-            source=source,
-            target=target,
+            source=self._clips[number],
+            target=self._clips[number][:, ::-1],
+            target_classes=self._ids[number],
             source_from_target=path.source_from_target.numpy(),
             start=path.source,
             deltas=None if path.delta is None else path.delta.numpy(),
             fps=self.fps,
             scene="tiny",
-            frame_numbers=frames,
+            frame_numbers=tuple(range(FRAMES)),
         )
-
-    def rgb(self, number: int, /) -> tuple[np.ndarray, np.ndarray]:
-        return self._clips[number], self._clips[number][:, ::-1]
-
-    def target_classes(self, number: int, /) -> np.ndarray:
-        return self._ids[number]
 
 
 class TinyOrbits(TinyClips):
@@ -113,12 +99,8 @@ class TinyOrbits(TinyClips):
 
     fps = 12.0
     camera: CameraControl = "spherical"
-    mount = None  # pyright: ignore[reportAssignmentType]  # no vehicle on a stage
+    classes = ()
     origin = "tiny orbits"
-
-    @property
-    def classes(self) -> tuple[SemanticClass, ...]:
-        return ()
 
     def trajectory(self, number: int, /) -> Trajectory:
         source = Spherical(azimuth_deg=0.0, elevation_deg=5.0 + number, radius_m=14.0)

@@ -55,7 +55,7 @@ def compact(
         scenes = work.scenes[:limit]
         remove_leftovers(work.out)
         one_thread_each()
-        packed, there, damaged, read, written = 0, 0, 0, 0, 0
+        packed, there, damaged, written = 0, 0, 0, 0
         with progress_bar("scenes", len(scenes), keep=True) as show:
             for number, outcome in enumerate(map_items(work, scenes, workers=workers, ray_address=ray), start=1):
                 try:
@@ -65,11 +65,11 @@ def compact(
                     say(printable(f"{outcome.item}: {fault}"))
                 else:
                     packed, there = packed + done.made, there + (not done.made)
-                    read, written = read + done.read, written + done.written
+                    written += done.written
                     if done.gaps:
                         say(f"{outcome.item}: packed without {done.gaps} views that are missing")
                 show(number)
-        sizes = f", {read / 1e6:.1f} MB in {written / 1e6:.1f} MB" if packed else ""
+        sizes = f", {written / 1e6:.1f} MB" if packed else ""
         say(f"scenes: {packed} packed{sizes}; {there} there already; {damaged} damaged")
     if damaged:
         raise typer.Exit(DataError.exit_code)
@@ -179,8 +179,6 @@ def lerobot_command(
             sample = pairs.sample(index)
             apart = float(np.linalg.norm(sample.source_from_target[:, :3, 3], axis=-1).mean())
             first, last = sample.frame_numbers[0], sample.frame_numbers[-1]
-            tell(
-                f"  {sample.scene} rows {first}..{last}: cameras {apart:.3f} m apart, {sample.bytes_read / 1e3:.0f} kB"
-            )
+            tell(f"  {sample.scene} rows {first}..{last}: cameras {apart:.3f} m apart")
         for line in pairs.skips.lines():
             tell(line)

@@ -20,7 +20,7 @@ from gcd_model.networks import Networks
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
 from gcd_train.data.latents import EncodedClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader
-from gcd_train.data.sample import ClipSource, RepeatedClips, Samples, to_network
+from gcd_train.data.sample import Samples, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.recipe_data import LoaderRecipe
@@ -157,7 +157,7 @@ class SampleBatches(WholeClips):
 
     def __init__(
         self,
-        samples: Samples | ClipSource,
+        samples: Samples,
         networks: Networks,
         recipe: UNetRecipe,
         family: Family,
@@ -168,8 +168,7 @@ class SampleBatches(WholeClips):
         super().__init__(recipe)
         self._networks, self._precision = networks, precision
         self._conditioner = Conditioner(networks.config, recipe, precision, family)
-        each = RepeatedClips(samples) if isinstance(samples, ClipSource) else samples
-        self._loader = SampleLoader(each, seed, loader)
+        self._loader = SampleLoader(samples, seed, loader)
 
     def whole_clips(self, draws: Draws, count: int) -> Batch:
         """See BatchSource. Raises DataError if samples cannot be read or do not fit the model."""

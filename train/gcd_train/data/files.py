@@ -6,7 +6,6 @@ What could not be read and was left out is counted and named, so that no fault i
 import io
 import logging
 import struct
-import threading
 import zipfile
 import zlib
 from collections import Counter, OrderedDict
@@ -62,6 +61,9 @@ class Skipped:
         return f"{self.scene}: {self.file} {self.reason}"
 
 
+_OTHERS = Skipped(scene="others", file="", reason=f"beyond {_DISTINCT} distinct faults")
+
+
 class Skips:
     """Everything left out so far. Each distinct one is logged once, as a warning, unless `logged` is false.
 
@@ -71,7 +73,6 @@ class Skips:
     def __init__(self, *, logged: bool = True) -> None:
         self._logged = logged
         self._counts: Counter[Skipped] = Counter()
-        self._beyond = 0
 
     def add(self, scene: str, file: Path | str, reason: str) -> Skipped:
         """Count one and return it."""
@@ -82,32 +83,21 @@ class Skips:
     def extend(self, others: Iterable[Skipped]) -> None:
         """Count what was left out elsewhere."""
         for skipped in others:
-            if skipped not in self._counts and len(self._counts) >= _DISTINCT:
-                self._beyond += 1  # a set in which everything is wrong must not fill the memory
-                continue
-            self._counts[skipped] += 1
-            if self._logged and self._counts[skipped] == 1:
-                _LOG.warning("left out %s", skipped)
+            is_known = skipped in self._counts or len(self._counts) < _DISTINCT
+            kind = skipped if is_known else _OTHERS  # a set in which everything is wrong must not fill the memory
+            self._counts[kind] += 1
+            if self._logged and self._counts[kind] == 1:
+                _LOG.warning("left out %s", kind)
 
     @property
     def total(self) -> int:
         """How often something was left out."""
-        return self._counts.total() + self._beyond
+        return self._counts.total()
 
-    def plain_lines(self, most: int = _SHOWN) -> list[str]:
+    def lines(self, most: int = _SHOWN) -> list[str]:
         """The first ones, a line each, and how many more there are."""
         rest = len(self._counts) - most
         return [*map(str, list(self._counts)[:most]), *([f"and {rest} more"] if rest > 0 else [])]
-
-    def lines(self, most: int = _SHOWN) -> list[str]:
-        """A short account to print, the most frequent first; empty if nothing was left out."""
-        if not self.total:
-            return []
-        shown, scenes = self._counts.most_common(most), {skipped.scene for skipped in self._counts}
-        rows = [f"left out {self.total} times, {len(self._counts)} distinct faults in {len(scenes)} scenes:"]
-        rows += [f"  {count} x {skipped}" for skipped, count in shown]
-        rest = self.total - sum(count for _, count in shown)
-        return rows + ([f"  and {rest} more"] if rest else [])
 
 
 class Recent(Generic[Key, Value]):
@@ -127,18 +117,6 @@ class Recent(Generic[Key, Value]):
         return self._kept[key]
 
 
-class _Tally(threading.local):
-    count: int = 0
-
-
-_read = _Tally()
-
-
-def bytes_read() -> int:
-    """Bytes of files that this thread has read so far; the difference over a call is what the call read."""
-    return _read.count
-
-
 def read(path: Path, most: int = MOST_PICTURE) -> bytes:
     """A whole file of at most so many bytes. Raises FileFault if it is not there, empty, larger or no regular file."""
     try:
@@ -154,7 +132,6 @@ def read(path: Path, most: int = MOST_PICTURE) -> bytes:
         raise FileFault(path, f"is larger than {most} bytes: it is something else")
     if not content:
         raise FileFault(path, "is empty: download or generate the scene again")
-    _read.count += len(content)
     return content
 
 

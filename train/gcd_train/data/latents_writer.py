@@ -23,7 +23,7 @@ from gcd_train.data.latents import (
     write_index,
     write_shard,
 )
-from gcd_train.data.sample import ClipSource, numbers_of, to_network
+from gcd_train.data.sample import Clips, numbers_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.recipe import LatentsRecipe, Recipe
 from gcd_train.stop import StopSignal
@@ -48,7 +48,7 @@ class LatentsJob:
 
     folder: Path
     networks: Networks
-    clips: ClipSource
+    clips: Clips
     recipe: LatentsRecipe
     conditioner: Conditioner
     class_weights: Sequence[ClassWeight]
@@ -100,7 +100,7 @@ def _description(job: LatentsJob) -> LatentsMeta:
     config = job.networks.config
     if len(job.clips) == 0:
         raise DataError("there are no clips to encode; generate some with `gcd-train generate driving`")
-    frames, height, width = job.clips.rgb(0)[0].shape[:3]
+    frames, height, width = job.clips.sample(0).source.shape[:3]
     if (frames, height, width) != (config.frames, config.height, config.width):
         raise DataError(
             f"clips must be {config.frames} frames of {config.width}x{config.height} for this model, "
@@ -109,7 +109,7 @@ def _description(job: LatentsJob) -> LatentsMeta:
     count = min(len(job.clips), job.recipe.limit or len(job.clips))
     return LatentsMeta(
         identity=job.identity,
-        seeds=tuple(job.clips.seed(number) for number in range(count)),
+        seeds=tuple(job.clips.seeds[:count]),
         frames=frames,
         flips=2 if job.recipe.flip else 1,
     )
@@ -118,8 +118,9 @@ def _description(job: LatentsJob) -> LatentsMeta:
 @torch.no_grad()
 def _encoded(job: LatentsJob, meta: LatentsMeta, number: int) -> dict[str, Tensor]:
     """One clip's row of every array."""
-    source, target = (job.precision.frames(to_network(side)) for side in job.clips.rgb(number))
-    path, draws = job.clips.trajectory(number), Draws(job.seed, "latents", number, job.precision.device)
+    sample = job.clips.sample(number)
+    source, target = (job.precision.frames(to_network(side)) for side in (sample.source, sample.target))
+    path, draws = sample.trajectory, Draws(job.seed, "latents", number, job.precision.device)
     sides = [False, True][: meta.flips]
     rows = {
         "source": torch.stack([_condition(job, source, draws, mirrored) for mirrored in sides]).half(),
@@ -184,7 +185,7 @@ class Encodings:
     config: ModelConfig
     family: Family
     precision: Precision
-    sets: tuple[ClipSource, ...]
+    sets: tuple[Clips, ...]
     as_videos: bool
     folder: Path
     shared: Path | None
@@ -220,7 +221,7 @@ class Encodings:
         (clips,) = self.sets
         return self._opened(networks, clips)
 
-    def _opened(self, networks: Networks, clips: ClipSource) -> LatentClips:
+    def _opened(self, networks: Networks, clips: Clips) -> LatentClips:
         identity = self._identity(networks, clips)
         place = self._place(identity)
         latents = LatentClips.open(place)
@@ -236,7 +237,7 @@ class Encodings:
             return self.shared / identity
         return self.folder if len(self.sets) == 1 else self.folder / identity
 
-    def _identity(self, networks: Networks, clips: ClipSource) -> str:
+    def _identity(self, networks: Networks, clips: Clips) -> str:
         recipe, config, family = self.recipe, self.config, self.family
         by_path = family.motion_bucket is None and family.limits is not None
         motion = family.name if by_path else None  # families with the recipe's number write the same latents

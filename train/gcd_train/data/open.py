@@ -1,6 +1,7 @@
 """From a recipe's [data] and the folders a user names to what a run learns from and is measured on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,7 +18,7 @@ from gcd_train.data.pairs import PairedClips, data_folders
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling, Sampling
 from gcd_train.data.pictures import PictureOptions
-from gcd_train.data.sample import ClipSource, PaintedClips, SampleClips, Samples, VideoClips, VideoSamples
+from gcd_train.data.sample import Bytes, Clips, MadeClips, Sample, Samples, VideoSamples, painted, video_clips
 from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.data.views import ViewPairs
@@ -43,10 +44,10 @@ class RunData:
     parts: the pairs that `clips` are videos of, encoded in their stead, each by itself; empty where `clips` are pairs.
     """
 
-    clips: ClipSource
-    valid: ClipSource
+    clips: Clips
+    valid: Clips
     batches: BatchMaker | None = None
-    parts: tuple[ClipSource, ...] = ()
+    parts: tuple[Clips, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -102,7 +103,7 @@ class _Opening:
             require_apart(
                 *({name: world for each in part for name, world in each.scenes.items()} for part in (learned, held))
             )
-            return RunData(clips=VideoClips(learned), valid=VideoClips(held), parts=learned)
+            return RunData(clips=video_clips(learned), valid=video_clips(held), parts=learned)
         clips, held_out = PairedClips.open(data), PairedClips.open(valid)
         require_apart(clips.scenes, held_out.scenes)
         for each, folder in ((clips, data), (held_out, valid)):
@@ -113,7 +114,7 @@ class _Opening:
                     f"{goal}; change data.path, or make the clips with `gcd-train generate driving --path` so"
                 )
         if self._data.modality == "semantic":
-            return RunData(clips=PaintedClips(clips), valid=PaintedClips(held_out))
+            return RunData(clips=painted(clips), valid=painted(held_out))
         return RunData(clips=clips, valid=held_out)
 
     def views(self) -> RunData:
@@ -229,29 +230,28 @@ class _Opening:
         )
         return ViewPairs(data, sampling, seed, options, repeats=repeats)
 
-    def _one_rate(self, data: Dataset4D, fps: float, repeats: int = 1) -> SampleClips:
+    def _one_rate(self, data: Dataset4D, fps: float, repeats: int = 1) -> Clips:
         """Clips at the rate that the recipe names, forwards; always the same ones."""
         wanted = self.recipe.unet.fps
         stride = max(round(fps / wanted), 1)
         if fps / stride != wanted:
             raise RecipeError(f"unet.fps is {wanted:g}, and no stride makes that of the set's {fps:g}")
         sampling = sampling_of(self.recipe, self.config.frames, stride=stride)
-        painted = self._data.modality == "semantic"
-        pairs = self._pairs(data, sampling, _FIXED_SEED, repeats, class_ids=painted)
-        return self._clips(pairs, len(pairs), wanted, data.ontology if painted else None)
+        semantic = self._data.modality == "semantic"
+        pairs = self._pairs(data, sampling, _FIXED_SEED, repeats, class_ids=semantic)
+        return self._clips(pairs, len(pairs), wanted, data.ontology if semantic else None)
 
-    def _clips(self, samples: Samples, count: int, fps: float, ontology: Ontology | None = None) -> SampleClips:
+    def _clips(self, samples: Samples, count: int, fps: float, ontology: Ontology | None = None) -> Clips:
         origin = digest_of(self._data, str(self.places.data))
         if self._data.task == "image-to-video":
             samples, count = VideoSamples(samples), 2 * count
-        return SampleClips(
-            samples,
-            count,
+        return MadeClips(
+            make=samples.sample if ontology is None else partial(_placed, samples, ontology.places),
+            seeds=range(count),
             camera=self.config.camera,
             fps=fps,
             origin=origin,
             classes=() if ontology is None else ontology.classes,
-            places=None if ontology is None else ontology.places,
         )
 
     def _sampled(self, samples: Samples) -> BatchMaker:
@@ -335,6 +335,12 @@ class _Opening:
                 f"data.orbit goes to {largest} (azimuth, elevation, radius), family {self.family.name} to {allowed}: "
                 "nobody could ask for the views beyond; change model.family or data.orbit"
             )
+
+
+def _placed(samples: Samples, places: Bytes, number: int) -> Sample:
+    """A sample whose class ids are their places in the ontology."""
+    sample = samples.sample(number)
+    return replace(sample, target_classes=places[sample.target_classes])
 
 
 def _worlds_of(data: Dataset4D) -> dict[str, str]:

@@ -25,7 +25,7 @@ from gcd_model.geometry import (
 )
 from gcd_model.small_files import decode_json
 from gcd_train.data.files import ZIP_FAULTS, read_member
-from gcd_train.data.sample import Bytes, ClipSource, Sample
+from gcd_train.data.sample import Bytes, Clips, Sample
 from gcd_train.errors import DataError
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, read_world
 
@@ -53,7 +53,7 @@ class PairedClip:
 
 
 @dataclass(eq=False)
-class PairedClips(ClipSource):
+class PairedClips(Clips):
     """All clips of some folders, read when asked for, safe to share between processes.
 
     One folder's clips are ordered by their number. Those of several alternate, so that the first ones are a fair mix.
@@ -71,9 +71,12 @@ class PairedClips(ClipSource):
         self.frames, self.height, self.width = world.frames, world.height, world.width
         self.hfov_deg, self.fps, self.classes = world.hfov_deg, world.fps, world.classes
         self.camera: CameraControl = "none" if world.camera == "fixed" else "spherical"
+        self.mount: CameraMount | None = None
         if world.camera == "fixed":
             options = world.options
             self.mount = CameraMount(height_m=options.height_m, tilt_deg=options.tilt_deg, hfov_deg=world.hfov_deg)
+        # in other folders than the first, made different from all others
+        self.seeds = [int(name) + _FOLDER_SEEDS * self._folder(index) for index, (_, name) in enumerate(self.places)]
         described = [msgspec.json.encode(msgspec.structs.replace(each, clips_per_shard=0)) for each in self.worlds]
         self.origin = hashlib.sha256(b"\n".join(described)).hexdigest()[:8]
 
@@ -116,9 +119,6 @@ class PairedClips(ClipSource):
         """Of a clip in its world: the number it was made from, in digits."""
         return self.places[index][1]
 
-    def __len__(self) -> int:
-        return len(self.places)
-
     def __getitem__(self, index: int) -> PairedClip:
         return PairedClip(
             source=self._colour(index, "source"),
@@ -126,19 +126,20 @@ class PairedClips(ClipSource):
             source_depth=self._strip(index, "source.depth").astype(np.float32) * np.float32(DEPTH_UNIT_M),
             target_depth=self._strip(index, "target.depth").astype(np.float32) * np.float32(DEPTH_UNIT_M),
             source_classes=self._classes(index, "source"),
-            target_classes=self.target_classes(index),
+            target_classes=self._classes(index, "target"),
             source_instances=self._strip(index, "source.instances"),
             target_instances=self._strip(index, "target.instances"),
-            seed=self.seed(index),
+            seed=self.seeds[index],
         )
 
     def sample(self, number: int, /) -> Sample:
-        """See ClipSource."""
-        (source, target), path = self.rgb(number), self.trajectory(number)
+        """See Clips."""
+        number %= len(self)
+        path = self.trajectory(number)
         return Sample(
-            source=source,
-            target=target,
-            target_classes=self.target_classes(number) if self.classes else None,
+            source=self._colour(number, "source"),
+            target=self._colour(number, "target"),
+            target_classes=self._classes(number, "target") if self.classes else None,
             source_from_target=path.source_from_target.numpy(),
             start=path.source,
             deltas=None if path.delta is None else path.delta.numpy(),
@@ -146,18 +147,6 @@ class PairedClips(ClipSource):
             scene=str(self.scene(number)),
             frame_numbers=tuple(range(self.frames)),
         )
-
-    def rgb(self, index: int, /) -> tuple[Bytes, Bytes]:
-        """Source and target pictures alone."""
-        return self._colour(index, "source"), self._colour(index, "target")
-
-    def target_classes(self, index: int, /) -> Bytes:
-        """Class ids of the target view alone, [T, H, W]; zeros where the world has no classes."""
-        return self._classes(index, "target")
-
-    def seed(self, index: int, /) -> int:
-        """The number a clip was made from; in other folders than the first it is made different from all others."""
-        return int(self.places[index][1]) + _FOLDER_SEEDS * self._folder(index)
 
     def trajectory(self, index: int, /) -> Trajectory:
         """The path from source to target. For an orbit its source stands at azimuth 0: only the change in it counts.

@@ -1,8 +1,9 @@
 """What training data consists of: a camera's view of a scene, a sample, a batch of them, a set of clips by number."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.config import CameraControl, SemanticClass
-from gcd_model.geometry import CameraMount, Intrinsics, Spherical, Trajectory, pose_trajectory
+from gcd_model.geometry import Intrinsics, Spherical, Trajectory, pose_trajectory
 from gcd_train.data.files import Skipped, Skips
 from gcd_train.errors import DataError
 
@@ -45,7 +46,7 @@ class Sample:
     start: the source camera on the sphere, and deltas: f64 [T, 3] azimuth and elevation in degrees and radius in
     metres, target minus source; None for paths that are not on the sphere. fps: of the clip, after the stride.
     scene: its name. frame_numbers: of the scene, T. visible: bool [T, H, W], target pixels that the source camera saw,
-    None where not asked for. skipped: what was tried before and left out. bytes_read: of files.
+    None where not asked for. skipped: what was tried before and left out.
     """
 
     source: Bytes
@@ -59,7 +60,6 @@ class Sample:
     deltas: NDArray[np.float64] | None = None
     visible: NDArray[np.bool_] | None = None
     skipped: tuple[Skipped, ...] = ()
-    bytes_read: int = 0
 
     @property
     def trajectory(self) -> Trajectory:
@@ -69,13 +69,15 @@ class Sample:
 
 
 class Samples(Protocol):
-    """Samples by number: `ViewPairs`, `LeRobotPairs`.
+    """Samples by number: `DrawnSamples`, `Clips`.
 
-    Any number from 0 up may be asked for; the set repeats its scenes after its length, with other draws.
-    skips: what could not be read.
+    Any number from 0 up may be asked for; after its length a drawn set repeats its scenes with other draws.
     """
 
-    skips: Skips
+    @property
+    def skips(self) -> Skips:
+        """What could not be read."""
+        ...
 
     def __len__(self) -> int:
         """Samples that are drawn before a scene comes again more often than another."""
@@ -142,163 +144,75 @@ def to_network(frames: Bytes | Tensor) -> Tensor:
     return rows.permute(0, 3, 1, 2).float().div_(127.5).sub_(1)
 
 
-class ClipSource(ABC):
+class Clips(ABC):
     """A set of clips that always are the same ones: what is encoded, measured on, and learned from one by one.
 
     fps: of all clips. camera: how a network is told where the target camera goes, "none" where all clips share one
-    path. mount: how the source camera sits on the vehicle, None without one. classes: the ontology of the class maps,
-    empty where there are none. origin: names the set and its options, whatever number of clips there is.
+    path. classes: the ontology of the class maps, empty where there are none. origin: names the set and its options,
+    whatever number of clips there is. seeds: what each clip was made from: names it, also when the set has grown since.
     """
 
     fps: float
     camera: CameraControl
-    mount: CameraMount | None = None
     classes: tuple[SemanticClass, ...] = ()
     origin: str
-    _last: tuple[int, Sample] | None = None
+    seeds: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    @property
+    def skips(self) -> Skips:
+        """Nothing: a clip that cannot be read is an error."""
+        return Skips()
 
     @abstractmethod
-    def __len__(self) -> int:
-        """Clips there are."""
-
-    @abstractmethod
     def sample(self, number: int, /) -> Sample:
-        """All of a clip. Raises DataError if it cannot be read."""
-
-    def seed(self, number: int, /) -> int:
-        """What a clip was made from: names it, also when the set has grown since."""
-        return number
-
-    def trajectory(self, number: int, /) -> Trajectory:
-        """The target camera's path, seen from the source camera; T poses. Raises DataError as `sample`."""
-        return self._kept_sample(number).trajectory
-
-    def rgb(self, number: int, /) -> tuple[Bytes, Bytes]:
-        """Source and target, uint8 [T, H, W, 3] each. Raises DataError as `sample`."""
-        sample = self._kept_sample(number)
-        return sample.source, sample.target
-
-    def target_classes(self, number: int, /) -> Bytes:
-        """Places in `classes` of the target, uint8 [T, H, W]; zeros where there are none. Raises as `sample`."""
-        sample = self._kept_sample(number)
-        return np.zeros(sample.target.shape[:3], np.uint8) if sample.target_classes is None else sample.target_classes
-
-    def _kept_sample(self, number: int) -> Sample:
-        """Pictures, path and classes of a clip are asked for one after the other: the last one is kept."""
-        if self._last is None or self._last[0] != number:
-            self._last = number, self.sample(number)
-        return self._last[1]
+        """A clip; the same ones again after the set's length. Raises DataError if it cannot be read."""
 
 
-class RepeatedClips:
-    """A set of clips as samples: the same ones again after its length."""
+@dataclass(eq=False, kw_only=True)
+class MadeClips(Clips):
+    """Clips that a function makes by number."""
 
-    def __init__(self, clips: ClipSource) -> None:
-        self._clips, self.skips = clips, Skips()
-
-    def __len__(self) -> int:
-        return len(self._clips)
-
-    def sample(self, index: int, /) -> Sample:
-        """The clip of a number. Raises DataError if it cannot be read."""
-        return self._clips.sample(index % len(self._clips))
-
-
-class SampleClips(ClipSource):
-    """The first `count` samples of a set.
-
-    places: by class id the place in `classes`; None for samples without class ids. The other options: see `ClipSource`.
-    """
-
-    def __init__(
-        self,
-        samples: Samples,
-        count: int,
-        *,
-        camera: CameraControl,
-        fps: float,
-        origin: str,
-        classes: tuple[SemanticClass, ...] = (),
-        places: Bytes | None = None,
-    ) -> None:
-        self._samples, self._count, self._places = samples, count, places
-        self.camera, self.fps, self.origin, self.classes = camera, fps, origin, classes
-
-    def __len__(self) -> int:
-        return self._count
+    make: Callable[[int], Sample]
+    seeds: Sequence[int]
+    fps: float
+    camera: CameraControl
+    origin: str
+    classes: tuple[SemanticClass, ...] = ()
 
     def sample(self, number: int, /) -> Sample:
-        """See ClipSource."""
-        sample = self._samples.sample(number)
-        if self._places is None or sample.target_classes is None:
-            return replace(sample, target_classes=None)
-        return replace(sample, target_classes=self._places[sample.target_classes])
+        """See Clips."""
+        return self.make(number)
 
 
-class SomeClips(ClipSource):
-    """Some of the clips, by their numbers, as they are. keep: hold decoded pictures in memory, 2 H W 3 T bytes each."""
-
-    def __init__(self, clips: ClipSource, numbers: Sequence[int], *, keep: bool = False) -> None:
-        self._clips, self._numbers, self._keep = clips, tuple(numbers), keep
-        self.fps, self.camera, self.mount = clips.fps, clips.camera, clips.mount
-        self.classes, self.origin = tuple(clips.classes), clips.origin
-        self._pictures: dict[int, tuple[Bytes, Bytes]] = {}
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def sample(self, number: int, /) -> Sample:
-        """See ClipSource."""
-        return self._clips.sample(self._numbers[number])
-
-    def seed(self, number: int, /) -> int:
-        """See ClipSource."""
-        return self._clips.seed(self._numbers[number])
-
-    def trajectory(self, number: int, /) -> Trajectory:
-        """See ClipSource."""
-        return self._clips.trajectory(self._numbers[number])
-
-    def rgb(self, number: int, /) -> tuple[Bytes, Bytes]:
-        """See ClipSource."""
-        if number in self._pictures:
-            return self._pictures[number]
-        pictures = self._clips.rgb(self._numbers[number])
-        if self._keep:
-            self._pictures[number] = pictures
-        return pictures
-
-    def target_classes(self, number: int, /) -> Bytes:
-        """See ClipSource."""
-        return self._clips.target_classes(self._numbers[number])
-
-
-class PaintedClips(SomeClips):
+def painted(clips: Clips) -> Clips:
     """The clips with the target painted in the colours of its classes: what a semantic model learns to draw.
 
     Raises DataError for clips of a world without classes.
     """
-
-    def __init__(self, clips: ClipSource) -> None:
-        super().__init__(clips, range(len(clips)))
-        if not clips.classes:
-            raise DataError("a semantic model needs classes, and these clips have none; generate driving pairs")
-        self._colours = np.array([kind.colour for kind in clips.classes], np.uint8)
-        self.origin = f"{clips.origin}-painted"  # latents of these are others
-
-    def sample(self, number: int, /) -> Sample:
-        """See ClipSource."""
-        return replace(super().sample(number), target=self._colours[self.target_classes(number)])
-
-    def rgb(self, number: int, /) -> tuple[Bytes, Bytes]:
-        """See ClipSource."""
-        source, _ = super().rgb(number)
-        return source, self._colours[self.target_classes(number)]
+    if not clips.classes:
+        raise DataError("a semantic model needs classes, and these clips have none; generate driving pairs")
+    colours = np.array([kind.colour for kind in clips.classes], np.uint8)
+    return MadeClips(
+        make=partial(_painted, clips, colours),
+        seeds=clips.seeds,
+        fps=clips.fps,
+        camera=clips.camera,
+        classes=clips.classes,
+        origin=f"{clips.origin}-painted",  # latents of these are others
+    )
 
 
-def numbers_of(clips: ClipSource, seeds: Sequence[int]) -> list[int]:
+def _painted(clips: Clips, colours: Bytes, number: int) -> Sample:
+    sample = clips.sample(number)
+    return replace(sample, target=colours[sample.target_classes])
+
+
+def numbers_of(clips: Clips, seeds: Sequence[int]) -> list[int]:
     """Where the clips of these seeds are now. Raises DataError if one is gone."""
-    places = {clips.seed(number): number for number in range(len(clips))}
+    places = {seed: number for number, seed in enumerate(clips.seeds)}
     gone = [seed for seed in seeds if seed not in places]
     if gone:
         raise DataError(f"{len(gone)} clips this run began with are gone, first seed {gone[0]}; give the same --data")
@@ -313,37 +227,6 @@ _PART_SEEDS = 10**15
 """Names of the second set's clips count from here: no clip's own number is as large."""
 
 
-class VideoClips(ClipSource):
-    """Both sides of all pairs of some sets, which take turns; their frame rate is the first set's."""
-
-    camera: CameraControl = "none"
-
-    def __init__(self, parts: Sequence[ClipSource]) -> None:
-        self._parts, self.fps = tuple(parts), parts[0].fps
-        self.origin = "-".join(("videos", *(part.origin for part in parts)))
-        self._places = [
-            (part, clip, side)
-            for clip in range(max(map(len, parts)))
-            for part, clips in enumerate(parts)
-            if clip < len(clips)
-            for side in (0, 1)
-        ]
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def seed(self, number: int, /) -> int:
-        """Twice the pair's own number, one more for the target's side."""
-        part, clip, side = self._places[number]
-        return part * _PART_SEEDS + 2 * self._parts[part].seed(clip) + side
-
-    def sample(self, number: int, /) -> Sample:
-        """See ClipSource."""
-        part, clip, side = self._places[number]
-        video, fps = self._parts[part].rgb(clip)[side], self._parts[part].fps
-        return _continued(video, fps, f"clip {self.seed(number)}", tuple(range(len(video))))
-
-
 class VideoSamples:
     """Samples of a data set as videos: sample 2n is what the source camera saw of its sample n, 2n + 1 the target."""
 
@@ -354,20 +237,42 @@ class VideoSamples:
         return 2 * len(self._samples)
 
     def sample(self, index: int, /) -> Sample:
-        """The video of a number. Raises DataError as `Samples.sample`."""
+        """The video of a number; the camera of the view is its own. Raises DataError as `Samples.sample`."""
         pair = self._samples.sample(index // 2)
         video = pair.target if index % 2 else pair.source
-        made = _continued(video, pair.fps, pair.scene, pair.frame_numbers)
-        return replace(made, skipped=pair.skipped, bytes_read=pair.bytes_read)
+        return replace(
+            pair,
+            source=np.repeat(video[:1], len(video), axis=0),
+            target=video,
+            source_from_target=np.tile(np.eye(4), (len(video), 1, 1)),
+            target_classes=None,
+            start=None,
+            deltas=None,
+            visible=None,
+        )
 
 
-def _continued(video: Bytes, fps: float, scene: str, frame_numbers: tuple[int, ...]) -> Sample:
-    """A video and its first frame; the camera of the view is the video's own."""
-    return Sample(
-        source=np.repeat(video[:1], len(video), axis=0),
-        target=video,
-        source_from_target=np.tile(np.eye(4), (len(video), 1, 1)),
-        fps=fps,
-        scene=scene,
-        frame_numbers=frame_numbers,
+def video_clips(parts: Sequence[Clips]) -> Clips:
+    """Both sides of all pairs of some sets, which take turns; their frame rate is the first set's.
+
+    A video's seed is twice its pair's, one more for the target's side.
+    """
+    places = [
+        (part, 2 * clip + side)
+        for clip in range(max(map(len, parts)))
+        for part, clips in enumerate(parts)
+        if clip < len(clips)
+        for side in (0, 1)
+    ]
+    return MadeClips(
+        make=partial(_video, [VideoSamples(part) for part in parts], places),
+        seeds=[part * _PART_SEEDS + 2 * parts[part].seeds[number // 2] + number % 2 for part, number in places],
+        fps=parts[0].fps,
+        camera="none",
+        origin="-".join(("videos", *(part.origin for part in parts))),
     )
+
+
+def _video(parts: Sequence[VideoSamples], places: Sequence[tuple[int, int]], number: int) -> Sample:
+    part, index = places[number % len(places)]
+    return parts[part].sample(index)

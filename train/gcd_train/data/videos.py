@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
 from gcd_model.small_files import read_json
-from gcd_train.data.files import MOST_PICTURE, FileFault, Skips
-from gcd_train.data.paths import generator
+from gcd_train.data.files import MOST_PICTURE, FileFault
 from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Bytes, Sample
-from gcd_train.data.views import readable
+from gcd_train.data.views import DrawnSamples
 from gcd_train.errors import DataError, RecipeError
 
 CAMERA_FILE = "cameras.json"
@@ -138,8 +137,8 @@ def _camera(path: Path, name: str, camera: _Camera, frames: int) -> FilmedCamera
     return FilmedCamera(path.parent / name, lens, np.broadcast_to(poses, (frames, 4, 4)))
 
 
-class FilmedPairs:
-    """Samples of filmed scenes by number: two of a scene's cameras, over the same frames.
+class FilmedPairs(DrawnSamples):
+    """Samples of filmed scenes: two of a scene's cameras, over the same frames.
 
     size: width and height of the samples. frames: T. fps: of the clips. repeats: see `ViewPairs`. Pictures are cropped
     about their middle and resized; of cameras with different lenses the wider one's picture is first re-projected to
@@ -157,8 +156,8 @@ class FilmedPairs:
         seed: int = 0,
         repeats: int = 1,
     ) -> None:
-        self.scenes, self.skips, self.fps = scenes, Skips(), fps
-        self._size, self._frames, self._seed, self._repeats = size, frames, seed, repeats
+        super().__init__(seed, repeats * len(scenes))
+        self.scenes, self.fps, self._size, self._frames = scenes, fps, size, frames
         for scene in scenes:
             stride = self._stride(scene)
             if abs(scene.fps / stride - fps) > _RATE_TOLERANCE * fps:
@@ -167,23 +166,15 @@ class FilmedPairs:
                 needed = (frames - 1) * stride + 1
                 raise DataError(f"{scene.file.parent} has {scene.frames} frames, a clip of {frames} takes {needed}")
 
-    def __len__(self) -> int:
-        return self._repeats * len(self.scenes)
-
-    def sample(self, index: int, /) -> Sample:
-        """The sample of a number, or of the one that replaces it. Raises DataError as `Samples.sample`."""
-
-        def place(number: int) -> tuple[str, Path]:
-            scene = self.scenes[number % len(self.scenes)]
-            return scene.name, scene.file
-
-        return readable(self._seed, index, len(self), self.skips, self._made, place)
+    def _place(self, number: int) -> tuple[str, Path]:
+        scene = self.scenes[number % len(self.scenes)]
+        return scene.name, scene.file
 
     def _stride(self, scene: FilmedScene) -> int:
         return max(round(scene.fps / self.fps), 1)
 
-    def _made(self, number: int) -> Sample:
-        scene, random = self.scenes[number % len(self.scenes)], generator(self._seed, number)
+    def _made(self, number: int, random: np.random.Generator) -> Sample:
+        scene = self.scenes[number % len(self.scenes)]
         source, target = (scene.cameras[int(k)] for k in random.choice(len(scene.cameras), 2, replace=False))
         stride = self._stride(scene)
         start = int(random.integers(scene.frames - (self._frames - 1) * stride))

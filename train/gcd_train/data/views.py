@@ -1,15 +1,16 @@
-"""Training pairs of a 4D data set: what a source camera saw, and what a camera on another path would have seen."""
+"""Training pairs drawn by number: what a source camera saw of a scene, and what one on another path would have."""
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from gcd_model.errors import ModelError
 from gcd_model.geometry import relative_pose
 from gcd_train.data.dataset4d import Dataset4D
-from gcd_train.data.files import FileFault, Skipped, Skips, bytes_read
+from gcd_train.data.files import FileFault, Skipped, Skips
 from gcd_train.data.paths import Draw, Sampling, generator
 from gcd_train.data.pictures import PictureOptions, pictures_of
 from gcd_train.data.sample import Sample
@@ -17,15 +18,65 @@ from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError, RenderError, TrainError
 
 _TRIES, _NAMED = 100, 5
-_REPEATS = 400
 
 
-class ViewPairs:
-    """Samples of a data set by number. The same (seed, index) gives the same sample, in any order, in any process.
+class DrawnSamples(ABC):
+    """Samples by number. The same (seed, index) gives the same sample, in any order, in any process.
+
+    A sample that cannot be read is counted in `skips` and replaced by another, at most 100 times.
+    """
+
+    def __init__(self, seed: int, count: int) -> None:
+        self.seed, self._count, self.skips = seed, count, Skips()
+
+    @abstractmethod
+    def _made(self, number: int, random: np.random.Generator) -> Sample:
+        """The sample of a number."""
+
+    @abstractmethod
+    def _place(self, number: int) -> tuple[str, Path]:
+        """Its scene, and the folder or file that is named for a fault that names none."""
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> Sample:
+        """As `sample`, for a loader. Raises IndexError beyond the end."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"{index} is beyond the {len(self)} samples")
+        return self.sample(index)
+
+    def sample(self, index: int, /) -> Sample:
+        """The sample of a number or, where it cannot be read, of the first of a hundred stand-ins that can.
+
+        Raises:
+            DataError: a hundred in a row cannot be read; it names the last faults.
+            RenderError, RecipeError: no other would do better.
+        """
+        skipped: list[Skipped] = []
+        for attempt in range(_TRIES + 1):
+            number = index if attempt == 0 else int(generator(self.seed, index, attempt).integers(len(self)))
+            try:
+                return replace(self._made(number, generator(self.seed, number)), skipped=tuple(skipped))
+            except (RenderError, RecipeError):
+                raise
+            except (TrainError, ModelError, OSError) as error:
+                scene, file = self._place(number)
+                reason = str(error)
+                if isinstance(error, FileFault):
+                    file, reason = error.path, error.reason
+                elif isinstance(error, OSError) and error.filename:
+                    file = Path(str(error.filename))
+                skipped.append(self.skips.add(scene, file, reason))
+        last = "; ".join(map(str, skipped[-_NAMED:]))
+        raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")
+
+
+class ViewPairs(DrawnSamples):
+    """Samples of a data set in a published layout.
 
     dataset: where pictures come from. sampling: frames and paths, for one `paths.MAX90` or `DRIVING`. options: what is
     made of them. repeats: the set counts as so many times its scenes; scene of index i is i mod the number of scenes.
-    A sample that cannot be read is counted in `skips` and replaced by another, at most 100 times.
 
     Safe in the workers of a loader: give it to `torch.utils.data.DataLoader(pairs, collate_fn=collate)`; where this
     process has drawn with OpenGL before, with `multiprocessing_context="spawn"`.
@@ -38,58 +89,23 @@ class ViewPairs:
         seed: int = 0,
         options: PictureOptions | None = None,
         *,
-        repeats: int = _REPEATS,
+        repeats: int = 400,
     ) -> None:
         if not dataset.scenes:
             raise DataError("a data set without scenes has no pairs; look at its folder, split and list")
-        self.dataset, self.sampling, self.seed, self._repeats = dataset, sampling, seed, repeats
-        self.skips = Skips()
+        super().__init__(seed, repeats * len(dataset.scenes))
+        self.dataset, self.sampling = dataset, sampling
         self._pictures = pictures_of(dataset, options or PictureOptions())
-
-    def __len__(self) -> int:
-        return self._repeats * len(self.dataset.scenes)
-
-    def __getitem__(self, index: int) -> Sample:
-        """As `sample`, for a loader. Raises IndexError beyond the end."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{index} is beyond the {len(self)} samples")
-        return self.sample(index)
-
-    def sample(self, index: int, /) -> Sample:
-        """The sample of a number, or of the one that replaces it.
-
-        Raises:
-            DataError: a hundred in a row cannot be read; it names the last faults.
-            RenderError, RecipeError: exact pictures cannot be drawn on this machine, or an option is wrong.
-        """
-        before = bytes_read()
-
-        def made(number: int) -> Sample:
-            scene = self.dataset.scenes[number % len(self.dataset.scenes)]
-            frames, random = self.dataset.frames(scene), generator(self.seed, number)
-            return self._pair(scene, self.sampling.draw(random, frames, self.dataset.fps))
-
-        def place(number: int) -> tuple[str, Path]:
-            scene = self.dataset.scenes[number % len(self.dataset.scenes)]
-            return scene, self.dataset.folder(scene)
-
-        sample = readable(self.seed, index, len(self), self.skips, made, place)
-        return replace(sample, bytes_read=bytes_read() - before)
 
     def controlled(self, scene: str, control: Control) -> Sample:
         """The sample of a scene that a control list asks for.
 
         Raises: DataError, FileFault: it cannot be read; nothing stands in for it.
         """
-        draw = self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps)
-        return self.pair(scene, draw)
+        return self.pair(scene, self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps))
 
     def pair(self, scene: str, draw: Draw) -> Sample:
         """A sample drawn elsewhere. Raises DataError, FileFault: it cannot be read."""
-        before = bytes_read()
-        return replace(self._pair(scene, draw), bytes_read=bytes_read() - before)
-
-    def _pair(self, scene: str, draw: Draw) -> Sample:
         made = self._pictures.make(scene, draw)
         world_from_source, world_from_target = map(torch.from_numpy, (made.world_from_source, draw.world_from_target))
         return Sample(
@@ -105,34 +121,10 @@ class ViewPairs:
             visible=made.visible,
         )
 
+    def _made(self, number: int, random: np.random.Generator) -> Sample:
+        scene, _ = self._place(number)
+        return self.pair(scene, self.sampling.draw(random, self.dataset.frames(scene), self.dataset.fps))
 
-def readable(
-    seed: int,
-    index: int,
-    length: int,
-    skips: Skips,
-    made: Callable[[int], Sample],
-    place: Callable[[int], tuple[str, Path]],
-) -> Sample:
-    """The sample of a number or, where it cannot be read, of the first of a hundred stand-ins that can.
-
-    made: the sample of a number. place: its scene, and the folder or file that is named for a fault that names none.
-    Raises: DataError if none can be read; it names the last faults. RenderError, RecipeError: no other would do better.
-    """
-    skipped: list[Skipped] = []
-    for attempt in range(_TRIES + 1):
-        number = index if attempt == 0 else int(generator(seed, index, attempt).integers(length))
-        try:
-            return replace(made(number), skipped=tuple(skipped))
-        except (RenderError, RecipeError):
-            raise
-        except (TrainError, ModelError, OSError) as error:
-            scene, file = place(number)
-            reason = str(error)
-            if isinstance(error, FileFault):
-                file, reason = error.path, error.reason
-            elif isinstance(error, OSError) and error.filename:
-                file = Path(str(error.filename))
-            skipped.append(skips.add(scene, file, reason))
-    last = "; ".join(map(str, skipped[-_NAMED:]))
-    raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")
+    def _place(self, number: int) -> tuple[str, Path]:
+        scene = self.dataset.scenes[number % len(self.dataset.scenes)]
+        return scene, self.dataset.folder(scene)

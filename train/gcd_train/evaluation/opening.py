@@ -239,7 +239,7 @@ def open_pairs(
         raise RecipeError("these clips have no vehicle to mount a camera on: leave out --declared-height and -tilt")
     declared = mount or CameraMount() if clips.camera == "none" else None
     some = chosen(clips, scenes=wanted, limit=choice.limit)
-    return PairedSet.of(some, declared=declared), tuple(notes.plain_lines())
+    return PairedSet.of(some, declared=declared), tuple(notes.lines())
 
 
 def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[EvaluationSet, tuple[str, ...]]:
@@ -283,7 +283,7 @@ def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[Evaluati
         identity=_identity(folder, scenes, cuts),
         semantic=cuts.semantic,
     )
-    return clips, (*notes.plain_lines(), *odd)
+    return clips, (*notes.lines(), *odd)
 
 
 def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | ParallelDomain4D:

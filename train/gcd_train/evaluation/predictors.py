@@ -16,7 +16,7 @@ from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
 from gcd_train.data.files import FileFault, read_colour
-from gcd_train.data.sample import Bytes, ClipSource, SceneView
+from gcd_train.data.sample import Bytes, Clips, SceneView
 from gcd_train.errors import DataError
 from gcd_train.pointcloud.project import tangents
 
@@ -171,7 +171,7 @@ class TargetStatistics:
     majority: Tensor | None = None
 
 
-def fit_statistics(clips: ClipSource, *, progress: Callable[[int, int], None] | None = None) -> TargetStatistics:
+def fit_statistics(clips: Clips, *, progress: Callable[[int, int], None] | None = None) -> TargetStatistics:
     """Mean picture and majority class of training targets.
 
     Args:
@@ -182,13 +182,14 @@ def fit_statistics(clips: ClipSource, *, progress: Callable[[int, int], None] | 
     """
     if len(clips) == 0:
         raise DataError("mean target and majority map want training clips, got an empty folder; generate some first")
-    total = to_pictures(clips.rgb(0)[1]).double().zero_()  # [T, 3, H, W]
-    votes = [np.zeros(clips.target_classes(0).shape, dtype=np.int32) for _ in clips.classes]  # K times [T, H, W]
+    first = clips.sample(0).target
+    total = to_pictures(first).double().zero_()  # [T, 3, H, W]
+    votes = [np.zeros(first.shape[:3], dtype=np.int32) for _ in clips.classes]  # K times [T, H, W]
     for index in range(len(clips)):
-        total += to_pictures(clips.rgb(index)[1])
-        labels = clips.target_classes(index) if votes else None
+        sample = clips.sample(index)
+        total += to_pictures(sample.target)
         for label, count in enumerate(votes):
-            count += labels == label
+            count += sample.target_classes == label
         if progress is not None:
             progress(index + 1, len(clips))
     majority = torch.from_numpy(np.stack(votes).argmax(axis=0).astype(np.uint8)) if votes else None

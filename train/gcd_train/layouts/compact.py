@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from gcd_train.data.files import FileFault, bytes_read
+from gcd_train.data.files import FileFault
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.sample import SceneView
@@ -25,10 +25,9 @@ _JSON_FOLDERS = ("calibration", "ontology")
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Packed:
-    """made: False for a scene that was there already. read, written: bytes. gaps: views that the source lacks."""
+    """made: False for a scene that was there already. written: bytes. gaps: views that the source lacks."""
 
     made: bool
-    read: int = 0
     written: int = 0
     gaps: int = 0
 
@@ -81,21 +80,20 @@ class Compaction:
             raise DataError(str(fault)) from fault  # which crosses from process to process as what it is
 
     def _packed(self, scene: str) -> Packed:
-        reader, before = self._reader(self.source, scene), bytes_read()
+        reader = self._reader(self.source, scene)
         frames = reader.frames(scene)
         with new_folder(self.out, scene) as folder:
             files = SceneFiles(folder)
             for path in self._facts(scene):
                 files.write(folder / path.relative_to(self.source / scene), path.read_bytes())
             written = self._write_views(reader, scene, files)
-            read = bytes_read() - before
             packed = self._reader(folder.parent, scene)
             for time, camera in written:
                 (same,), (view,) = packed.views(scene, time, [camera]), reader.views(scene, time, [camera])
                 _require_alike(same, view, f"{camera} at frame {time}", street=not self.orbits)
             self._write_manifest(scene, files)
         gaps = frames * len(self.cameras) - len(written)
-        return Packed(made=True, read=read, written=files.size, gaps=gaps)
+        return Packed(made=True, written=files.size, gaps=gaps)
 
     @property
     def _ahead(self) -> str:

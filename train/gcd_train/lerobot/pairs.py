@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
-from gcd_train.data.files import FileFault, Skips
-from gcd_train.data.paths import generator
+from gcd_train.data.files import FileFault
 from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Sample
-from gcd_train.data.views import readable
+from gcd_train.data.views import DrawnSamples
 from gcd_train.errors import DataError
 from gcd_train.lerobot.folder import (
     CameraCalibration,
@@ -31,82 +30,52 @@ from gcd_train.lerobot.folder import (
     read_rows,
 )
 
-_EARLY_S = 0.5
+_EARLY_S, _SLACK_S = 0.5, 1e-4
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class VideoClip:
-    """pictures: u8 [T, H, W, 3], RGB. bytes_read: of packets."""
-
-    pictures: NDArray[np.uint8]
-    bytes_read: int
-
-
-def read_pictures(path: Path, times_s: Sequence[float], tolerance_s: float) -> VideoClip:
+def read_pictures(path: Path, times_s: Sequence[float], tolerance_s: float) -> Bytes:
     """The picture nearest to each time.
 
     Args:
         times_s: rising, seconds in the file.
         tolerance_s: a picture farther away in time is none.
+    Returns:
+        u8 [T, H, W, 3], RGB.
     Raises: FileFault: the video is missing, damaged, too short, or has no picture near enough. DataError: no PyAV.
     """
     av = load_av()
     if not path.is_file():
         raise FileFault(path, "is missing: download or export the data set again")
-    counted = _Counted()
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise FileFault(path, "holds no video")
-            shown = _pictures_since(container, times_s[0], counted)
-            chosen = list(_nearest(path, shown, times_s, tolerance_s))
+            stream = container.streams.video[0]
+            stream.thread_type = "NONE"  # loader workers share the cores
+            begin = max(0.0, times_s[0] - _EARLY_S)
+            container.seek(int(begin / stream.time_base), stream=stream, backward=True)
+            frames = (frame for frame in container.decode(stream) if frame.pts is not None)
+            return np.stack(list(_nearest(path, frames, times_s, tolerance_s)))
     except (av.FFmpegError, ValueError, IndexError) as error:
         raise FileFault(path, f"is damaged ({error})") from error
-    return VideoClip(pictures=np.stack(chosen), bytes_read=counted.bytes)
 
 
-@dataclass(slots=True)
-class _Counted:
-    bytes: int = 0
-
-
-def _pictures_since(container: Any, first_s: float, counted: _Counted) -> Iterator[tuple[float, Any]]:
-    """Time and frame of every picture, from a little before `first_s`."""
-    stream = container.streams.video[0]
-    stream.thread_type = "NONE"  # loader workers share the cores
-    begin = max(0.0, first_s - _EARLY_S)
-    container.seek(int(begin / stream.time_base), stream=stream, backward=True)
-    for packet in container.demux(stream):
-        counted.bytes += packet.size
-        for frame in packet.decode():
-            if frame.pts is not None:
-                yield float(frame.pts * frame.time_base), frame
-
-
-def _nearest(
-    path: Path, shown: Iterator[tuple[float, Any]], times_s: Sequence[float], tolerance_s: float
-) -> Iterator[NDArray[np.uint8]]:
+def _nearest(path: Path, frames: Iterator[Any], times_s: Sequence[float], tolerance_s: float) -> Iterator[Bytes]:
     """One picture a wanted time; a picture may serve two."""
-    before: tuple[float, Any] | None = None
-    after = next(shown, None)
+    before, after = None, next(frames, None)
     for wanted in times_s:
-        while after is not None and after[0] < wanted:
-            before, after = after, next(shown, None)
-        there = [pair for pair in (before, after) if pair is not None]
+        while after is not None and after.time < wanted:
+            before, after = after, next(frames, None)
+        there = [frame for frame in (before, after) if frame is not None]
         if not there:
             raise FileFault(path, "holds no picture that can be decoded")
-        time, frame = there[0] if abs(there[0][0] - wanted) <= abs(there[-1][0] - wanted) else there[-1]
-        if abs(time - wanted) > tolerance_s:
-            end = f"it ends at {time:.3f} s" if after is None else f"the nearest is at {time:.3f} s"
+        frame = min(there, key=lambda each: abs(each.time - wanted))
+        if abs(frame.time - wanted) > tolerance_s:
+            end = f"it ends at {frame.time:.3f} s" if after is None else f"the nearest is at {frame.time:.3f} s"
             raise FileFault(path, f"has no picture within {1000 * tolerance_s:.1f} ms of {wanted:.3f} s: {end}")
         yield frame.to_ndarray(format="rgb24")
-
-
-__all__ = ["LeRobotOptions", "LeRobotPairs"]
-
-_SLACK_S = 1e-4
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -141,10 +110,9 @@ class _Window:
     poses: Mapping[str, Floats]
 
 
-class LeRobotPairs:
-    """Samples of a LeRobot data set by number. The same (seed, index) gives the same sample, in any process.
+class LeRobotPairs(DrawnSamples):
+    """Samples of a LeRobot data set.
 
-    An episode that cannot be read is counted in `skips` and replaced by another, at most 100 times.
     Raises: DataError, FileFault: no data set, no calibration, or an option does not fit.
     """
 
@@ -152,12 +120,13 @@ class LeRobotPairs:
         load_arrow()  # what is not installed is said now, not sample by sample
         load_av()
         self.options = options or LeRobotOptions()
-        self.folder, self.seed, self.skips = LeRobotFolder.open(folder), seed, Skips()
+        self.folder = LeRobotFolder.open(folder)
         self.episodes = tuple(self.folder.episodes)[slice(*self.options.episodes)]
         if not self.episodes:
             raise DataError(
                 f"{folder} has {len(self.folder.episodes)} episodes, none of them in {self.options.episodes}"
             )
+        super().__init__(seed, self.options.repeats * len(self.episodes))
         self._calibrations = read_cameras(folder, self.options.calibration)
         self.cameras = self._chosen_cameras()
         info = self.folder.info
@@ -166,26 +135,9 @@ class LeRobotPairs:
             raise DataError(f"clips of {self.fps:g} frames per second were wanted, {folder} has {info.fps:g}")
         self._tolerance_s = self.options.tolerance_s or 0.5 / info.fps + _SLACK_S
 
-    def __len__(self) -> int:
-        return self.options.repeats * len(self.episodes)
-
-    def __getitem__(self, index: int) -> Sample:
-        """As `sample`, for a loader. Raises IndexError beyond the end."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{index} is beyond the {len(self)} samples")
-        return self.sample(index)
-
-    def sample(self, index: int) -> Sample:
-        """The sample of a number, or of the one that replaces it.
-
-        Raises: DataError naming the last faults if a hundred in a row cannot be read.
-        """
-
-        def place(number: int) -> tuple[str, Path]:
-            episode = self.episodes[number % len(self.episodes)]
-            return episode.name, episode.data
-
-        return readable(self.seed, index, len(self), self.skips, self._pair, place)
+    def _place(self, number: int) -> tuple[str, Path]:
+        episode = self.episodes[number % len(self.episodes)]
+        return episode.name, episode.data
 
     def _chosen_cameras(self) -> tuple[str, ...]:
         """Calibrated cameras that the set has."""
@@ -201,22 +153,19 @@ class LeRobotPairs:
             raise DataError(f"pairs need two cameras or more, got {', '.join(wanted)}")
         return tuple(sorted(set(wanted)))
 
-    def _pair(self, number: int) -> Sample:
-        episode, random = self.episodes[number % len(self.episodes)], generator(self.seed, number)
+    def _made(self, number: int, random: np.random.Generator) -> Sample:
+        episode = self.episodes[number % len(self.episodes)]
         source, target = (self.cameras[int(k)] for k in random.choice(len(self.cameras), 2, replace=False))
         window = self._window(episode, (source, target), random)
         lens = narrower(self._calibrations[source].lens, self._calibrations[target].lens)
-        seen, seen_bytes = self._pictures(episode, source, window, lens)
-        aimed, aimed_bytes = self._pictures(episode, target, window, lens)
         poses = (torch.from_numpy(window.poses[name]) for name in (source, target))
         return Sample(
-            source=seen,
-            target=aimed,
+            source=self._pictures(episode, source, window, lens),
+            target=self._pictures(episode, target, window, lens),
             source_from_target=relative_pose(*poses).numpy(),
             fps=self.fps,
             scene=episode.name,
             frame_numbers=window.rows,
-            bytes_read=seen_bytes + aimed_bytes,
         )
 
     def _window(self, episode: EpisodePlace, cameras: Sequence[str], random: np.random.Generator) -> _Window:
@@ -242,17 +191,16 @@ class LeRobotPairs:
         }
         return _Window(tuple(chosen.tolist()), tuple(times[chosen].tolist()), poses)
 
-    def _pictures(self, episode: EpisodePlace, camera: str, window: _Window, lens: Intrinsics) -> tuple[Bytes, int]:
-        """[T, H, W, 3] through this lens at the wanted size, and the bytes that were read."""
+    def _pictures(self, episode: EpisodePlace, camera: str, window: _Window, lens: Intrinsics) -> Bytes:
+        """[T, H, W, 3] through this lens at the wanted size."""
         path, begin = episode.videos[camera]
-        clip = read_pictures(path, [begin + time for time in window.times_s], self._tolerance_s)
-        height, width = clip.pictures.shape[1:3]
+        pictures = read_pictures(path, [begin + time for time in window.times_s], self._tolerance_s)
+        height, width = pictures.shape[1:3]
         calibration = self._calibrations[camera]
         if (width, height) != (calibration.width, calibration.height):
             said = f"{calibration.width} x {calibration.height}"
             raise FileFault(path, f"is {width} x {height}, its calibration says {said}")
-        sized = [seen_through(picture, calibration.lens, lens, self.options.size) for picture in clip.pictures]
-        return np.stack(sized), clip.bytes_read
+        return np.stack([seen_through(each, calibration.lens, lens, self.options.size) for each in pictures])
 
 
 def _number(value: float | list[float]) -> float:

@@ -39,7 +39,7 @@ class Footage:
     labels: i32 [T, H, W] ids in the source picture, None without any. kind: of the labels, "class" or "instance".
     names: of the ids. depth: f32 [T, H, W] metres along the optical axis of the source, 0 where nothing is known.
     world_from_source, world_from_target: f64 [T, 4, 4]. look_at: the point the path turns about or ends looking at, or
-    None. world: what the axes x, y, z mean. bytes_read: of files.
+    None. world: what the axes x, y, z mean.
     """
 
     title: str
@@ -66,7 +66,6 @@ class Footage:
     world_from_target: Poses
     look_at: tuple[float, float, float] | None
     world: str
-    bytes_read: int = 0
 
     @property
     def frames(self) -> int:
@@ -137,7 +136,7 @@ class Footage:
         way = np.linalg.norm(np.diff(self.world_from_target[:, :3, 3], axis=0), axis=1).sum()
         height, width = self.source.shape[1:3]
         seen, rule = self.seen_shares, "published rule" if self.target_depth is None else "depths agree within 2 %"
-        rows = [
+        return [
             ("scene", f"{self.scene_frames} frames at {self.scene_fps:g} fps, {len(self.cameras)} cameras"),
             ("clip", f"{self.frames} frames at {self.fps:g} fps, {self.frame_numbers[0]} to {self.frame_numbers[-1]}"),
             ("pictures", f"{width} x {height} px, hfov {self.hfov_deg:.1f}°"),
@@ -146,4 +145,3 @@ class Footage:
             ("depth", f"{near:.1f} to {far:.1f} m (1st to 99th percentile)"),
             ("seen", f"{100 * seen.mean():.0f} % of all surfaces, {100 * seen[-1]:.0f} % at the end\n({rule})"),
         ]
-        return rows + ([("read", f"{self.bytes_read / 1e6:.1f} MB")] if self.bytes_read else [])

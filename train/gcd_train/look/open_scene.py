@@ -14,7 +14,7 @@ from gcd_model.errors import FileError
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics, from_pose, spherical_trajectory
 from gcd_model.small_files import decode_json, read_json
 from gcd_train.data.dataset4d import Dataset4D, OntologyItem, read_ontology
-from gcd_train.data.files import MOST_TEXT, ZIP_FAULTS, bytes_read, read_member
+from gcd_train.data.files import MOST_TEXT, ZIP_FAULTS, read_member
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
@@ -97,7 +97,6 @@ def _data_set(path: Path) -> Dataset4D:
 
 def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     """A clip of a scene. Raises: FileFault naming the file that cannot be read, RecipeError for frames that are not."""
-    before = bytes_read()
     on_sphere = isinstance(data, Kubric4D)
     numbers, stride = _frame_numbers(data.frames(scene), KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, options)
     views = [data.views(scene, number, [data.source_camera])[0] for number in numbers]
@@ -133,7 +132,6 @@ def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
         world_from_target=poses,
         look_at=LOOK_AT if on_sphere else DRIVING_GOAL_TARGET,
         world=_STAGE if on_sphere else _VEHICLE,
-        bytes_read=bytes_read() - before,
     )
 
 
@@ -279,7 +277,7 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
     if seed is None and path.suffix == ".zip" and (number := path.stem.split("-")[1:2]) and number[0].isdecimal():
         seed = int(number[0])
     clips = PairedClips.open(folder)
-    seeds = [clips.seed(number) for number in range(len(clips))]
+    seeds = list(clips.seeds)
     if seed is not None and seed not in seeds:
         raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(seeds)}, {seeds[0]} to {seeds[-1]}")
     index = 0 if seed is None else seeds.index(seed)

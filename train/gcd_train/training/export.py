@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from gcd_model.weights.adapter import Adapter
 from gcd_model.weights.card import Card, precision
 from gcd_model.weights.load import load_weights, save_weights
 from gcd_model.weights.save import write_adapter, write_published
-from gcd_train.data.sample import ClipSource, to_network
+from gcd_train.data.sample import Clips, to_network
 from gcd_train.errors import RunError
 from gcd_train.evaluation.metrics import NO_CLASS, mean_iou, named_confusion, psnr
 from gcd_train.pictures import write_sheet
@@ -29,7 +30,7 @@ _SHOWN_CLIPS = 4
 class Validation:
     """Held-out clips and how the model takes them."""
 
-    def __init__(self, clips: ClipSource, family: Family, *, count: int) -> None:
+    def __init__(self, clips: Clips, family: Family, *, count: int) -> None:
         self._clips, self._family = clips, family
         self._count = min(count, len(clips))
 
@@ -43,13 +44,14 @@ class Validation:
         counts: Tensor | None = None
         shown: list[list[Tensor]] = []
         for number in range(self._count):
-            source, target = (to_network(side) for side in self._clips.rgb(number))
+            sample = self._clips.sample(number)
+            source, target = to_network(sample.source), to_network(sample.target)
             clip = Clip(video=source, fps=self._clips.fps)
-            view = synthesizer.render(synthesizer.encode(clip), [self._clips.trajectory(number)])[0]
+            view = synthesizer.render(synthesizer.encode(clip), [sample.trajectory])[0]
             scores.append(psnr(view.video, (target + 1) / 2)[1:])
             rows = [source, view.video * 2 - 1, target]
             if view.classes is not None:
-                truth = torch.from_numpy(self._clips.target_classes(number).copy())
+                truth = torch.from_numpy(np.array(sample.target_classes))
                 met = named_confusion(view.classes[0, 1:], truth[1:], [kind.name for kind in self._clips.classes])
                 counts = met if counts is None else counts + met
                 rows += [self._painted(view.classes[0]), self._painted(truth)]

@@ -18,7 +18,7 @@ from gcd_train.data.batches import EncodedBatches, SampleBatches
 from gcd_train.data.latents import EncodedClips
 from gcd_train.data.latents_writer import Encodings, autoencoder_digest
 from gcd_train.data.open import RunData
-from gcd_train.data.sample import ClipSource
+from gcd_train.data.sample import Clips
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
 from gcd_train.recipe_data import AnyStageName, Budget
@@ -252,7 +252,7 @@ class Trainer:
         return None if clips is None else torch.tensor(clips.meta.sensitivity, device=self._precision.device)
 
 
-def require_fit(clips: ClipSource, config: ModelConfig, fps: float) -> None:
+def require_fit(clips: Clips, config: ModelConfig, fps: float) -> None:
     """Raises DataError if the clips are not what the model and its recipe take them for."""
     if clips.fps != fps:
         raise DataError(f"the recipe's unet.fps is {fps:g}, the clips have {clips.fps:g}; change one of them")

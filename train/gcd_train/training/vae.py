@@ -1,8 +1,10 @@
 """The autoencoder, on crops of source and target frames."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -12,7 +14,7 @@ from gcd_model.colours import nearest_classes
 from gcd_model.layers import zeroed
 from gcd_model.networks import Networks
 from gcd_model.vae import Encoder, Posterior, TemporalDecoder
-from gcd_train.data.sample import Bytes, ClipSource, SomeClips, to_network
+from gcd_train.data.sample import Bytes, Clips, to_network
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.metrics import mean_iou, named_confusion, psnr
 from gcd_train.pictures import write_sheet
@@ -44,8 +46,8 @@ class VAETask:
     def __init__(
         self,
         networks: Networks,
-        clips: ClipSource,
-        valid: ClipSource,
+        clips: Clips,
+        valid: Clips,
         recipe: VAERecipe,
         precision: Precision,
         seed: int,
@@ -55,7 +57,7 @@ class VAETask:
         self._precision, self._seed, self._recipe, self._valid = precision, seed, recipe, valid
         self._painted = config.semantic_classes
         order = Draws(seed, "vae-pool", 0, torch.device("cpu")).order(len(clips))
-        self._clips = SomeClips(clips, order[: recipe.pool], keep=True)
+        self._pool, self._sample = order[: recipe.pool], cache(clips.sample)  # decoded once
         if config.vae.linear:
             start_from_components(networks.target_encoder, networks.decoder, self._some_frames(_STATISTICS_CLIPS))
         self._pair = precision.placed(Autoencoder(networks))
@@ -97,13 +99,14 @@ class VAETask:
         means: list[Tensor] = []
         counts: list[Tensor] = []
         for number in range(min(len(self._valid), _MEASURED_CLIPS)):
-            frames = to_network(self._valid.rgb(number)[1]).to(self._precision.device)
+            sample = self._valid.sample(number)
+            frames = to_network(sample.target).to(self._precision.device)
             latents = self._pair.target_encoder(frames).mean
             decoded = self._pair.decoder(latents, frames.shape[0]).clamp(-1, 1)
             scores.append(psnr((decoded + 1) / 2, (frames + 1) / 2).mean())
             means.append(latents)
             if self._painted:
-                truth = torch.from_numpy(self._valid.target_classes(number).copy())
+                truth = torch.from_numpy(np.array(sample.target_classes))
                 counts.append(named_confusion(self._classes(decoded), truth, [kind.name for kind in self._painted]))
             shown += [[decoded[0], decoded[-1]], [frames[0], frames[-1]]]
         write_sheet(picture, shown)
@@ -133,11 +136,11 @@ class VAETask:
 
     def _crops(self, draws: Draws, count: int, run: int) -> Tensor:
         """[count * run, 3, crop, crop] in [-1, 1]: runs of source or target frames, half of them mirrored."""
-        numbers = draws.below(len(self._clips), count).tolist()
+        numbers = draws.below(len(self._pool), count).tolist()
         sides, flips = draws.below(2, count).tolist(), draws.below(2, count).tolist()
         crops: list[Tensor] = []
         for number, side, flip in zip(numbers, sides, flips, strict=True):
-            crop = self._crop(self._clips.rgb(number)[side], draws, run)
+            crop = self._crop(self._sides(number)[side], draws, run)
             crops.append(to_network(crop[:, :, ::-1] if flip else crop))
         return self._precision.frames(torch.cat(crops))
 
@@ -150,8 +153,13 @@ class VAETask:
 
     def _some_frames(self, count: int) -> Tensor:
         """Every third frame of both sides of `count` clips, [N, 3, H, W] in [-1, 1]."""
-        numbers = Draws(self._seed, "vae-statistics", 0, torch.device("cpu")).below(len(self._clips), count)
-        return torch.cat([to_network(side[::3]) for number in numbers.tolist() for side in self._clips.rgb(number)])
+        numbers = Draws(self._seed, "vae-statistics", 0, torch.device("cpu")).below(len(self._pool), count)
+        return torch.cat([to_network(side[::3]) for number in numbers.tolist() for side in self._sides(number)])
+
+    def _sides(self, number: int) -> tuple[Bytes, Bytes]:
+        """Source and target of a clip of the pool."""
+        sample = self._sample(self._pool[number])
+        return sample.source, sample.target
 
     @torch.no_grad()
     def _statistics(self) -> tuple[Tensor, Tensor]:
