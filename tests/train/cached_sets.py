@@ -53,7 +53,6 @@ def tiny_identity(**changes: object) -> CacheIdentity:
         "plan": PLAN,
         "copies": 2,
         "augmentation": 0.02,
-        "moments": "both",
         "seed": 5,
         "height": HEIGHT,
         "width": WIDTH,

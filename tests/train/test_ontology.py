@@ -56,10 +56,6 @@ def test_unlisted_ids_are_black_and_without_a_place() -> None:
     assert [kind.name for kind in known.classes] == ["class 5", "class 9"]
 
 
-def test_unlisted_ids_share_the_place_of_void() -> None:
-    assert made({5: (10, 20, 30), VOID: (0, 0, 0)}).places[[5, VOID, 6]].tolist() == [0, 1, 1]
-
-
 @pytest.mark.parametrize(
     "items",
     [

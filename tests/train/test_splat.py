@@ -128,11 +128,6 @@ def test_nearer_points_win() -> None:
     np.testing.assert_allclose(made.depth.numpy(), 5.0)
 
 
-def test_points_at_one_depth_are_averaged() -> None:
-    made = splat([wall(5.0, 200), wall(5.0, 50)], HERE, SOURCE, options=SplatOptions(radius=0))
-    np.testing.assert_allclose(made.colour.numpy(), 125 / 255, atol=1e-5)
-
-
 @pytest.mark.parametrize(("radius", "reached"), [(0, 1), (1, 4), (2, 9), (3, 16)])
 def test_a_single_point_shows_in_as_many_pixels_as_its_radius_says(radius: int, reached: int) -> None:
     depth = np.zeros((SOURCE.height, SOURCE.width), np.float32)
@@ -192,16 +187,6 @@ def test_a_view_of_nothing_but_absurd_depth_is_no_view() -> None:
     assert bool(made.colour.isfinite().all())
 
 
-def test_several_values_are_drawn_as_if_one_by_one(room: list[SceneView]) -> None:
-    pose = rig_poses([(40.0, 20.0)])[0]
-    inverted = [255 - view.rgb for view in room]
-    both = splat(
-        room, pose, TARGET, values=[np.concatenate([v.rgb, i], -1) for v, i in zip(room, inverted, strict=True)]
-    )
-    assert torch.equal(both.colour[..., :3], splat(room, pose, TARGET).colour)
-    assert torch.equal(both.colour[..., 3:], splat(room, pose, TARGET, values=inverted).colour)
-
-
 def test_labels_are_those_of_the_heaviest_point_and_never_mixed(room: list[SceneView]) -> None:
     pose = rig_poses([(30.0, 20.0)])[0]
     labels = [np.where(view.classes == BALL, 60_000, 7).astype(np.uint16) for view in room if view.classes is not None]
@@ -242,12 +227,6 @@ def test_no_tile_that_contributes_is_passed_over(seed: int) -> None:
         assert (covered != (total > 0)).sum() <= 1  # a point on a pixel's border may fall either way
 
 
-def test_sizes_may_differ_from_view_to_view(room: list[SceneView]) -> None:
-    other = photograph(room[0].world_from_camera, Intrinsics.from_hfov(60.0, 45, 33))
-    made = splat([room[0], other], room[0].world_from_camera, TARGET)
-    assert bool(made.covered.any())
-
-
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
@@ -260,11 +239,6 @@ def test_sizes_may_differ_from_view_to_view(room: list[SceneView]) -> None:
 def test_parts_that_do_not_fit_are_named(fault: dict[str, Any], said: str) -> None:
     with pytest.raises(DataError, match=said):
         splat([wall(5.0, 1), replace(wall(5.0, 1), **fault)], HERE, TARGET)
-
-
-def test_values_for_other_views_are_refused() -> None:
-    with pytest.raises(DataError, match="1 views need"):
-        splat([wall(5.0, 1)], HERE, TARGET, values=[])
 
 
 @pytest.mark.gpu

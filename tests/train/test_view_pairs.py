@@ -157,16 +157,6 @@ def test_what_the_source_saw_is_all_at_first_and_less_later(kubric: Kubric4D, dr
     assert 0.3 < path[-1].mean() < 0.7
 
 
-def test_a_sample_is_the_same_in_any_order(kubric: Kubric4D) -> None:
-    first, second = (ViewPairs(kubric, ORBIT, 2, PictureOptions(size=SIZE)) for _ in range(2))
-    ahead = [first.sample(index) for index in (0, 1)]
-    back = [second.sample(index) for index in (1, 0)][::-1]
-    for one, other in zip(ahead, back, strict=True):
-        np.testing.assert_array_equal(one.target, other.target)
-        assert one.frame_numbers == other.frame_numbers
-    assert not np.array_equal(ahead[0].target, ahead[1].target)
-
-
 def test_workers_of_a_loader_give_what_one_process_gives(driving_root: Path) -> None:
     pairs = driving_pairs(driving_root, repeats=2)
     alone = [pairs.sample(index) for index in range(4)]
@@ -240,16 +230,6 @@ def test_what_is_wrong_with_the_machine_is_not_blamed_on_the_data(
     assert pairs.skips.total == 0
 
 
-def test_a_short_scene_is_left_out_by_name(two_scenes: Path) -> None:
-    for path in (two_scenes / "scene_000004" / "rgb" / "yaw-0").iterdir():
-        if int(path.stem) > 30:
-            path.unlink()
-    sample = driving_pairs(two_scenes).sample(0)
-    assert sample.scene == "scene_000009"
-    assert "is too short" in sample.skipped[0].reason
-    assert sample.skipped[0].file == str(two_scenes / "scene_000004")
-
-
 def test_a_control_is_followed_and_not_replaced(two_scenes: Path) -> None:
     pairs = driving_pairs(two_scenes)
     control = Control(name="sample_00", frame_start=1, frame_skip=1)
@@ -269,11 +249,3 @@ def test_a_scene_without_its_class_layer_is_left_out(two_scenes: Path) -> None:
     sample = driving_pairs(two_scenes, modality="classes").sample(0)
     assert sample.scene == "scene_000009"
     assert "lacks its layer semantic_segmentation_2d" in sample.skipped[0].reason
-
-
-def test_a_set_reduced_to_a_list_keeps_its_options(driving_root: Path) -> None:
-    dataset = ParallelDomain4D.open(driving_root, cameras=CAMERAS, instances=True).only(["scene_000009"])
-    assert dataset.scenes == ("scene_000009",)
-    assert dataset.views("scene_000009", 0)[0].instances is not None
-    with pytest.raises(DataError, match="no scene of the list or split"):
-        dataset.only([])

@@ -1,6 +1,5 @@
 """`gcd-train cache`: the frozen encoders run once over the driving set."""
 
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -37,9 +36,6 @@ PathChoice: TypeAlias = Annotated[
     Literal["gradual", "direct", "both"],
     Option(help="Clips to encode for: the camera moves (gradual), or is there at once (direct)."),
 ]
-Kept: TypeAlias = Annotated[
-    Literal["both", "mean"], Option(help="What to keep of the targets' latents: mean and variance, or the mean.")
-]
 Semantic: TypeAlias = Annotated[bool, Option("--semantic", help="Targets show the classes instead of colour.")]
 Exact: TypeAlias = Annotated[
     bool, Option("--exact", help="Draw targets from geometry.npz, which generated scenes have, not from points.")
@@ -69,7 +65,6 @@ def cache(
     split_file: SplitFile = None,
     copies: Copies = 4,
     path: PathChoice = "both",
-    moments: Kept = "both",
     semantic: Semantic = False,
     exact: Exact = False,
     limit: Limit = None,
@@ -87,14 +82,14 @@ def cache(
     with errors_shown():
         choice = EncoderChoice(weights=weights, family=family, device=device, dtype=dtype, batch=batch)
         encoders = load_encoders(choice)
-        config = encoders.config
+        config = encoders.networks.config
         plan = ClipPlan(clip_frames=config.frames, paths=("gradual", "direct") if path == "both" else (path,))
         scenes = _dataset(data, split, split_file, limit, semantic)
         drawn = PictureOptions(
             size=(config.width, config.height), modality="classes" if semantic else "rgb", exact=exact
         )
         pictures = DrivingPictures(scenes, config.frames, drawn)
-        identity = identity_of(encoders, pictures, plan, copies=copies, moments=moments, seed=seed)
+        identity = identity_of(encoders, pictures, plan, copies=copies, seed=seed)
         _run(CacheJob(folder=out, pictures=pictures, choice=choice, identity=identity), workers, ray)
 
 
@@ -124,10 +119,7 @@ def _run(job: "CacheJob", workers: int, ray: str | None) -> None:
     folder, scenes = job.folder, job.pictures.scenes
     with only_writer(folder):
         account = _Account(total=len(scenes))
-        steps = cache_scenes(
-            job, scenes, workers=workers, ray_address=ray, free_bytes=lambda: shutil.disk_usage(folder).free
-        )
-        for step in steps:
+        for step in cache_scenes(job, scenes, workers=workers, ray_address=ray):
             account = account.after(step)
             _OUT.print(account.line(step), markup=False)
     _close(folder, scenes, account)

@@ -5,7 +5,7 @@ pairs                 int16  [R, 2]               time and path position of ever
 source                f16    [N, K, C, h, w]      condition latents of the noised source, K draws of the noise
 tokens                f16    [N, D]               image tokens of the clean source; only with an image tower
 target_mean           f16    [R, C, h, w]         posterior of the target latents, not scaled
-target_log_variance   u8     [R, C, h, w]         of it, -30..20 in 255 steps: the deviation to 5 %; only with moments
+target_log_variance   u8     [R, C, h, w]         of it, -30..20 in 255 steps: the deviation to 5 %
 emphasis              f16    [R, 1, h, w]         class emphasis of semantic targets; only for semantic targets
 
 The source picture of a frame depends on its time t alone. With the fixed path of ParallelDomain-4D the target picture
@@ -31,12 +31,11 @@ from torch import Tensor, nn
 from gcd_model.networks import Networks, weights_digest
 from gcd_model.vae import Posterior
 from gcd_train.data.files import Recent
-from gcd_train.data.latents import Index, Shard, read_index, read_shard
+from gcd_train.data.latents import Index, Shard, open_shard, read_index
 from gcd_train.errors import DataError
 from gcd_train.training.draws import Draws
 
 PathKind = Literal["gradual", "direct"]
-Moments = Literal["both", "mean"]
 _LOWEST, _SPAN, _CODES = -30.0, 50.0, 255
 
 
@@ -94,7 +93,7 @@ class CacheIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     encoders: digest of the frozen weights. dtype: they computed in. pictures: the set and its rendering. fps: of the
     scenes, before any stride.
     copies: differently noised source latents a frame. augmentation: strength of that noise, on pixels in [-1, 1].
-    moments: "both" keeps the posterior's mean and variance, "mean" the mean alone. height, width: pixels.
+    height, width: pixels.
     scale: of target latents, applied when read. emphasis: whether class emphasis maps are kept (semantic targets).
     """
 
@@ -105,7 +104,6 @@ class CacheIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     plan: ClipPlan
     copies: int
     augmentation: float
-    moments: Moments
     seed: int
     height: int
     width: int
@@ -192,7 +190,7 @@ class CachedLatents:
     def clip(self, scene: str, place: ClipPlace, path: PathKind, draws: Draws | None = None) -> CachedClip:
         """The tensors of a clip.
 
-        draws: chooses each frame's noise copy, and a sample of the target's posterior where both moments were kept;
+        draws: chooses each frame's noise copy, and a sample of the target's posterior;
         None: the first copy and the mean. Raises: DataError for a clip that is not there or a damaged shard.
         """
         identity = self.index.identity
@@ -215,11 +213,11 @@ class CachedLatents:
         )
 
     def _read(self, scene: str) -> dict[str, Tensor]:
-        return read_shard(self.folder, self.index.scenes[scene])
+        return open_shard(self.folder, self.index.scenes[scene], "run the same `gcd-train cache` again")
 
     def _target(self, tensors: dict[str, Tensor], rows: Tensor, draws: Draws | None) -> Tensor:
         mean = tensors["target_mean"][rows].float()
-        if draws is not None and "target_log_variance" in tensors:
+        if draws is not None:
             posterior = Posterior(mean, log_variance_of(tensors["target_log_variance"][rows]))
             mean = posterior.sample(draws.normal(*mean.shape))
         return mean * self.index.identity.scale

@@ -9,7 +9,7 @@ The released trainer spends 16 TFLOP on them in every sample: its 13 000 updates
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,19 +18,18 @@ import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model import ModelConfig
 from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
-from gcd_model.image_encoder import ImageEncoder, clip_pixels
+from gcd_model.image_encoder import clip_pixels
 from gcd_model.loading import random_weights, weights_path
-from gcd_model.vae import Encoder, Posterior
+from gcd_model.networks import Networks
+from gcd_model.vae import Posterior
 from gcd_model.weights.card import precision
 from gcd_model.weights.load import load_weights
 from gcd_train.data.cache import (
     CacheIdentity,
     CacheIndex,
     ClipPlan,
-    Moments,
     SceneShard,
     encoder_parts,
     encoders_digest,
@@ -47,7 +46,6 @@ from gcd_train.training.draws import Draws
 from gcd_train.training.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
 
 _log = logging.getLogger(__name__)
-_MARGIN_BYTES = 64 * 2**20
 
 
 class EncoderChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -65,29 +63,26 @@ class EncoderChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 @dataclass(frozen=True, slots=True)
 class Encoders:
-    """Encoders on their device. digest: names their weights, whatever checkpoint they came in."""
+    """Frozen encoders on their device. digest: names their weights, whatever checkpoint they came in."""
 
-    config: ModelConfig
-    target: Encoder
-    condition: Encoder
-    image: ImageEncoder | None
+    networks: Networks
     digest: str
     choice: EncoderChoice
     device: torch.device
 
     def posterior(self, frames: Tensor) -> Posterior:
         """Target latents of frames [N, 3, H, W] in [-1, 1], not scaled: float32 moments on the CPU."""
-        parts = [self.target(rows) for rows in self._batches(frames)]
+        parts = [self.networks.target_encoder(rows) for rows in self._batches(frames)]
         mean, log_variance = (torch.cat([getattr(p, name) for p in parts]) for name in ("mean", "log_variance"))
         return Posterior(mean.float().cpu(), log_variance.float().cpu())
 
     def condition_mean(self, frames: Tensor) -> Tensor:
         """Condition latents [N, C, h, w] of frames with their noise, not scaled; float32 on the CPU."""
-        return torch.cat([self.condition(rows).mean for rows in self._batches(frames)]).float().cpu()
+        return torch.cat([self.networks.condition_encoder(rows).mean for rows in self._batches(frames)]).float().cpu()
 
     def tokens(self, frames: Tensor) -> Tensor | None:
         """Image tokens [N, D] of clean frames; None for a model without an image tower."""
-        tower = self.image
+        tower = self.networks.image_encoder
         if tower is None:
             return None
         size = tower.config.image_size
@@ -117,15 +112,7 @@ def load_encoders(choice: EncoderChoice) -> Encoders:
         module.to(device, precision(choice.dtype)).requires_grad_(False).eval()
         if device.type == "cpu":
             arrange(module)
-    return Encoders(
-        config=networks.config,
-        target=networks.target_encoder,
-        condition=networks.condition_encoder,
-        image=networks.image_encoder,
-        digest=digest,
-        choice=choice,
-        device=device,
-    )
+    return Encoders(networks, digest, choice, device)
 
 
 class DrivingPictures:
@@ -155,7 +142,6 @@ class DrivingPictures:
         draw = Draw(
             frame_numbers=(time,) * len(positions),
             fps=self.data.fps,
-            reversed=False,
             world_from_source=world_from_source,
             world_from_target=world_from_source @ self._source_from_target[list(positions)],
             start=None,
@@ -219,9 +205,8 @@ def encode_moment(
     rows = {
         "source": encoders.condition_mean(source + identity.augmentation * noise)[None].half(),
         "target_mean": posterior.mean.half(),
+        "target_log_variance": log_variance_codes(posterior.log_variance),
     }
-    if identity.moments == "both":
-        rows["target_log_variance"] = log_variance_codes(posterior.log_variance)
     tokens = encoders.tokens(source)
     if tokens is not None:
         rows["tokens"] = tokens.half()
@@ -250,8 +235,11 @@ class CacheJob:
             )
         started = time.perf_counter()
         tensors, missing = encode_scene(encoders, self.pictures, self.identity, scene)
-        return SceneShard(
-            **write_shard(self.folder, scene, tensors),
+        return write_shard(
+            self.folder,
+            scene,
+            tensors,
+            SceneShard,
             frames=self.pictures.frames(scene),
             times=tuple(tensors["times"].tolist()),
             missing={str(moment): reason for moment, reason in missing.items()},
@@ -277,11 +265,10 @@ def identity_of(
     plan: ClipPlan,
     *,
     copies: int = 4,
-    moments: Moments = "both",
     seed: int = 0,
 ) -> CacheIdentity:
     """What a cache made now would say of itself; its pixel noise is as strong as the checkpoint is sampled with."""
-    config = encoders.config
+    config = encoders.networks.config
     return CacheIdentity(
         encoders=encoders.digest,
         dtype=encoders.choice.dtype,
@@ -290,7 +277,6 @@ def identity_of(
         plan=plan,
         copies=copies,
         augmentation=config.sampling.augmentation,
-        moments=moments,
         seed=seed,
         height=config.height,
         width=config.width,
@@ -305,12 +291,10 @@ def cache_scenes(
     *,
     workers: int = 1,
     ray_address: str | None = None,
-    free_bytes: Callable[[], int] | None = None,
 ) -> Iterator[CacheProgress]:
     """Make the shards that are missing or damaged; each scene ends in the index or is reported with its error.
 
-    The caller holds `only_writer`. free_bytes: room on the disk, asked after each scene.
-    Raises: RunError if the folder holds another cache, cannot be written, or is too small for what is to come.
+    The caller holds `only_writer`. Raises: RunError if the folder holds another cache or cannot be written.
     """
     index = _begun(job)
     todo = [scene for scene in scenes if scene not in index.scenes]
@@ -324,15 +308,6 @@ def cache_scenes(
             index = msgspec.structs.replace(index, scenes=dict(sorted({**index.scenes, scene: entry}.items())))
             write_index(job.folder, index)
         yield CacheProgress(scene=scene, entry=entry, error=why, done=done, failed=failed, total=len(scenes))
-        left = len(scenes) - done - failed
-        if free_bytes is None or not index.scenes or not left:
-            continue
-        needed, free = left * max(each.bytes for each in index.scenes.values()) + _MARGIN_BYTES, free_bytes()
-        if free < needed:
-            raise RunError(
-                f"{job.folder}: {left} more scenes need up to {needed / 1e9:.2f} GB, the disk has {free / 1e9:.2f} GB; "
-                "make room or take fewer --copies, then run the same line again"
-            )
 
 
 def _begun(job: CacheJob) -> CacheIndex:

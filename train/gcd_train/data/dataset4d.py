@@ -205,11 +205,6 @@ class Dataset4D(ABC):
         fewer.scenes = tuple(scenes)
         return fewer
 
-    @property
-    def palette(self) -> Bytes | None:
-        """u8 [256, 3], RGB colour by class id; None without classes."""
-        return None if self.ontology is None else self.ontology.palette
-
     def folder(self, scene: str) -> Path:
         """Where the scene lies."""
         return self.root / scene

@@ -22,8 +22,7 @@ from typing import Any, Self, TypeAlias, TypeVar
 
 import msgspec
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, load_file, save
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from gcd_model.errors import FileError
@@ -51,6 +50,8 @@ class Index(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 Kind = TypeVar("Kind", bound=Index)
+AnyShard = TypeVar("AnyShard", bound=Shard)
+_ANEW = "delete its folder and run `gcd-train train ... --stage latents`"
 
 
 def read_index(folder: Path, kind: type[Kind]) -> Kind | None:
@@ -72,12 +73,13 @@ def write_index(folder: Path, index: Index) -> None:
     write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)), lasting=True)
 
 
-def write_shard(folder: Path, name: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """Write a shard; returns the fields of its `Shard`. Raises RunError if it cannot be written."""
+def write_shard(folder: Path, name: str, tensors: dict[str, Tensor], kind: type[AnyShard], **facts: Any) -> AnyShard:
+    """Write a shard and say what it is, with some more facts. Raises RunError if it cannot be written."""
     content, file = save(tensors), f"{name}.safetensors"
     write_whole(folder / file, content, lasting=True)
     arrays = {name: tuple(values.shape) for name, values in sorted(tensors.items())}
-    return {"file": file, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content), "arrays": arrays}
+    digest = hashlib.sha256(content).hexdigest()
+    return kind(file=file, sha256=digest, bytes=len(content), arrays=arrays, **facts)
 
 
 def fault(folder: Path, shard: Shard) -> str | None:
@@ -93,26 +95,15 @@ def fault(folder: Path, shard: Shard) -> str | None:
     return None if same else f"{path} is damaged: its SHA-256 is not the one it was written with"
 
 
-def read_shard(folder: Path, shard: Shard) -> dict[str, Tensor]:
-    """The arrays of a shard, in memory. Raises DataError if it is missing or not as it was written."""
+def open_shard(folder: Path, shard: Shard, redo: str) -> dict[str, Tensor]:
+    """The arrays of a shard, mapped: read where they are used.
+
+    Raises DataError, with how to make it again, if it is missing or not as it was written.
+    """
     wrong = fault(folder, shard)
-    try:
-        if wrong is None:
-            return load((folder / shard.file).read_bytes())
-    except (OSError, SafetensorError) as error:
-        wrong = f"{folder / shard.file} cannot be read ({error})"
-    raise DataError(f"{wrong}; run the same `gcd-train cache` again, it makes this scene anew")
-
-
-def map_shard(folder: Path, shard: Shard) -> dict[str, Tensor]:
-    """The arrays of a shard, mapped: read where they are used. Raises RunError if it is missing or cut."""
-    path = folder / shard.file
-    try:
-        if not path.is_file() or path.stat().st_size != shard.bytes:
-            raise RunError(f"{path} is missing or not of the {shard.bytes} bytes that were written; delete {folder}")
-        return load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise RunError(f"{path} cannot be read ({error}); delete {folder} and encode the clips again") from error
+    if wrong is not None:
+        raise DataError(f"{wrong}; {redo}")
+    return load_file(folder / shard.file)
 
 
 @contextmanager
@@ -179,11 +170,11 @@ class LatentClips:
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Map the arrays. Raises RunError if the folder is unfinished or damaged."""
+        """Map the arrays. Raises RunError if the folder is unfinished, DataError for a damaged shard."""
         meta = read_index(folder, LatentsMeta)
         if meta is None or not meta.sensitivity:
             raise RunError(f"{folder} holds no finished latents; run `gcd-train train ... --stage latents`")
-        return cls(meta, [map_shard(folder, shard) for shard in meta.shards])
+        return cls(meta, [open_shard(folder, shard, _ANEW) for shard in meta.shards])
 
     def resident(self, device: torch.device) -> Self:
         """The same, held in the device's memory."""

@@ -18,7 +18,7 @@ from gcd_train.data.latents import (
     LatentsMeta,
     LatentVideos,
     Shard,
-    map_shard,
+    open_shard,
     read_index,
     write_index,
     write_shard,
@@ -85,14 +85,14 @@ def encode_clips(job: LatentsJob) -> None:
             _log.info("latents  clip %d of %d  %.2f clips/s  %.0f s left", number + 1, meta.clips, rate, left_s)
         if stopped or len(rows) == _SHARD or number + 1 == meta.clips:
             tensors = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
-            shard = Shard(**write_shard(job.folder, f"clips-{meta.done:06d}", tensors))
+            shard = write_shard(job.folder, f"clips-{meta.done:06d}", tensors, Shard)
             meta = msgspec.structs.replace(meta, shards=(*meta.shards, shard))
             write_index(job.folder, meta)
             rows.clear()
         if stopped:
             raise Interrupted(f"stopped after clip {number + 1} of {meta.clips} of latents; run again to go on")
-    parts = [map_shard(job.folder, shard)["target"] for shard in meta.shards[:_SENSITIVITY_CLIPS]]
-    target = torch.cat(parts)[:_SENSITIVITY_CLIPS, 0].float()
+    first = [open_shard(job.folder, shard, f"delete {job.folder}") for shard in meta.shards[:_SENSITIVITY_CLIPS]]
+    target = torch.cat([shard["target"] for shard in first])[:_SENSITIVITY_CLIPS, 0].float()
     write_index(job.folder, msgspec.structs.replace(meta, sensitivity=tuple(_sensitivity(job, target).tolist())))
 
 

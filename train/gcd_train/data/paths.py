@@ -59,8 +59,8 @@ class FrameSampling:
         last = frames - ((self.clip - 1) * stride + 1) - (0 if self.reach_last else 1)
         return last if self.latest_start is None else min(last, self.latest_start)
 
-    def draw(self, rng: np.random.Generator, frames: int) -> tuple[tuple[int, ...], int, bool]:
-        """Frame numbers, stride, and whether they run backwards. Raises DataError if no clip fits."""
+    def draw(self, rng: np.random.Generator, frames: int) -> tuple[tuple[int, ...], int]:
+        """Frame numbers, falling where they run backwards, and stride. Raises DataError if no clip fits."""
         fitting = [stride for stride in self.strides if self.last_start(frames, stride) >= 0]
         if not fitting:
             wanted = frames - self.last_start(frames, min(self.strides))
@@ -72,9 +72,7 @@ class FrameSampling:
         stride = int(rng.choice(fitting))
         start = int(rng.integers(self.last_start(frames, stride) + 1))
         numbers = tuple(range(start, start + self.clip * stride, stride))
-        if rng.random() < self.reverse:
-            return numbers[::-1], stride, True
-        return numbers, stride, False
+        return (numbers[::-1] if rng.random() < self.reverse else numbers), stride
 
     def controlled(self, control: Control, frames: int) -> tuple[int, ...]:
         """Frame numbers a control asks for. Raises DataError if the scene does not have them."""
@@ -94,7 +92,7 @@ DRIVING_FRAMES = FrameSampling(strides=(1, 2))
 class Draw:
     """One sample of a scene.
 
-    frame_numbers: T numbers of the scene's frames, falling where the clip is `reversed`. fps: of the clip.
+    frame_numbers: T numbers of the scene's frames, falling where the clip runs backwards. fps: of the clip.
     world_from_source: f64 [4, 4], it stands still. world_from_target: f64 [T, 4, 4]. The world is the scene's, or the
     vehicle in driving. start: the source on the sphere, deltas: f64 [T, 3] target minus source in azimuth and elevation
     in degrees and radius in metres; None in driving.
@@ -102,7 +100,6 @@ class Draw:
 
     frame_numbers: tuple[int, ...]
     fps: float
-    reversed: bool
     world_from_source: NDArray[np.float64]
     world_from_target: NDArray[np.float64]
     start: Spherical | None
@@ -121,8 +118,7 @@ class OrbitSampling:
     azimuth_deg, elevation_deg, radius_m: where the source may stand and the goal too (its azimuth may be any). The
     source's elevation is uniform in its sine, so that directions are; the goal's is uniform in degrees.
     max_azimuth_deg, max_elevation_deg, max_radius_m: largest change to the goal.
-    gradual: the camera moves all the way through the clip; otherwise it is at the goal from the first frame on.
-    move_time: the frame in which a gradual move is done, the last by default.
+    move_time: the frame in which the camera is at the goal: the last by default (gradual), or 0 (direct).
     Source: Van Hoorick et al. 2024 (GCD), section 4; bounds of elevation as released (the paper prints 0..90 for
     max180: `elevation_deg=(0, 90)`).
     """
@@ -133,7 +129,6 @@ class OrbitSampling:
     azimuth_deg: Range = (0.0, 360.0)
     elevation_deg: Range = (0.0, 50.0)
     radius_m: Range = (12.0, 18.0)
-    gradual: bool = True
     move_time: int | None = None
     frames: FrameSampling = KUBRIC_FRAMES
 
@@ -154,16 +149,16 @@ class OrbitSampling:
 
     def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
         """A sample. Raises DataError if the scene is too short."""
-        numbers, stride, backwards = self.frames.draw(rng, frames)
+        numbers, stride = self.frames.draw(rng, frames)
         start = self.source(rng)
-        return self._draw(numbers, fps / stride, backwards, start, self.change(rng, start))
+        return self._draw(numbers, fps / stride, start, self.change(rng, start))
 
     def controlled(self, control: Control, frames: int, fps: float) -> Draw:
         """The sample of a control. Raises DataError if the scene is too short or the control has no cameras."""
         numbers = self.frames.controlled(control, frames)
         if control.start is None or control.goal is None:
             raise DataError(f"control {control.name} has no cameras: it is a driving control, give Kubric-4D's")
-        return self._draw(numbers, control.fps(fps), False, control.start, control.goal - control.start)
+        return self._draw(numbers, control.fps(fps), control.start, control.goal - control.start)
 
     def source(self, rng: np.random.Generator) -> Spherical:
         """Where a source camera stands, uniform over the bounds' part of the sphere and in the radius."""
@@ -182,11 +177,9 @@ class OrbitSampling:
             radius_m=_step(rng, start.radius_m, self.max_radius_m, self.radius_m),
         )
 
-    def _draw(
-        self, numbers: tuple[int, ...], fps: float, backwards: bool, start: Spherical, change: SphericalDelta
-    ) -> Draw:
+    def _draw(self, numbers: tuple[int, ...], fps: float, start: Spherical, change: SphericalDelta) -> Draw:
         last = len(numbers) - 1
-        move_time = (last if self.move_time is None else self.move_time) if self.gradual else 0
+        move_time = last if self.move_time is None else self.move_time
         try:
             path = spherical_trajectory(start, change, frames=len(numbers), move_time=move_time)
         except ModelError as error:
@@ -196,7 +189,6 @@ class OrbitSampling:
         return Draw(
             frame_numbers=numbers,
             fps=fps,
-            reversed=backwards,
             world_from_source=world_from_source,
             world_from_target=world_from_source @ path.source_from_target.numpy(),
             start=start,
@@ -214,31 +206,29 @@ MAX180 = OrbitSampling(max_azimuth_deg=180.0, max_elevation_deg=60.0)
 class DrivingSampling:
     """ParallelDomain-4D's one path, from the forward camera up and back, at a sine pace; only the frames are drawn.
 
-    gradual, move_time: as in OrbitSampling.
+    move_time: as in OrbitSampling.
     """
 
-    gradual: bool = True
     move_time: int | None = None
     frames: FrameSampling = DRIVING_FRAMES
 
     def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
         """A sample. Raises DataError if the scene is too short."""
-        numbers, stride, backwards = self.frames.draw(rng, frames)
-        return self._draw(numbers, fps / stride, backwards)
+        numbers, stride = self.frames.draw(rng, frames)
+        return self._draw(numbers, fps / stride)
 
     def controlled(self, control: Control, frames: int, fps: float) -> Draw:
         """The sample of a control. Raises DataError if the scene is too short for it."""
-        return self._draw(self.frames.controlled(control, frames), control.fps(fps), False)
+        return self._draw(self.frames.controlled(control, frames), control.fps(fps))
 
-    def _draw(self, numbers: tuple[int, ...], fps: float, backwards: bool) -> Draw:
+    def _draw(self, numbers: tuple[int, ...], fps: float) -> Draw:
         last = len(numbers) - 1
-        move_time = (last if self.move_time is None else self.move_time) if self.gradual else 0
+        move_time = last if self.move_time is None else self.move_time
         path = driving_trajectory(frames=len(numbers), move_time=move_time)
         vehicle_from_source = _vehicle_from_source()
         return Draw(
             frame_numbers=numbers,
             fps=fps,
-            reversed=backwards,
             world_from_source=vehicle_from_source,
             world_from_target=vehicle_from_source @ path.source_from_target.numpy(),
             start=None,

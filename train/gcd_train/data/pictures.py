@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from gcd_model.geometry import Intrinsics, center_crop_box
+from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose
 from gcd_train.data.dataset4d import VOID, Dataset4D, Ontology
 from gcd_train.data.files import FileFault, Recent
 from gcd_train.data.paths import Draw
-from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.sample import Bytes, Sample, SceneView
 from gcd_train.errors import DataError, RenderError
 from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility
@@ -36,17 +37,6 @@ Modality = Literal["rgb", "classes"]
 SAME_POSE = 5e-3
 """Largest difference between the entries of two poses at which a dataset's own camera stands for a drawn one."""
 _SOURCE, _TARGET = "source", "target"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DrawnPictures:
-    """A sample's pictures, as in `Sample`. world_from_source: f64 [4, 4], where the source camera really stood."""
-
-    source: Bytes
-    target: Bytes
-    target_classes: Bytes | None
-    visible: NDArray[np.bool_] | None
-    world_from_source: Doubles
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -76,8 +66,8 @@ class SplatPictures:
         self._dataset, self._options, (self._width, self._height) = dataset, options, options.size
         self._points = SplatOptions(published=options.published)
 
-    def make(self, scene: str, draw: Draw) -> DrawnPictures:
-        """The pictures. Raises DataError, FileFault: a file is missing, damaged or does not fit."""
+    def make(self, scene: str, draw: Draw) -> Sample:
+        """The sample. Raises DataError, FileFault: a file is missing, damaged or does not fit."""
         lens, read = self._dataset.lens(scene), Recent(partial(self._dataset.views, scene), 1)
         place = list(self._dataset.cameras).index(self._dataset.source_camera)
         world_from_source, frames = draw.world_from_source, list[tuple[Bytes, ...]]()
@@ -104,12 +94,14 @@ class SplatPictures:
                 masks.append(
                     visibility(seen, world_from_target, lens, width=across, height=along, options=self._points)
                 )
-        return DrawnPictures(
+        return _sample(
+            scene,
+            draw,
+            world_from_source,
             source=np.stack([source for source, _ in frames]),
             target=np.stack([target for _, target in frames]),
-            target_classes=np.stack(classes) if classes else None,
+            classes=np.stack(classes) if classes else None,
             visible=np.stack(masks) if masks else None,
-            world_from_source=world_from_source,
         )
 
     def _target_ids(self, views: Sequence[SceneView], world_from_target: Doubles, lens: Intrinsics) -> Bytes:
@@ -170,7 +162,7 @@ class ExactPictures:
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_renderer": None}  # an OpenGL context cannot go to another process
 
-    def make(self, scene: str, draw: Draw) -> DrawnPictures:
+    def make(self, scene: str, draw: Draw) -> Sample:
         """See SplatPictures. Raises RenderError without a headless OpenGL."""
         from gcd_train.scenes.driving.classes import class_ids as published_ids
 
@@ -189,12 +181,14 @@ class ExactPictures:
         if self._ontology is not None:
             ids = self._ontology.merge(np.stack([published_ids(each.classes) for each in drawn[_TARGET]]))
             target = self._ontology.encode(ids) if self._options.modality == "classes" else target
-        return DrawnPictures(
+        return _sample(
+            scene,
+            draw,
+            draw.world_from_source,
             source=np.stack([each.rgb for each in drawn[_SOURCE]]),
             target=target,
-            target_classes=ids if self._options.class_ids else None,
+            classes=ids if self._options.class_ids else None,
             visible=_visibility(drawn, cameras, lens) if self._options.visible else None,
-            world_from_source=draw.world_from_source,
         )
 
     def _own_renderer(self) -> "Renderer":
@@ -207,6 +201,32 @@ class ExactPictures:
 def pictures_of(dataset: Dataset4D, options: PictureOptions) -> SplatPictures | ExactPictures:
     """What makes a set's pictures. Raises DataError where classes are asked of a set without."""
     return (ExactPictures if options.exact else SplatPictures)(dataset, options)
+
+
+def _sample(
+    scene: str,
+    draw: Draw,
+    world_from_source: Doubles,
+    *,
+    source: Bytes,
+    target: Bytes,
+    classes: Bytes | None,
+    visible: NDArray[np.bool_] | None,
+) -> Sample:
+    """world_from_source: f64 [4, 4], where the source camera really stood."""
+    poses = map(torch.from_numpy, (world_from_source, draw.world_from_target))
+    return Sample(
+        source=source,
+        target=target,
+        target_classes=classes,
+        source_from_target=relative_pose(*poses).numpy(),
+        start=draw.start,
+        deltas=draw.deltas,
+        fps=draw.fps,
+        scene=scene,
+        frame_numbers=draw.frame_numbers,
+        visible=visible,
+    )
 
 
 def trained_picture(rgb: Bytes, width: int, height: int) -> Bytes:

@@ -5,10 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from gcd_model.errors import ModelError
-from gcd_model.geometry import relative_pose
 from gcd_train.data.dataset4d import Dataset4D
 from gcd_train.data.files import FileFault, Skipped, Skips
 from gcd_train.data.paths import Draw, Sampling, generator
@@ -106,20 +104,7 @@ class ViewPairs(DrawnSamples):
 
     def pair(self, scene: str, draw: Draw) -> Sample:
         """A sample drawn elsewhere. Raises DataError, FileFault: it cannot be read."""
-        made = self._pictures.make(scene, draw)
-        world_from_source, world_from_target = map(torch.from_numpy, (made.world_from_source, draw.world_from_target))
-        return Sample(
-            source=made.source,
-            target=made.target,
-            target_classes=made.target_classes,
-            source_from_target=relative_pose(world_from_source, world_from_target).numpy(),
-            start=draw.start,
-            deltas=draw.deltas,
-            fps=draw.fps,
-            scene=scene,
-            frame_numbers=draw.frame_numbers,
-            visible=made.visible,
-        )
+        return self._pictures.make(scene, draw)
 
     def _made(self, number: int, random: np.random.Generator) -> Sample:
         scene, _ = self._place(number)

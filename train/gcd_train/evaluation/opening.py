@@ -315,11 +315,15 @@ def _sampling(cuts: SceneCuts, *, orbits: bool) -> OrbitSampling | DrivingSampli
     """How goals, first frames and strides are drawn."""
     usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
     frames = FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
+    move_time = None if cuts.gradual else 0
     if not orbits:
-        return DrivingSampling(gradual=cuts.gradual, frames=frames)
+        return DrivingSampling(move_time=move_time, frames=frames)
     azimuth_deg, elevation_deg = (180.0, 60.0) if cuts.far else (90.0, 30.0)
     return OrbitSampling(
-        max_azimuth_deg=azimuth_deg, max_elevation_deg=elevation_deg, gradual=cuts.gradual, frames=frames
+        max_azimuth_deg=azimuth_deg,
+        max_elevation_deg=elevation_deg,
+        move_time=None if cuts.gradual else 0,
+        frames=frames,
     )
 
 

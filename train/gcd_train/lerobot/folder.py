@@ -85,21 +85,10 @@ class CameraFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     cameras: dict[str, CameraCalibration]
 
 
-_EXAMPLE = msgspec.json.encode(
-    CameraFile(
-        cameras={
-            "observation.images.front": CameraCalibration(
-                width=640,
-                height=480,
-                fx=600.0,
-                fy=600.0,
-                cx=320.0,
-                cy=240.0,
-                base_from_camera=((1, 0, 0, 0.4), (0, -1, 0, 0), (0, 0, -1, 1.2), (0, 0, 0, 1)),
-            )
-        }
-    )
-).decode()
+_EXAMPLE = (
+    '{"cameras": {"observation.images.front": {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 320.0, '
+    '"cy": 240.0, "base_from_camera": [[1, 0, 0, 0.4], [0, -1, 0, 0], [0, 0, -1, 1.2], [0, 0, 0, 1]]}}}'
+)
 
 
 def read_cameras(folder: Path, calibration: Path | None = None) -> dict[str, CameraCalibration]:

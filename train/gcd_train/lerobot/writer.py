@@ -6,7 +6,7 @@ where each begins. The calibration is ours, see `folder`.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -17,43 +17,6 @@ from numpy.typing import NDArray
 
 from gcd_train.errors import DataError
 from gcd_train.lerobot.folder import CameraCalibration, load_arrow, load_av, write_cameras
-
-
-@dataclass(slots=True)
-class Spread:
-    """Least, greatest, mean and deviation of what has passed."""
-
-    count: int = 0
-    low: Any = None
-    high: Any = None
-    total: Any = 0.0
-    squares: Any = 0.0
-
-    def add(self, rows: NDArray[Any]) -> None:
-        """Count rows [T, N]."""
-        values = rows.astype(np.float64)
-        low, high = values.min(0), values.max(0)
-        self.low = low if self.low is None else np.minimum(self.low, low)
-        self.high = high if self.high is None else np.maximum(self.high, high)
-        self.count += len(values)
-        self.total = self.total + values.sum(0)
-        self.squares = self.squares + (values**2).sum(0)
-
-    def join(self, other: "Spread") -> None:
-        """Count what another has counted."""
-        self.low = other.low if self.low is None else np.minimum(self.low, other.low)
-        self.high = other.high if self.high is None else np.maximum(self.high, other.high)
-        self.count += other.count
-        self.total, self.squares = self.total + other.total, self.squares + other.squares
-
-    def told(self, *, picture: bool) -> dict[str, list[Any]]:
-        """As LeRobot writes it: a number each, or [3, 1, 1] for the channels of pictures."""
-        mean = self.total / self.count
-        deviation = np.sqrt(np.maximum(self.squares / self.count - mean**2, 0.0))
-        rows = {"min": self.low, "max": self.high, "mean": mean, "std": deviation}
-        shaped = {name: (row.reshape(3, 1, 1) if picture else row).tolist() for name, row in rows.items()}
-        return {**shaped, "count": [self.count]}
-
 
 Bytes = NDArray[np.uint8]
 _SAMPLED = 8
@@ -89,6 +52,31 @@ class ExportOptions:
     episodes_a_file: int = 100
 
 
+Statistics = dict[str, NDArray[np.float64]]
+"""min, max, mean and std of each number, and the count of rows, [1]."""
+
+
+def _statistics(rows: NDArray[Any]) -> Statistics:
+    """Of rows [T, N]."""
+    values = rows.astype(np.float64)
+    spread = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    return {**spread, "count": np.array([len(values)])}
+
+
+def _together(parts: Sequence[Statistics]) -> Statistics:
+    """Of all rows that some statistics are of."""
+    count = np.stack([part["count"] for part in parts])
+    mean = sum(part["mean"] * part["count"] for part in parts) / count.sum()
+    square = sum((part["std"] ** 2 + part["mean"] ** 2) * part["count"] for part in parts) / count.sum()
+    return {
+        "min": np.min([part["min"] for part in parts], 0),
+        "max": np.max([part["max"] for part in parts], 0),
+        "mean": mean,
+        "std": np.sqrt(np.maximum(square - mean**2, 0.0)),
+        "count": count.sum(0),
+    }
+
+
 @dataclass(slots=True)
 class _Video:
     """The file a camera is writing now, and how many frames it has."""
@@ -96,13 +84,6 @@ class _Video:
     container: Any
     stream: Any
     frames: int = 0
-
-
-@dataclass(slots=True)
-class _Totals:
-    episodes: int = 0
-    frames: int = 0
-    tasks: dict[str, int] = field(default_factory=dict[str, int])
 
 
 class LeRobotWriter:
@@ -115,35 +96,33 @@ class LeRobotWriter:
         self._folder, self._cameras, self._options = folder, cameras, options
         self._arrow, self._parquet = load_arrow()
         self._av = load_av()
-        self._totals, self._spread = _Totals(), dict[str, Spread]()
+        self._count, self._frames, self._tasks = 0, 0, dict[str, int]()
+        self._statistics: dict[str, list[Statistics]] = {}
         self._videos: dict[str, _Video] = {}
         self._tables: list[Any] = []
         self._episodes: list[dict[str, Any]] = []
-        self._widths: dict[str, int] = {}
         (folder / "meta").mkdir(parents=True, exist_ok=True)
 
     def add(self, episode: LoggedEpisode, pictures: Iterator[Mapping[str, Bytes]]) -> None:
         """Append an episode; `pictures` gives a picture [H, W, 3] of every camera for each of its rows."""
         lengths = {len(rows) for rows in episode.features.values()}
-        if len(lengths) != 1:
-            raise DataError(f"an episode's features must be of one length, got {sorted(lengths)}")
         begins = {name: self._video(name).frames for name in self._cameras}
-        spread: dict[str, Spread] = {}
-        frames = self._encode(pictures, spread)
-        if frames != lengths.pop():
-            raise DataError(f"an episode has {frames} pictures and other numbers of rows; give one for each")
-        table = self._rows(episode, frames, spread)
-        self._tables.append(table)
-        self._episodes.append(self._told(episode, frames, begins, spread))
-        self._totals.episodes += 1
-        self._totals.frames += frames
-        if self._totals.episodes % self._options.episodes_a_file == 0:
+        statistics = self._encode(pictures)
+        frames = next(iter(self._videos.values())).frames - next(iter(begins.values()))
+        if lengths != {frames}:
+            raise DataError(f"an episode has {frames} pictures and {sorted(lengths)} rows; give one for each")
+        columns = self._columns(episode, frames)
+        statistics |= {name: _statistics(values) for name, values in columns.items()}
+        self._tables.append(self._arrow.table({name: self._column(name, values) for name, values in columns.items()}))
+        self._episodes.append(self._episode(episode, frames, begins, statistics))
+        self._count, self._frames = self._count + 1, self._frames + frames
+        if self._count % self._options.episodes_a_file == 0:
             self._finish_files()
 
     def close(self) -> None:
         """Write what describes the set."""
         self._finish_files()
-        statistics = {name: spread.told(picture=name in self._cameras) for name, spread in self._spread.items()}
+        statistics = {name: self._listed(name, _together(parts)) for name, parts in self._statistics.items()}
         _write(self._folder / "meta/stats.json", statistics)
         _write(self._folder / "meta/info.json", self._info())
         self._write_tasks()
@@ -151,7 +130,7 @@ class LeRobotWriter:
 
     @property
     def _place(self) -> dict[str, int]:
-        number = self._totals.episodes // self._options.episodes_a_file
+        number = self._count // self._options.episodes_a_file
         return {"chunk": number // _FILES_A_CHUNK, "file": number % _FILES_A_CHUNK}
 
     def _video(self, name: str) -> _Video:
@@ -168,17 +147,18 @@ class LeRobotWriter:
             self._videos[name] = _Video(container, stream)
         return self._videos[name]
 
-    def _encode(self, pictures: Iterator[Mapping[str, Bytes]], spread: dict[str, Spread]) -> int:
-        count = 0
-        for count, seen in enumerate(pictures, start=1):
+    def _encode(self, pictures: Iterator[Mapping[str, Bytes]]) -> dict[str, Statistics]:
+        """Append the pictures to the videos; statistics of the colours of some."""
+        sampled: dict[str, list[NDArray[np.float64]]] = {name: [] for name in self._cameras}
+        for number, seen in enumerate(pictures):
             for name, camera in self._cameras.items():
                 picture = seen[name]
                 if picture.shape != (camera.height, camera.width, 3):
                     raise DataError(f"{name} must be {camera.width} x {camera.height}, got a picture {picture.shape}")
                 self._encode_one(self._video(name), picture)
-                if (count - 1) % _SAMPLED == 0:
-                    spread.setdefault(name, Spread()).add(picture[::4, ::4].reshape(-1, 3) / 255)
-        return count
+                if number % _SAMPLED == 0:
+                    sampled[name].append(picture[::4, ::4].reshape(-1, 3) / 255)
+        return {name: _statistics(np.concatenate(rows)) for name, rows in sampled.items() if rows}
 
     def _encode_one(self, video: _Video, picture: Bytes) -> None:
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
@@ -186,38 +166,34 @@ class LeRobotWriter:
         video.container.mux(video.stream.encode(frame))
         video.frames += 1
 
-    def _rows(self, episode: LoggedEpisode, frames: int, spread: dict[str, Spread]) -> Any:
-        pa = self._arrow
-        columns: dict[str, Any] = {}
-        for name, rows in episode.features.items():
-            values = np.ascontiguousarray(rows, np.float32)
-            wide = self._widths.setdefault(name, values.shape[1])
-            if wide != values.shape[1]:
-                raise DataError(f"{name} had {wide} numbers in the first episode and has {values.shape[1]} in this one")
-            columns[name] = pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), wide)
-            spread[name] = Spread()
-            spread[name].add(values)
-        task = self._totals.tasks.setdefault(episode.task, len(self._totals.tasks))
-        steps = np.arange(frames)
-        numbers = (steps, np.full(frames, self._totals.episodes), self._totals.frames + steps, np.full(frames, task))
+    def _columns(self, episode: LoggedEpisode, frames: int) -> dict[str, NDArray[Any]]:
+        """Rows [T, N] of an episode by name: its features and LeRobot's own numbers."""
+        columns = {name: np.ascontiguousarray(rows, np.float32) for name, rows in episode.features.items()}
+        for name, rows in columns.items():
+            width = self._statistics[name][0]["mean"].shape[0] if name in self._statistics else rows.shape[1]
+            if width != rows.shape[1]:
+                raise DataError(f"{name} had {width} numbers in the first episode and has {rows.shape[1]} in this one")
+        task, steps = self._tasks.setdefault(episode.task, len(self._tasks)), np.arange(frames)
+        numbers = (steps, np.full(frames, self._count), self._frames + steps, np.full(frames, task))
         own = [(steps / self._options.fps).astype(np.float32), *(row.astype(np.int64) for row in numbers)]
-        for name, row in zip(_OWN, own, strict=True):
-            columns[name] = pa.array(row)
-            spread[name] = Spread()
-            spread[name].add(row[:, None])
-        return pa.table(columns)
+        return columns | {name: row[:, None] for name, row in zip(_OWN, own, strict=True)}
 
-    def _told(
-        self, episode: LoggedEpisode, frames: int, begins: dict[str, int], spread: dict[str, Spread]
+    def _column(self, name: str, values: NDArray[Any]) -> Any:
+        """LeRobot's own are plain numbers, features are lists."""
+        flat = self._arrow.array(values.reshape(-1))
+        return flat if name in _OWN else self._arrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+    def _episode(
+        self, episode: LoggedEpisode, frames: int, begins: dict[str, int], statistics: dict[str, Statistics]
     ) -> dict[str, Any]:
         """The episode's row in meta/episodes."""
         place, fps = self._place, self._options.fps
         row: dict[str, Any] = {
-            "episode_index": self._totals.episodes,
+            "episode_index": self._count,
             "tasks": [episode.task],
             "length": frames,
-            "dataset_from_index": self._totals.frames,
-            "dataset_to_index": self._totals.frames + frames,
+            "dataset_from_index": self._frames,
+            "dataset_to_index": self._frames + frames,
             "data/chunk_index": place["chunk"],
             "data/file_index": place["file"],
             "meta/episodes/chunk_index": place["chunk"],
@@ -228,11 +204,18 @@ class LeRobotWriter:
             row[f"videos/{name}/file_index"] = place["file"]
             row[f"videos/{name}/from_timestamp"] = first / fps
             row[f"videos/{name}/to_timestamp"] = (first + frames) / fps
-        for name, seen in spread.items():
-            told = seen.told(picture=name in self._cameras)
-            row.update({f"stats/{name}/{key}": value for key, value in told.items()})
-            self._spread.setdefault(name, Spread()).join(seen)
+        for name, seen in statistics.items():
+            row.update({f"stats/{name}/{key}": value for key, value in self._listed(name, seen).items()})
+            self._statistics.setdefault(name, []).append(seen)
         return row
+
+    def _listed(self, name: str, statistics: Statistics) -> dict[str, list[Any]]:
+        """As LeRobot writes it: a number each, or [3, 1, 1] for the channels of pictures."""
+        shaped = name in self._cameras
+        return {
+            key: (row.reshape(3, 1, 1) if shaped and key != "count" else row).tolist()
+            for key, row in statistics.items()
+        }
 
     def _finish_files(self) -> None:
         """Close the videos and write the tables of the episodes since the last time."""
@@ -242,7 +225,7 @@ class LeRobotWriter:
         self._videos = {}
         if not self._tables:
             return
-        number = (self._totals.episodes - 1) // self._options.episodes_a_file
+        number = (self._count - 1) // self._options.episodes_a_file
         name = f"{_FILE.format(chunk=number // _FILES_A_CHUNK, file=number % _FILES_A_CHUNK)}.parquet"
         for table, room in (
             (self._arrow.concat_tables(self._tables), "data"),
@@ -254,31 +237,30 @@ class LeRobotWriter:
         self._tables, self._episodes = [], []
 
     def _write_tasks(self) -> None:
-        """A table whose index is the task's words, as pandas would write it."""
-        tasks, pa = self._totals.tasks, self._arrow
+        """A table whose index is the task's words, as pandas writes it."""
+        tasks, pa = self._tasks, self._arrow
         table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
-        told = {
-            "index_columns": ["task"],
-            "column_indexes": [],
-            "columns": [_pandas_column("task_index", "int64"), _pandas_column("task", "unicode")],
-            "creator": {"library": "pyarrow", "version": pa.__version__},
-            "pandas_version": "2.2.0",
-        }
-        table = table.replace_schema_metadata({"pandas": json.dumps(told)})
-        self._parquet.write_table(table, self._folder / "meta/tasks.parquet")
+        columns = [
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
+            for name, kind, stored in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+        ]
+        index = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
+        self._parquet.write_table(
+            table.replace_schema_metadata({"pandas": json.dumps(index)}), self._folder / "meta/tasks.parquet"
+        )
 
     def _info(self) -> dict[str, Any]:
         return {
             "codebase_version": "v3.0",
             "robot_type": self._options.robot,
-            "total_episodes": self._totals.episodes,
-            "total_frames": self._totals.frames,
-            "total_tasks": len(self._totals.tasks),
+            "total_episodes": self._count,
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
             "chunks_size": _FILES_A_CHUNK,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": self._options.fps,
-            "splits": {"train": f"0:{self._totals.episodes}"},
+            "splits": {"train": f"0:{self._count}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
             "features": self._features(),
@@ -286,9 +268,11 @@ class LeRobotWriter:
 
     def _features(self) -> dict[str, Any]:
         told: dict[str, Any] = {name: self._video_feature(camera) for name, camera in self._cameras.items()}
-        for name, wide in self._widths.items():
+        for name, parts in self._statistics.items():
+            if name in self._cameras or name in _OWN:
+                continue
             names = list(self._options.names.get(name, [])) or None
-            told[name] = {"dtype": "float32", "shape": [wide], "names": names}
+            told[name] = {"dtype": "float32", "shape": list(parts[0]["mean"].shape), "names": names}
         for name in _OWN:
             told[name] = {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
         return told
@@ -318,11 +302,6 @@ class LeRobotWriter:
         else:
             for video in self._videos.values():
                 video.container.close()
-
-
-def _pandas_column(name: str, kind: str) -> dict[str, Any]:
-    kept = "object" if kind == "unicode" else kind
-    return {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kept, "metadata": None}
 
 
 def _write(path: Path, told: dict[str, Any]) -> None:
