@@ -2,25 +2,20 @@
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import torch
 from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 
 from gcd_model import FAMILIES, load_synthesizer
-from gcd_model.networks import Networks, random_networks
-from gcd_train.data.latents import LatentClips, LatentVideos
-from gcd_train.data.latents_writer import LatentsJob, encode_clips
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import Clips, video_clips
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe
-from gcd_train.training.conditioner import Conditioner
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.run import RunInputs, Trainer
-from gcd_train.training.setup import Precision, family_of, model_config, start_networks
+from gcd_train.training.setup import family_of, model_config, start_networks
 
 CPU = torch.device("cpu")
 SMALLER = ("model.unet.multipliers=[1,2,2]", "model.vae.width=16", "model.vae.multipliers=[1,1,2]", "log.valid_clips=1")
@@ -28,25 +23,6 @@ SMALLER = ("model.unet.multipliers=[1,2,2]", "model.vae.width=16", "model.vae.mu
 
 def recipe(name: str, *changes: str) -> Recipe:
     return load_recipe(f"package:{name}", small=True, changes=[*SMALLER, *changes])
-
-
-def encoded(folder: Path, networks: Networks, told: Recipe, clips: Clips) -> LatentClips:
-    assert told.latents is not None
-    precision = Precision.of(told.compute)
-    job = LatentsJob(
-        folder=folder,
-        networks=networks,
-        clips=clips,
-        recipe=msgspec.structs.replace(told.latents, flip=True, limit=None),
-        conditioner=Conditioner(networks.config, told.unet, precision, FAMILIES["svd"]),
-        class_weights=(),
-        precision=precision,
-        seed=1,
-        identity="test",
-        stop=Never(),
-    )
-    encode_clips(job)
-    return LatentClips.open(folder)
 
 
 # laws
@@ -68,29 +44,6 @@ def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> No
     assert len(set(videos.seeds)) == 6
 
 
-def test_encoded_pairs_read_as_videos_are_the_encoded_videos(tmp_path: Path) -> None:
-    told = recipe("study-pretrain")
-    networks = random_networks(model_config(told.model), seed=5)
-    sets = (TinyClips(2), TinyClips(1, seed=7))
-    parts = [encoded(tmp_path / str(number), networks, told, clips) for number, clips in enumerate(sets)]
-    videos = LatentVideos(parts, networks.config.vae.scale)
-    again = encoded(tmp_path / "videos", networks, told, video_clips(sets))
-    place = {seed: number for number, seed in enumerate(again.meta.seeds)}
-    order = [
-        place[part * 10**15 + 2 * seed + side] for part in (0, 1) for seed in parts[part].meta.seeds for side in (0, 1)
-    ]
-    clips, frames = torch.tensor([3, 0, 5, 4, 1]), torch.tensor([0, 1, 3, 2, 3])
-    mirrored = torch.tensor([False, True, True, False, False])
-    rows = videos.rows(clips, frames, mirrored, CPU)
-    wanted = again.rows(torch.tensor(order)[clips], frames, mirrored, CPU)
-    torch.testing.assert_close(rows.target, wanted.target, atol=2e-3, rtol=0)  # kept as float16
-    torch.testing.assert_close(rows.source, wanted.source, atol=2e-3, rtol=0)
-    assert torch.equal(rows.motion, wanted.motion)
-    assert videos.meta.clips == len(again.meta.seeds) == 6
-    assert videos.names(torch.tensor([0, 5])) == ("clip 100, its source", "clip 100, its target")
-    assert sum(videos.meta.sensitivity) == pytest.approx(sum(parts[0].meta.sensitivity), rel=1e-5)
-
-
 # examples
 
 
@@ -98,7 +51,7 @@ def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[Clips, ...] 
     videos = video_clips(parts) if parts else None
     inputs = RunInputs(
         recipe=told,
-        data=RunData(clips=videos or TinyClips(2), valid=videos or TinyClips(1, seed=9), parts=parts),
+        data=RunData(clips=videos or TinyClips(2), valid=videos or TinyClips(1, seed=9)),
         folder=RunFolder(folder),
         stop=Never(),
         latents=latents,
@@ -106,7 +59,7 @@ def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[Clips, ...] 
     return Trainer(inputs)
 
 
-def test_views_start_from_what_continues_pictures_and_nothing_is_encoded_twice(tmp_path: Path) -> None:
+def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     latents, other = tmp_path / "latents", TinyClips(2, seed=4)
     other.origin = "tiny direct"
     first = recipe("study-pretrain")
@@ -115,11 +68,14 @@ def test_views_start_from_what_continues_pictures_and_nothing_is_encoded_twice(t
     made = load_synthesizer(weights, device="cpu")
     assert made.traits.family is FAMILIES["svd"]
     before = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
-    assert len({path.parent for path in before}) == 2
+    assert len({path.parent for path in before}) == 1
     assert not (tmp_path / "first" / "latents").exists()
     then = recipe("study-gradual-pretrained", f"model.weights={weights}")
-    trainer(tmp_path / "second", then, latents).run("latents")
-    assert {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")} == before
+    for folder in ("second", "third"):  # which share their latents
+        trainer(tmp_path / folder, then, latents).run("latents")
+    after = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
+    assert before.items() < after.items()
+    assert len({path.parent for path in after}) == 2
     start = start_networks(then.model, model_config(then.model), then.seed)
     assert torch.equal(start.unet.conv_out.weight, made.networks.unet.conv_out.weight.float())
     scratch = recipe("study-gradual-scratch", f"model.weights={weights}")
@@ -131,10 +87,4 @@ def test_views_start_from_what_continues_pictures_and_nothing_is_encoded_twice(t
 def test_a_model_for_something_else_is_refused(tmp_path: Path) -> None:
     told = recipe("study-pretrain", "model.family=driving")
     with pytest.raises(RecipeError, match=r'give model\.family "svd"'):
-        open_data(told, model_config(told.model), family_of(told.model), DataPlaces(data=tmp_path, valid=tmp_path))
-
-
-def test_latents_that_were_encoded_unalike_are_no_videos(tmp_path: Path) -> None:
-    told = recipe("study-pretrain", "latents.sample=true")
-    with pytest.raises(RecipeError, match="one shared autoencoder"):
         open_data(told, model_config(told.model), family_of(told.model), DataPlaces(data=tmp_path, valid=tmp_path))

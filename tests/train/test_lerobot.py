@@ -152,6 +152,14 @@ def test_a_sample_depends_on_seed_and_index_alone(made: Path) -> None:
     assert other != [backwards[index].frame_numbers for index in range(4)]
 
 
+def test_a_lower_rate_takes_the_rows_nearest_in_time(made: Path) -> None:
+    sample = _only(made, LEFT, RIGHT, fps=10.0).sample(0)
+    assert set(np.diff(sample.frame_numbers)) == {2}
+    assert sample.fps == 10.0
+    with pytest.raises(DataError, match="30 frames per second were wanted"):
+        _only(made, LEFT, RIGHT, fps=30.0)
+
+
 def test_of_two_lenses_both_sides_have_the_narrower_one(copied: Path) -> None:
     same = _only(copied, LEFT, RIGHT).sample(0)
     path = copied / CAMERA_FILE

@@ -44,6 +44,20 @@ def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
 
 
 @needs_egl
+def test_generation_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    write_partial = tmp_path / "shard-00000002-2.123.partial"
+    tmp_path.mkdir(exist_ok=True)
+    write_partial.write_bytes(b"cut off")
+    list(generate(tmp_path, TINY, range(2), workers=1))
+    first = shard_path(tmp_path, range(2))
+    written = first.stat().st_mtime_ns
+    seen = list(generate(tmp_path, TINY, range(4), workers=1))
+    assert seen == [2, 4]
+    assert first.stat().st_mtime_ns == written
+    assert len(PairedClips.open(tmp_path)) == 4
+
+
+@needs_egl
 def test_a_folder_of_another_world_is_refused(tmp_path: Path) -> None:
     list(generate(tmp_path, TINY, range(1), workers=1))
     with pytest.raises(DataError, match="choose another folder"):

@@ -18,7 +18,7 @@ from gcd_model.geometry import Trajectory
 from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
-from gcd_train.data.latents import EncodedClips, LatentRows
+from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader
 from gcd_train.data.sample import Samples, to_network
 from gcd_train.errors import DataError, RecipeError
@@ -93,7 +93,7 @@ def _in_kept_precision(network: Callable[[Tensor], Made], frames: Tensor) -> Mad
 class EncodedBatches:
     """Batches of what the latents stage wrote."""
 
-    def __init__(self, clips: EncodedClips, config: ModelConfig, recipe: UNetRecipe, precision: Precision) -> None:
+    def __init__(self, clips: LatentClips, config: ModelConfig, recipe: UNetRecipe, precision: Precision) -> None:
         self._clips, self._recipe, self._precision = clips, recipe, precision
         self._conditioner = Conditioner(config, recipe, precision)
 

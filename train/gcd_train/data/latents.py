@@ -14,11 +14,11 @@ emphasis    float16 [N, T, 1, h, w]         how much more a class counts, see `c
 
 import fcntl
 import hashlib
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Self, TypeVar
 
 import msgspec
 import torch
@@ -184,15 +184,22 @@ class LatentClips:
     def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
         """The frames (clips[i], frames[i]), mirrored where the flag says so; all int64 or bool [N] on the CPU."""
 
+        part_of = torch.bucketize(clips, self._ends, right=True)
+        parts: list[int] = part_of.unique().tolist()
+        places = [(part_of == part).nonzero()[:, 0] for part in parts]
+        order = torch.cat(places).argsort()
+
         def at(name: str, *index: Tensor) -> Tensor | None:
+            """Rows of an array, which lie in several shards, in the order of `clips`."""
             if name not in self._shards[0]:
                 return None
-
-            def rows(part: int, numbers: Tensor, which: Tensor) -> tuple[Tensor]:
+            found: list[Tensor] = []
+            for part, which in zip(parts, places, strict=True):
                 values = self._shards[part][name]
-                return (values[tuple(each.to(values.device) for each in (numbers, *(i[which] for i in index)))],)
-
-            return _gathered(self._ends, clips, rows)[0].to(device)
+                numbers = clips[which] - (self._ends[part - 1] if part else 0)
+                found.append(values[tuple(each.to(values.device) for each in (numbers, *(i[which] for i in index)))])
+            rows = torch.cat(found)
+            return rows[order.to(rows.device)].to(device)
 
         side = mirrored.long()
         source, target, motion = at("source", side, frames), at("target", side, frames), at("motion")
@@ -214,66 +221,3 @@ class LatentClips:
     def names(self, clips: Tensor) -> tuple[str, ...]:
         """What the clips are called in messages: their seeds."""
         return tuple(f"clip {self.meta.seeds[number]}" for number in clips.tolist())
-
-
-class LatentVideos:
-    """Both sides of all pairs of some folders of latents; see `sample.VideoClips` for what they stand for.
-
-    scale: what the U-Net works on is this times what the condition encoder gives; see gcd_model.config.VAEConfig.
-    Both sides must have been encoded alike: by one autoencoder, without augmentation, targets as their mean.
-    """
-
-    def __init__(self, parts: Sequence[LatentClips], scale: float) -> None:
-        self._parts, self._scale = tuple(parts), scale
-        metas = [part.meta for part in parts]
-        self._ends = torch.tensor([2 * meta.clips for meta in metas]).cumsum(0)
-        sensitivities = zip(*(meta.sensitivity for meta in metas), strict=True)
-        self.meta = msgspec.structs.replace(
-            metas[0],
-            seeds=tuple(seed for meta in metas for seed in meta.seeds for _ in range(2)),
-            sensitivity=tuple(sum(row) / len(metas) for row in sensitivities),
-        )
-
-    def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
-        """The frames (clips[i], frames[i]) and, as their source, the first frame of the same video; see `LatentClips`.
-
-        clips: int64 [N], video 2n is the source's side of pair n, 2n + 1 the target's.
-        """
-
-        def rows(part: int, videos: Tensor, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            latents, flip = self._parts[part], mirrored[which]
-            now = latents.rows(videos // 2, frames[which], flip, device)
-            first = latents.rows(videos // 2, torch.zeros_like(videos), flip, device)
-            of_target = (videos % 2).bool().to(device)[:, None, None, None]
-            source = torch.where(of_target, first.target / self._scale, first.source)
-            return source, torch.where(of_target, now.target, now.source * self._scale), now.motion
-
-        source, target, motion = _gathered(self._ends, clips, rows)
-        return LatentRows(source=source, target=target, motion=motion, control=None, emphasis=None)
-
-    def names(self, clips: Tensor) -> tuple[str, ...]:
-        """What the videos are called in messages: the seed of their pair, and its side."""
-        numbers = clips.tolist()
-        return tuple(f"clip {self.meta.seeds[n]}, its {'target' if n % 2 else 'source'}" for n in numbers)
-
-
-EncodedClips: TypeAlias = LatentClips | LatentVideos
-"""Clips as the U-Net learns from them."""
-
-
-def _gathered(
-    ends: Tensor, clips: Tensor, rows: Callable[[int, Tensor, Tensor], tuple[Tensor, ...]]
-) -> tuple[Tensor, ...]:
-    """Rows of clips that lie in several parts, in the order of `clips`.
-
-    ends: behind the last clip of each part. rows: of a part, by the clips' numbers in it and their places in `clips`.
-    """
-    part_of = torch.bucketize(clips, ends, right=True)
-    parts: list[int] = part_of.unique().tolist()
-    places = [(part_of == part).nonzero()[:, 0] for part in parts]
-    firsts = [int(ends[part - 1]) if part else 0 for part in parts]
-    made = [rows(part, clips[at] - first, at) for part, first, at in zip(parts, firsts, places, strict=True)]
-    if len(made) == 1:
-        return made[0]
-    order = torch.cat(places).argsort()
-    return tuple(torch.cat(each)[order.to(each[0].device)] for each in zip(*made, strict=True))

@@ -13,10 +13,8 @@ from torch import Tensor
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks, weights_digest
 from gcd_train.data.latents import (
-    EncodedClips,
     LatentClips,
     LatentsMeta,
-    LatentVideos,
     Shard,
     open_shard,
     read_index,
@@ -174,55 +172,44 @@ def _sensitivity(job: LatentsJob, latents: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Encodings:
-    """A run's folders of latents, one for each set of clips.
+    """A run's folder of latents.
 
-    sets: of clips, one, or the pairs that a run takes as videos. folder: of the run's latents. shared: a folder that
-    several runs share, where each set lies under the name of what it belongs to; None for the run's own.
-    as_videos: whether both sides of the pairs count as videos.
+    folder: of the run's own. shared: a folder that several runs share, where each set of clips lies under the name of
+    what it belongs to; None for the run's own.
     """
 
     recipe: Recipe
     config: ModelConfig
     family: Family
     precision: Precision
-    sets: tuple[Clips, ...]
-    as_videos: bool
+    clips: Clips
     folder: Path
     shared: Path | None
     stop: StopSignal
 
     def encode(self, networks: Networks) -> None:
         """Write what is not there yet. Raises Interrupted, DataError, RunError, see `encode_clips`."""
-        recipe = self.recipe
-        for clips in self.sets:
-            identity = self._identity(networks, clips)
-            job = LatentsJob(
-                folder=self._place(identity),
-                networks=networks,
-                clips=clips,
-                recipe=self._latents,
-                precision=self.precision,
-                seed=recipe.seed,
-                conditioner=Conditioner(self.config, recipe.unet, self.precision, self.family),
-                class_weights=COLOUR_WEIGHTS[recipe.unet.loss.class_weights],
-                identity=identity,
-                stop=self.stop,
-            )
-            encode_clips(job)
+        recipe, identity = self.recipe, self._identity(networks)
+        job = LatentsJob(
+            folder=self._place(identity),
+            networks=networks,
+            clips=self.clips,
+            recipe=self._latents,
+            precision=self.precision,
+            seed=recipe.seed,
+            conditioner=Conditioner(self.config, recipe.unet, self.precision, self.family),
+            class_weights=COLOUR_WEIGHTS[recipe.unet.loss.class_weights],
+            identity=identity,
+            stop=self.stop,
+        )
+        encode_clips(job)
 
-    def opened(self, networks: Networks) -> EncodedClips:
-        """What the U-Net learns from. Raises RunError for latents of another autoencoder, or unfinished ones."""
-        if not self.as_videos:
-            return self.pairs(networks)
-        return LatentVideos([self._opened(networks, clips) for clips in self.sets], self.config.vae.scale)
+    def opened(self, networks: Networks) -> LatentClips:
+        """What the U-Net learns from.
 
-    def pairs(self, networks: Networks) -> LatentClips:
-        """The latents of the one set there is. Raises RunError as `opened`."""
-        (clips,) = self.sets
-        return self._opened(networks, clips)
-
-    def _opened(self, networks: Networks, clips: Clips) -> LatentClips:
-        identity = self._identity(networks, clips)
+        Raises RunError for latents of another autoencoder, or unfinished ones; DataError for damaged ones.
+        """
+        identity = self._identity(networks)
         place = self._place(identity)
         latents = LatentClips.open(place)
         if latents.meta.identity != identity:
@@ -233,16 +220,14 @@ class Encodings:
         return latents.resident(self.precision.device) if self.recipe.compute.resident else latents
 
     def _place(self, identity: str) -> Path:
-        if self.shared is not None:
-            return self.shared / identity
-        return self.folder if len(self.sets) == 1 else self.folder / identity
+        return self.folder if self.shared is None else self.shared / identity
 
-    def _identity(self, networks: Networks, clips: Clips) -> str:
+    def _identity(self, networks: Networks) -> str:
         recipe, config, family = self.recipe, self.config, self.family
         by_path = family.motion_bucket is None and family.limits is not None
         motion = family.name if by_path else None  # families with the recipe's number write the same latents
         steered = (config.camera, motion, recipe.unet.motion_bucket)
-        options = digest_of(self._latents, recipe.seed, clips.origin, steered, recipe.unet.loss.class_weights)
+        options = digest_of(self._latents, recipe.seed, self.clips.origin, steered, recipe.unet.loss.class_weights)
         return f"{autoencoder_digest(networks)}-{options}"
 
     @property

@@ -41,13 +41,11 @@ class RunData:
     """clips: to learn from, for stages that take them one by one, all at the recipe's fps. valid: held out.
 
     batches: how the U-Net's batches are made where they come neither from encoded clips nor from `clips`.
-    parts: the pairs that `clips` are videos of, encoded in their stead, each by itself; empty where `clips` are pairs.
     """
 
     clips: Clips
     valid: Clips
     batches: BatchMaker | None = None
-    parts: tuple[Clips, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -98,12 +96,11 @@ class _Opening:
     def pairs(self) -> RunData:
         data, valid = self.places.data, self._valid_folder("pairs have no split of their own")
         if self._data.task == "image-to-video":  # both sides of all pairs: the folders need not go the same way
-            self._require_plain_latents()
             learned, held = (tuple(map(PairedClips.open, data_folders(place))) for place in (data, valid))
             require_apart(
                 *({name: world for each in part for name, world in each.scenes.items()} for part in (learned, held))
             )
-            return RunData(clips=video_clips(learned), valid=video_clips(held), parts=learned)
+            return RunData(clips=video_clips(learned), valid=video_clips(held))
         clips, held_out = PairedClips.open(data), PairedClips.open(valid)
         require_apart(clips.scenes, held_out.scenes)
         for each, folder in ((clips, data), (held_out, valid)):
@@ -311,17 +308,6 @@ class _Opening:
                 f"frames of {kept.width}x{kept.height} at strides {kept.plan.strides}, forwards, of one path, up to "
                 f"the last frame but one, with augmentation {kept.augmentation:g}; the recipe's {', '.join(named)} "
                 "wants another thing: change the recipe, or make the cache anew"
-            )
-
-    def _require_plain_latents(self) -> None:
-        """Encoded pairs serve as videos where both sides were encoded alike."""
-        latents = self.recipe.latents
-        if self.recipe.unet.source != "latents" or latents is None:
-            return
-        if latents.augmentation or latents.sample or not self.config.vae.shared:
-            raise RecipeError(
-                'data.task "image-to-video" takes both sides of the encoded pairs as videos: it wants one shared '
-                'autoencoder, latents.augmentation 0 and latents.sample false; or give unet.source "pixels"'
             )
 
     def _require_family_covers_orbit(self) -> None:

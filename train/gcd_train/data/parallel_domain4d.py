@@ -192,7 +192,7 @@ class ParallelDomain4D(Dataset4D):
         if self.ontology is not None and (folder / "semantic_segmentation_2d").is_dir():
             self._require_same_ontology(names.ontology_folder(folder))
         pictures = _pictures(folder / "rgb" / self.source_camera)
-        height, width = _size(pictures)
+        height, width = read_colour(pictures[0]).shape[:2]
         return _Scene(cameras, width, height, 1 + max(names.frame_time(path.stem) or 0 for path in pictures))
 
     def _require_same_ontology(self, folder: Path) -> None:
@@ -212,19 +212,6 @@ def _pictures(folder: Path) -> list[Path]:
     if not found:
         raise FileFault(folder, "holds no picture: download or generate the scene again")
     return found
-
-
-def _size(pictures: list[Path]) -> tuple[int, int]:
-    """Height and width of the first picture that can be read. Raises FileFault of the first if none can."""
-    first: FileFault | None = None
-    for path in pictures:
-        try:
-            picture = read_colour(path)
-        except FileFault as fault:
-            first = first or fault
-        else:
-            return picture.shape[0], picture.shape[1]
-    raise first or FileFault(pictures[0].parent, "holds no picture")
 
 
 def _first_ontology(root: Path, scenes: Sequence[str]) -> Ontology:

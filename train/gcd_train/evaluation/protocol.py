@@ -136,7 +136,7 @@ class DrawnControls:
             return start, skip
         strides = self.frames.strides if skip is None else (skip,)
         chosen = FrameSampling(clip=self.frames.clip, strides=strides, latest_start=self.frames.latest_start)
-        numbers, stride, _ = chosen.draw(rng, frames)
+        numbers, stride = chosen.draw(rng, frames)
         return numbers[0] if start is None else start, stride
 
 

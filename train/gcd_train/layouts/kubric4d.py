@@ -45,7 +45,7 @@ CAMERAS = tuple(f"view{view}" for view in range(VIEWS))
 STEP_RATE_HZ = 480
 """Of the physics of both worlds in this layout."""
 
-_IDS, _BITS = 256, 64
+_IDS = 256
 _WEBP_QUALITY = 85
 _GRAVITY_M_S2, _SENSOR_MM = 9.81, 32.0
 _DIGITS = 5  # decimals of metres and shares: hundredths of a millimetre
@@ -156,22 +156,11 @@ class InstanceTracks:
 
     def add(self, time: int, ids: NDArray[np.uint8]) -> None:
         """One picture [H, W]."""
-        counts = np.bincount(ids.reshape(-1), minlength=_IDS)
-        self.pixels[time] = counts
-        for first in range(0, int(np.flatnonzero(counts)[-1]) + 1, _BITS):  # one bit an id: a row is seen at once
-            bit_of = np.zeros(_IDS, np.uint64)
-            bit_of[first : first + _BITS] = np.uint64(1) << np.arange(_BITS, dtype=np.uint64)
-            bits = bit_of[ids]
-            top, bottom = _span(np.bitwise_or.reduce(bits, axis=1))
-            left, right = _span(np.bitwise_or.reduce(bits, axis=0))
-            self.boxes[time, first : first + _BITS] = np.stack([top, left, bottom, right], -1)
-        self.boxes[time][counts == 0] = 0
-
-
-def _span(occupied: NDArray[np.uint64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First place with each bit, and one after the last, [64]."""
-    there = (occupied[:, None] >> np.arange(_BITS, dtype=np.uint64)) & np.uint64(1)
-    return there.argmax(0), len(there) - there[::-1].argmax(0)
+        self.pixels[time] = np.bincount(ids.reshape(-1), minlength=_IDS)
+        for number in np.flatnonzero(self.pixels[time]):
+            here = ids == number
+            rows, columns = np.flatnonzero(here.any(axis=1)), np.flatnonzero(here.any(axis=0))
+            self.boxes[time, number] = rows[0], columns[0], rows[-1] + 1, columns[-1] + 1
 
 
 def view_metadata(

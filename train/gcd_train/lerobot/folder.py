@@ -225,24 +225,20 @@ def _episodes_v3(folder: Path, info: Info) -> Iterator[EpisodePlace]:
     paths = sorted((folder / "meta/episodes").glob("chunk-*/file-*.parquet"))
     if not paths:
         raise FileFault(folder / "meta/episodes", "holds no chunk-000/file-000.parquet; a v3.0 set has one")
-    wanted = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    keys = ("chunk_index", "file_index", "from_timestamp")
-    wanted += [f"videos/{name}/{key}" for name in videos for key in keys]
-    for path in paths:
-        for row in read_rows(path, wanted):
-            data = {"chunk_index": int(row["data/chunk_index"]), "file_index": int(row["data/file_index"])}
-            yield EpisodePlace(
-                number=int(row["episode_index"]),
-                length=int(row["length"]),
-                data=_inside(folder, info.data_path, data),
-                videos={name: _video_place(folder, info, name, row) for name in videos},
-            )
-
-
-def _video_place(folder: Path, info: Info, name: str, row: Mapping[str, Any]) -> tuple[Path, float]:
-    chunk, file, since = (row[f"videos/{name}/{key}"] for key in ("chunk_index", "file_index", "from_timestamp"))
-    numbers = {"video_key": name, "chunk_index": int(chunk), "file_index": int(file)}
-    return _inside(folder, _video_path(folder, info), numbers), float(since)
+    keys = ("chunk_index", "file_index")
+    wanted = ["episode_index", "length", *(f"data/{key}" for key in keys)]
+    wanted += [f"videos/{name}/{key}" for name in videos for key in (*keys, "from_timestamp")]
+    for row in (row for path in paths for row in read_rows(path, wanted)):
+        films = {name: {key: int(row[f"videos/{name}/{key}"]) for key in keys} for name in videos}
+        yield EpisodePlace(
+            number=int(row["episode_index"]),
+            length=int(row["length"]),
+            data=_inside(folder, info.data_path, {key: int(row[f"data/{key}"]) for key in keys}),
+            videos={
+                name: (_video(folder, info, name, numbers), float(row[f"videos/{name}/from_timestamp"]))
+                for name, numbers in films.items()
+            },
+        )
 
 
 def _episodes_v2(folder: Path, info: Info) -> Iterator[EpisodePlace]:
@@ -252,23 +248,20 @@ def _episodes_v2(folder: Path, info: Info) -> Iterator[EpisodePlace]:
         rows = [decode_json(line, _Row) for line in read_small(path, _MOST_BYTES).splitlines() if line.strip()]
     except FileError as error:
         raise FileFault(path, f"is no list of episodes: it {error}") from error
-    for number, length in ((row.episode_index, row.length) for row in rows):
-        numbers = {"episode_index": number, "episode_chunk": number // max(1, info.chunks_size)}
+    for row in rows:
+        numbers = {"episode_index": row.episode_index, "episode_chunk": row.episode_index // max(1, info.chunks_size)}
         yield EpisodePlace(
-            number=number,
-            length=length,
+            number=row.episode_index,
+            length=row.length,
             data=_inside(folder, info.data_path, numbers),
-            videos={
-                name: (_inside(folder, _video_path(folder, info), {**numbers, "video_key": name}), 0.0)
-                for name in videos
-            },
+            videos={name: (_video(folder, info, name, numbers), 0.0) for name in videos},
         )
 
 
-def _video_path(folder: Path, info: Info) -> str:
+def _video(folder: Path, info: Info, name: str, numbers: Mapping[str, int]) -> Path:
     if info.video_path is None:
         raise FileFault(folder / "meta/info.json", "has cameras but no video_path; pictures in rows are not supported")
-    return info.video_path
+    return _inside(folder, info.video_path, {**numbers, "video_key": name})
 
 
 def _inside(folder: Path, template: str, numbers: Mapping[str, int | str]) -> Path:

@@ -143,8 +143,7 @@ def _frame_numbers(frames: int, sampling: FrameSampling, options: ShowOptions) -
         return tuple(range(min(frames, clip))), 1
     reaching = replace(sampling, strides=strides, reach_last=True, reverse=0.0, latest_start=None)
     if options.start is None:
-        numbers, stride, _ = reaching.draw(generator(options.seed, 0), frames)
-        return numbers, stride
+        return reaching.draw(generator(options.seed, 0), frames)
     stride = options.stride or 1
     last = reaching.last_start(frames, stride)
     if not 0 <= options.start <= last:

@@ -15,7 +15,7 @@ from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
 from gcd_train.data.batches import EncodedBatches, SampleBatches
-from gcd_train.data.latents import EncodedClips
+from gcd_train.data.latents import LatentClips
 from gcd_train.data.latents_writer import Encodings, autoencoder_digest
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips
@@ -93,8 +93,7 @@ class Trainer:
             config=self._config,
             family=self._family,
             precision=self._precision,
-            sets=inputs.data.parts or (inputs.data.clips,),
-            as_videos=bool(inputs.data.parts),
+            clips=inputs.data.clips,
             folder=inputs.folder.stage("latents"),
             shared=inputs.latents,
             stop=inputs.stop,
@@ -206,7 +205,7 @@ class Trainer:
         self._precision.placed(networks if source == "pixels" else networks.unet)  # encoders only to encode
         self._train(networks, self._batches(networks, clips), clips, identity)
 
-    def _train(self, networks: Networks, batches: BatchSource, clips: EncodedClips | None, identity: str) -> None:
+    def _train(self, networks: Networks, batches: BatchSource, clips: LatentClips | None, identity: str) -> None:
         """Train networks that lie ready. clips: encoded ones, where batches are made of such."""
         recipe, seed = self._recipe.unet, self._recipe.seed
         weights = self._weights(clips) if recipe.loss.sensitivity else None
@@ -237,7 +236,7 @@ class Trainer:
     def _validation(self) -> Validation:
         return Validation(self._inputs.data.valid, self._family, count=self._recipe.log.valid_clips)
 
-    def _batches(self, networks: Networks, clips: EncodedClips | None) -> BatchSource:
+    def _batches(self, networks: Networks, clips: LatentClips | None) -> BatchSource:
         recipe = self._recipe.unet
         if clips is not None:
             return EncodedBatches(clips, self._config, recipe, self._precision)
@@ -247,7 +246,7 @@ class Trainer:
         loader, seed = self._recipe.data.loader, self._recipe.seed
         return SampleBatches(data.clips, networks, recipe, self._family, self._precision, loader, seed)
 
-    def _weights(self, clips: EncodedClips | None) -> torch.Tensor | None:
+    def _weights(self, clips: LatentClips | None) -> torch.Tensor | None:
         """Of latent channels, by what the decoder makes of them."""
         return None if clips is None else torch.tensor(clips.meta.sensitivity, device=self._precision.device)
 
