@@ -20,7 +20,7 @@ import torch
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90
-from gcd_train.data.views import ViewPairs
+from gcd_train.data.pictures import ViewPairs
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.parallel import one_thread_each
 from gcd_train.pointcloud import published_picture

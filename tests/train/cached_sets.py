@@ -1,11 +1,17 @@
 """A driving set small enough to cache in a blink: three scenes of seven frames, clips of three."""
 
+import multiprocessing
+import os
+import signal
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import torch
 
 from gcd_train.data.cache import CacheIdentity, ClipPlan
-from gcd_train.data.cache_writer import EncoderChoice, Encoders, load_encoders
+from gcd_train.data.cache_writer import CacheJob, EncoderChoice, Encoders, cache_scenes, load_encoders
+from gcd_train.data.latents import only_writer
 from gcd_train.errors import DataError
 
 HEIGHT, WIDTH, FRAMES, CLIP = 32, 48, 7, 3
@@ -59,3 +65,42 @@ def tiny_identity(**changes: object) -> CacheIdentity:
         "scale": 0.18215,
     }
     return CacheIdentity(**(told | changes))  # pyright: ignore[reportArgumentType]
+
+
+# a child that kills itself at the n-th time something settles on the disk
+
+RENAME = Path.replace
+_HANG_S = 100
+
+
+def killed_run(folder: Path, kill_at: int) -> int | None:
+    """How the child ended: -9 if it was killed. Odd numbers kill before a file appears, even ones right after."""
+    tiny_identity()  # the networks are loaded here; a fork has them
+    child = multiprocessing.get_context("fork").Process(target=_run, args=(folder, kill_at))
+    child.start()
+    child.join(_HANG_S)
+    if child.exitcode is None:
+        child.kill()
+    return child.exitcode
+
+
+def _run(folder: Path, kill_at: int) -> None:
+    torch.set_num_threads(1)  # the parent's other threads are not here
+    settled = 0
+
+    def replace(self: Path, target: Path) -> Path:
+        nonlocal settled
+        settled += 1
+        if 2 * settled - 1 == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        moved = RENAME(self, target)
+        if 2 * settled == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return moved
+
+    Path.replace = replace  # type: ignore[method-assign]
+    pictures = FakePictures()
+    job = CacheJob(folder=folder, pictures=pictures, choice=CHOICE, identity=tiny_identity())
+    with only_writer(folder):
+        for _ in cache_scenes(job, pictures.scenes):
+            pass

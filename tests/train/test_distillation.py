@@ -110,7 +110,7 @@ def test_the_student_samples_in_training_as_the_synthesizer_does(networks: Netwo
         device="cpu",
     )
     synthesizer = Synthesizer(deepcopy(networks), traits)
-    features = synthesizer.encode(Clip(video=to_network(TinyClips(1).rgb(0)[0]), fps=10.0))
+    features = synthesizer.encode(Clip(video=to_network(TinyClips(1).sample(0).source), fps=10.0))
     options = RenderOptions(steps=3, initial_noise=noise)
     view = synthesizer.render(features, [TinyClips(1).trajectory(0)], options)[0]
     assert torch.allclose(made, view.latents[0], atol=2e-4)
@@ -141,7 +141,7 @@ def test_a_distillation_ends_in_a_weight_file_that_takes_the_students_steps(run:
     sampling = synthesizer.traits.config.sampling
     assert (sampling.steps, sampling.sigma_min, sampling.guidance) == (2, 1.0, (1.0, 1.0))
     steps: list[tuple[int, int]] = []
-    features = synthesizer.encode(Clip(video=to_network(TinyClips(1).rgb(0)[0]), fps=10.0))
+    features = synthesizer.encode(Clip(video=to_network(TinyClips(1).sample(0).source), fps=10.0))
     options = RenderOptions(progress=lambda done, of: steps.append((done, of)))
     synthesizer.render(features, [synthesizer.traits.plan_view()], options)
     assert steps == [(1, 2), (2, 2)]

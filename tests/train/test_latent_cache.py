@@ -10,8 +10,18 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from cache_process import killed_run
-from cached_sets import CHOICE, CLIP, FRAMES, HEIGHT, PLAN, WIDTH, FakePictures, tiny_encoders, tiny_identity
+from cached_sets import (
+    CHOICE,
+    CLIP,
+    FRAMES,
+    HEIGHT,
+    PLAN,
+    WIDTH,
+    FakePictures,
+    killed_run,
+    tiny_encoders,
+    tiny_identity,
+)
 from tiny_scenes4d import DRIVING_POSES, write_driving
 from tiny_world import tiny_recipe
 from torch.testing import assert_close

@@ -133,7 +133,7 @@ def pixel_batch(augmentation: float, dropout: float = 0.0) -> tuple[Batch, Netwo
     changed: UNetRecipe = msgspec.structs.replace(
         recipe, image_share=0.0, loss=LossRecipe(), augmentation=augmentation, dropout=dropout
     )
-    source = to_network(TinyClips(1).rgb(0)[0])
+    source = to_network(TinyClips(1).sample(0).source)
     batches = SampleBatches(TinyClips(1), networks, changed, FAMILIES["driving"], PRECISION)
     return batches.whole_clips(draws(), 1), networks, source
 

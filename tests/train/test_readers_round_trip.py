@@ -13,8 +13,7 @@ from gcd_model.geometry import Intrinsics
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
-from gcd_train.data.pictures import PictureOptions
-from gcd_train.data.views import ViewPairs
+from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.layouts.encodings import SKY_M
 from gcd_train.layouts.scene_writer import SceneFormat, write_scene

@@ -29,10 +29,9 @@ from gcd_train.data.dataset4d import VOID
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
-from gcd_train.data.pictures import PictureOptions, trained_lens, trained_picture
+from gcd_train.data.pictures import PictureOptions, ViewPairs, trained_lens, trained_picture
 from gcd_train.data.sample import Sample, collate
 from gcd_train.data.splits import Control
-from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RenderError
 from gcd_train.pointcloud import render_lens
 

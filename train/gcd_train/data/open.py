@@ -17,11 +17,10 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips, data_folders
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling, Sampling
-from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.data.sample import Bytes, Clips, MadeClips, Sample, Samples, VideoSamples, painted, video_clips
 from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
-from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose
 from gcd_train.data.dataset4d import VOID, Dataset4D, Ontology
 from gcd_train.data.files import FileFault, Recent
-from gcd_train.data.paths import Draw
-from gcd_train.data.sample import Bytes, Sample, SceneView
+from gcd_train.data.paths import Draw, Sampling
+from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
+from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RenderError
 from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility
@@ -227,6 +228,51 @@ def _sample(
         frame_numbers=draw.frame_numbers,
         visible=visible,
     )
+
+
+class ViewPairs(DrawnSamples):
+    """Samples of a data set in a published layout.
+
+    dataset: where pictures come from. sampling: frames and paths, for one `paths.MAX90` or `DRIVING`. options: what is
+    made of them. repeats: the set counts as so many times its scenes; scene of index i is i mod the number of scenes.
+
+    Safe in the workers of a loader: give it to `torch.utils.data.DataLoader(pairs, collate_fn=collate)`; where this
+    process has drawn with OpenGL before, with `multiprocessing_context="spawn"`.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset4D,
+        sampling: Sampling,
+        seed: int = 0,
+        options: PictureOptions | None = None,
+        *,
+        repeats: int = 400,
+    ) -> None:
+        if not dataset.scenes:
+            raise DataError("a data set without scenes has no pairs; look at its folder, split and list")
+        super().__init__(seed, repeats * len(dataset.scenes))
+        self.dataset, self.sampling = dataset, sampling
+        self._pictures = pictures_of(dataset, options or PictureOptions())
+
+    def controlled(self, scene: str, control: Control) -> Sample:
+        """The sample of a scene that a control list asks for.
+
+        Raises: DataError, FileFault: it cannot be read; nothing stands in for it.
+        """
+        return self.pair(scene, self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps))
+
+    def pair(self, scene: str, draw: Draw) -> Sample:
+        """A sample drawn elsewhere. Raises DataError, FileFault: it cannot be read."""
+        return self._pictures.make(scene, draw)
+
+    def _made(self, number: int, random: np.random.Generator) -> Sample:
+        scene, _ = self._place(number)
+        return self.pair(scene, self.sampling.draw(random, self.dataset.frames(scene), self.dataset.fps))
+
+    def _place(self, number: int) -> tuple[str, Path]:
+        scene = self.dataset.scenes[number % len(self.dataset.scenes)]
+        return scene, self.dataset.folder(scene)
 
 
 def trained_picture(rgb: Bytes, width: int, height: int) -> Bytes:

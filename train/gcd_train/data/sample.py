@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -12,11 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, pose_trajectory
-from gcd_train.data.files import Skipped, Skips
-from gcd_train.errors import DataError
+from gcd_train.data.files import FileFault, Skipped, Skips
+from gcd_train.data.paths import generator
+from gcd_train.errors import DataError, RecipeError, RenderError, TrainError
 
 Bytes: TypeAlias = NDArray[np.uint8]
+_TRIES, _NAMED = 100, 5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -142,6 +146,58 @@ def to_network(frames: Bytes | Tensor) -> Tensor:
     """Frames as the networks take them: uint8 [T, H, W, 3] -> float32 [T, 3, H, W] in [-1, 1]."""
     rows = frames if isinstance(frames, Tensor) else torch.from_numpy(np.ascontiguousarray(frames))
     return rows.permute(0, 3, 1, 2).float().div_(127.5).sub_(1)
+
+
+class DrawnSamples(ABC):
+    """Samples by number. The same (seed, index) gives the same sample, in any order, in any process.
+
+    A sample that cannot be read is counted in `skips` and replaced by another, at most 100 times.
+    """
+
+    def __init__(self, seed: int, count: int) -> None:
+        self.seed, self._count, self.skips = seed, count, Skips()
+
+    @abstractmethod
+    def _made(self, number: int, random: np.random.Generator) -> Sample:
+        """The sample of a number."""
+
+    @abstractmethod
+    def _place(self, number: int) -> tuple[str, Path]:
+        """Its scene, and the folder or file that is named for a fault that names none."""
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> Sample:
+        """As `sample`, for a loader. Raises IndexError beyond the end."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"{index} is beyond the {len(self)} samples")
+        return self.sample(index)
+
+    def sample(self, index: int, /) -> Sample:
+        """The sample of a number or, where it cannot be read, of the first of a hundred stand-ins that can.
+
+        Raises:
+            DataError: a hundred in a row cannot be read; it names the last faults.
+            RenderError, RecipeError: no other would do better.
+        """
+        skipped: list[Skipped] = []
+        for attempt in range(_TRIES + 1):
+            number = index if attempt == 0 else int(generator(self.seed, index, attempt).integers(len(self)))
+            try:
+                return replace(self._made(number, generator(self.seed, number)), skipped=tuple(skipped))
+            except (RenderError, RecipeError):
+                raise
+            except (TrainError, ModelError, OSError) as error:
+                scene, file = self._place(number)
+                reason = str(error)
+                if isinstance(error, FileFault):
+                    file, reason = error.path, error.reason
+                elif isinstance(error, OSError) and error.filename:
+                    file = Path(str(error.filename))
+                skipped.append(self.skips.add(scene, file, reason))
+        last = "; ".join(map(str, skipped[-_NAMED:]))
+        raise DataError(f"{len(skipped)} samples in a row cannot be read, the last: {last}")
 
 
 class Clips(ABC):

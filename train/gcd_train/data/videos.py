@@ -26,8 +26,7 @@ from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
 from gcd_model.small_files import read_json
 from gcd_train.data.files import MOST_PICTURE, FileFault
 from gcd_train.data.pictures import narrower, seen_through
-from gcd_train.data.sample import Bytes, Sample
-from gcd_train.data.views import DrawnSamples
+from gcd_train.data.sample import Bytes, DrawnSamples, Sample
 from gcd_train.errors import DataError, RecipeError
 
 CAMERA_FILE = "cameras.json"

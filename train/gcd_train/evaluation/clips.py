@@ -19,10 +19,9 @@ from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, to
 from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.files import ZIP_FAULTS
 from gcd_train.data.pairs import PairedClip, PairedClips
-from gcd_train.data.pictures import SAME_POSE, trained_lens, trained_picture
+from gcd_train.data.pictures import SAME_POSE, ViewPairs, trained_lens, trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
 from gcd_train.data.splits import Control
-from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_views
 from gcd_train.evaluation.protocol import ClipControls

@@ -19,9 +19,8 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling
-from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read_scene_list, read_split
-from gcd_train.data.views import ViewPairs
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
 from gcd_train.evaluation.protocol import (

@@ -17,8 +17,7 @@ from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
 from gcd_train.data.files import FileFault
 from gcd_train.data.pictures import narrower, seen_through
-from gcd_train.data.sample import Sample
-from gcd_train.data.views import DrawnSamples
+from gcd_train.data.sample import DrawnSamples, Sample
 from gcd_train.errors import DataError
 from gcd_train.lerobot.folder import (
     CameraCalibration,
