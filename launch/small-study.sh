@@ -56,7 +56,7 @@ for path in gradual direct; do
     --out "$ROOT/study-$path-scratch" "${TRAIN[@]}" --set "model.weights=$PRETRAINED"
 done
 
-METHODS=copy_source,mean_target,ground_homography,reproject_rgbd,vanilla_svd
+METHODS=copy_source,ground_homography,reproject_rgbd,vanilla_svd
 if [ "${HEXPLANE:-yes}" = yes ]; then METHODS=$METHODS,hexplane_1; fi
 BUDGET=(--hexplane-updates "${UPDATES:-200}" --hexplane-rays "${RAYS:-512}")
 MEASURE=(${LPIPS:+--lpips "$LPIPS"} --views last)
@@ -68,7 +68,7 @@ for path in gradual direct; do
       --data "$DATA/test/$path" --out "$ROOT/evaluated/$model" "${MEASURE[@]}"
   done
 done
-gcd_train evaluate --methods "$METHODS" --svd "$PRETRAINED" --train "$DATA/train/gradual" --train-limit 400 \
+gcd_train evaluate --methods "$METHODS" --svd "$PRETRAINED" \
   --data "$DATA/test/gradual" --out "$ROOT/evaluated/baselines" "${BUDGET[@]}" "${MEASURE[@]}"
 
 "$PYTHON" tools/study_findings.py "$ROOT"/evaluated/* --out "$ROOT/findings" ${SMALL:+--small}

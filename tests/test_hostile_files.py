@@ -265,7 +265,7 @@ def driving_calibration(here: Path, plant: Plant) -> list[str]:
 
 NOTE = RunNote(
     command="x", made="x", versions={}, data=(), data_identity="x", kind="orbit", modality="rgb", protocol="pairs",
-    frames=4, height=8, width=8, fps=10.0, seed=0, methods={"copy": {}},
+    frames=4, height=8, width=8, seed=0, methods={"copy": {}},
 )  # fmt: skip
 
 

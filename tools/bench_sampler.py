@@ -8,7 +8,7 @@ way (the first row) and its paired 95 % interval over scenes. `runs` counts eval
 """
 
 import argparse
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
@@ -17,9 +17,9 @@ from gcd_model.clip import SOLVERS
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
-from gcd_train.evaluation.opening import Choice, open_pairs
-from gcd_train.evaluation.predictors import Fixed
-from gcd_train.evaluation.statistics import Selection, bootstrap, difference
+from gcd_train.evaluation.opening import ClipOptions, open_clips
+from gcd_train.evaluation.predictors import Prediction
+from gcd_train.evaluation.statistics import Selection, class_counts, difference, scene_sums
 
 UNGUIDED = (1.0, 1.0)
 HEADS = ["steps", "solver", "guidance", "runs", "latents from Euler", "dB to Euler", "latents from fine", "dB to fine"]
@@ -42,7 +42,7 @@ def main():
     parser.add_argument("--dtype")
     options = parser.parse_args()
     model = load_synthesizer(options.weights, device=options.device, dtype=options.dtype)
-    clips = open_pairs(options.data, Choice(split=options.split, limit=options.limit), None)[0]
+    clips = open_clips(ClipOptions(data=options.data, split=options.split, limit=options.limit), model.traits)[0]
     views = SynthesizedViews.of(model, clips, RenderOptions(seed=options.seed))
     own = sampler_of(model.traits.config.sampling, RenderOptions())
     references = [replace(own, steps=25), replace(own, steps=options.fine, solver="dpmpp_2m")]
@@ -78,6 +78,18 @@ def options_of(way, seed=0):
     )
 
 
+@dataclass
+class Fixed:
+    """What was drawn already."""
+
+    name: str
+    prediction: Prediction
+    privileged: bool = False
+
+    def predict(self, clip):
+        return self.prediction
+
+
 def measure(views, clips, ways, references):
     """Of each way: its distances from both references, means over clips, and its figures against the truth."""
     apart, records = {way: [] for way in ways}, {way: [] for way in ways}
@@ -89,7 +101,8 @@ def measure(views, clips, ways, references):
             apart[way].append([number for each in references for number in distance(drawn[way], drawn[each])])
             shown = Fixed(name=str(way), prediction=views.shown(drawn[way]))
             records[way].append(predicted_and_measured(shown, clip, classes=clips.classes)[1])
-    truth = {way: bootstrap(rows, Selection(), classes=len(clips.classes)) for way, rows in records.items()}
+    count = len(clips.classes)
+    truth = {way: scene_sums(rows, Selection(), class_counts(rows, count)) for way, rows in records.items()}
     return {way: ([mean(column) for column in zip(*apart[way], strict=True)], truth[way]) for way in ways}
 
 
@@ -105,13 +118,13 @@ def show(found, diffusion):
         guidance = "no" if way.guidance == UNGUIDED else "{:g} to {:g}".format(*way.guidance)
         if way.guidance_interval is not None:
             guidance += ", noise {:g} to {:g}".format(*way.guidance_interval)
-        ahead_db, ahead_miou = (difference(truth, own, name) for name in ("psnr_db", "miou"))
+        ahead_db, ahead_miou = (difference(truth, own, name) for name in ("psnr_db", "miou_full"))
         row = [way.steps, way.solver, guidance, Schedule.of(diffusion, options_of(way)).evaluations]
         row += [f"{number:.{digits}f}" for number, digits in zip(apart, (4, 1, 4, 1), strict=True)]
         row += [f"{truth.value('psnr_db'):.2f}", f"{ahead_db.value:.2f} [{ahead_db.low:.2f}, {ahead_db.high:.2f}]"]
         row += [
             f"{truth.value('gradient_energy'):.2f}",
-            f"{truth.value('miou'):.3f}",
+            f"{truth.value('miou_full'):.3f}",
             f"{ahead_miou.value:.3f} [{ahead_miou.low:.3f}, {ahead_miou.high:.3f}]",
         ]
         print("| " + " | ".join(map(str, row)) + " |")

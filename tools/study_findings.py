@@ -11,11 +11,10 @@ count: models of two paths share the last frame alone. Writes findings.md and fi
 import argparse
 from pathlib import Path
 
-from gcd_train.evaluation.comparisons import Difference, differences_csv
 from gcd_train.evaluation.paper import PICTURE_COLUMNS
-from gcd_train.evaluation.runs import Goal, Run, gather
-from gcd_train.evaluation.statistics import Selection, bootstrap, common_clips, difference
-from gcd_train.evaluation.tables import markdown_rows
+from gcd_train.evaluation.runs import Run, gather, targets_apart
+from gcd_train.evaluation.statistics import Selection, common_clips, difference, scene_sums
+from gcd_train.evaluation.tables import Difference, differences_csv, markdown_rows
 
 CLAIMS = [
     ("gradual > direct", "study-gradual-pretrained", "study-direct-pretrained", "last"),
@@ -35,7 +34,6 @@ def main():
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--small", action="store_true", help="of models trained with --small")
-    parser.add_argument("--seed", type=int, default=0, help="of the draws of scenes")
     options = parser.parse_args()
     methods = by_name(gather([Run.read(run) for run in options.runs]))
     rows, notes, found = [], [], []
@@ -47,7 +45,7 @@ def main():
             continue
         ours, theirs, note = shared(methods[first], methods[other], frames)
         notes += [note] if note else []
-        apart = differences(first, other, ours, theirs, frames, options.seed) if ours else []
+        apart = differences(first, other, ours, theirs, frames) if ours else []
         rows += [[*head, *figures(each)] for each in apart] or [[*head, "-", "no clips in common", "-", "-"]]
         found += apart
     table = "\n".join([*markdown_rows(HEADS, rows), *(f"\n{note}" for note in notes)]) + "\n"
@@ -69,7 +67,7 @@ def by_name(sets):
 def shared(first, other, frames):
     """Records of both of the clips that show the same, and which are left out and why."""
     pairs = list(zip(*common_clips(first.records, other.records), strict=True))
-    why = {one.key: Goal.of([one]).apart_from(Goal.of([two]), frames) for one, two in pairs}
+    why = {one.key: targets_apart(one, two, frames) for one, two in pairs}
     same = [pair for pair in pairs if not why[pair[0].key]]
     left_out = [(key, reason) for key, reason in why.items() if reason]
     note = ""
@@ -81,12 +79,11 @@ def shared(first, other, frames):
     return [one for one, _ in same], [two for _, two in same], note
 
 
-def differences(first, other, ours, theirs, frames, seed):
+def differences(first, other, ours, theirs, frames):
     found = []
     for column in PICTURE_COLUMNS:
-        sums = (
-            bootstrap(records, Selection(frames=frames, region=column.region), seed=seed) for records in (ours, theirs)
-        )
+        selection = Selection(frames=frames, region=column.region)
+        sums = (scene_sums(records, selection) for records in (ours, theirs))
         apart = difference(*sums, column.figure)
         if apart.known:
             found.append(

@@ -29,7 +29,7 @@ from gcd_train.data.sample import Sample
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.measure import predicted_and_measured as measured
 from gcd_train.evaluation.predictors import CameraPair, Predictor, pixel_rays
-from gcd_train.evaluation.statistics import Bootstrap, Selection, bootstrap
+from gcd_train.evaluation.statistics import Selection, Sums, class_counts, scene_sums
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World
 
 SKY, ROAD, TERRAIN = 0, 1, 4
@@ -104,7 +104,18 @@ class PlaneClips:
     def write(self, folder: Path, first_seed: int = 0) -> Path:
         """A data folder with these clips in one shard, under seeds from `first_seed` on."""
         folder.mkdir(parents=True, exist_ok=True)
-        world = World(
+        (folder / "world.json").write_bytes(msgspec.json.encode(self.world))
+        with zipfile.ZipFile(folder / f"shard-{first_seed:08d}-{len(self)}.zip", "w") as archive:
+            for number, clip in enumerate(self.clips, start=first_seed):
+                if self.paths:
+                    archive.writestr(f"{number:08d}/scene.json", _told(self.paths[number - first_seed]))
+                for kind, strip in _strips(clip).items():
+                    archive.writestr(f"{number:08d}/{kind}.png", cv2.imencode(".png", strip)[1].tobytes())
+        return folder
+
+    @property
+    def world(self) -> World:
+        return World(
             name="drop" if self.paths else "driving",
             width=self.width,
             height=self.height,
@@ -117,14 +128,6 @@ class PlaneClips:
             camera="orbit" if self.paths else "fixed",
             clips_per_scene=self.clips_per_scene,
         )
-        (folder / "world.json").write_bytes(msgspec.json.encode(world))
-        with zipfile.ZipFile(folder / f"shard-{first_seed:08d}-{len(self)}.zip", "w") as archive:
-            for number, clip in enumerate(self.clips, start=first_seed):
-                if self.paths:
-                    archive.writestr(f"{number:08d}/scene.json", _told(self.paths[number - first_seed]))
-                for kind, strip in _strips(clip).items():
-                    archive.writestr(f"{number:08d}/{kind}.png", cv2.imencode(".png", strip)[1].tobytes())
-        return folder
 
     def __len__(self) -> int:
         return len(self.clips)
@@ -196,14 +199,8 @@ def _strips(clip: PairedClip) -> dict[str, np.ndarray]:
     return {kind: np.ascontiguousarray(np.concatenate(frames)) for kind, frames in strips.items()}
 
 
-def evaluated(
-    predictors: Sequence[Predictor],
-    clips: PlaneClips,
-    *,
-    declared: CameraMount | None = None,
-    selection: Selection | None = None,
-) -> list[Bootstrap]:
+def evaluated(predictors: Sequence[Predictor], clips: PlaneClips, selection: Selection | None = None) -> list[Sums]:
     """Figures of each on these pairs."""
-    pairs = PairedSet(clips=clips, identity="plane", declared=declared)
+    pairs = PairedSet.of(clips, "plane")
     of = [[measured(each, pairs.clip(key), classes=pairs.classes)[1] for key in pairs.keys] for each in predictors]
-    return [bootstrap(records, selection or Selection(), classes=len(pairs.classes)) for records in of]
+    return [scene_sums(records, selection or Selection(), class_counts(records, len(pairs.classes))) for records in of]

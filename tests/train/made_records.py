@@ -47,7 +47,6 @@ def record(
     privileged: bool = False,
     draws: int = 1,
     lpips: float | None = None,
-    grid: Sequence[tuple[int, int, int]] | None = None,
     gradient: Sequence[float] | None = (1.0,) * FRAMES,
     step: Sequence[float] | None = (1.0,) * (FRAMES - 1),
     seconds: float = 1.0,
@@ -68,7 +67,6 @@ def record(
         lpips=None if lpips is None else ((lpips,) * FRAMES,) * draws,
         step=None if step is None else (tuple(step),) * draws,
         step_target=(2.0,) * (FRAMES - 1),
-        grid_confusion=None if grid is None else (tuple(grid),) * FRAMES,
     )
 
 
@@ -95,7 +93,6 @@ def note(
         frames=FRAMES,
         height=32,
         width=48,
-        fps=10.0,
         seed=3,
         classes=tuple(classes),
         methods={name: dict(told) for name, told in (methods or {}).items()},

@@ -2,21 +2,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip
+from driving_plane import STAGE_SOURCE, plane_clip
 
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
 from gcd_train.data.pairs import PairedClip
-from gcd_train.evaluation.predictors import (
-    CameraPair,
-    SourceClip,
-    TargetStatistics,
-    fit_statistics,
-    to_pictures,
-)
-from gcd_train.evaluation.reprojection import GroundHomography
+from gcd_train.evaluation.metrics import NO_CLASS
+from gcd_train.evaluation.predictors import CameraPair, SourceClip, to_pictures
+from gcd_train.evaluation.reprojection import GroundHomography, ground_grid
 
 FRAMES, HEIGHT, WIDTH = 5, 64, 96
-MARK, MARK_CLASS = -1.0, 12
 
 
 def cameras(mount: CameraMount | None = None) -> CameraPair:
@@ -34,12 +28,6 @@ def seen_by(pair: CameraPair, clip: PairedClip) -> SourceClip:
     )
 
 
-def marked_fill() -> TargetStatistics:
-    """A fill no picture holds, so that holes can be told."""
-    mean = torch.full((FRAMES, 3, HEIGHT, WIDTH), MARK)
-    return TargetStatistics(mean=mean, majority=torch.full((FRAMES, HEIGHT, WIDTH), MARK_CLASS, dtype=torch.uint8))
-
-
 def near_ground(clip: PairedClip) -> torch.Tensor:
     """Where the paint is coarse enough for the source picture to hold it, bool [T, H, W]."""
     return torch.from_numpy((clip.target_depth > 0) & (clip.target_depth < 25))
@@ -54,24 +42,17 @@ def agreement(video: torch.Tensor, target: torch.Tensor, seen: torch.Tensor) -> 
 @pytest.mark.parametrize("mount", [CameraMount(), CameraMount(height_m=1.2, tilt_deg=-3.0)])
 def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount: CameraMount) -> None:
     clip = plane_clip(cameras(mount))
-    made = GroundHomography(fill=marked_fill()).predict(seen_by(cameras(mount), clip))
+    made = GroundHomography().predict(seen_by(cameras(mount), clip))
     assert made.video is not None
     assert made.classes is not None
-    seen = (made.video[:, 0] > MARK / 2) & near_ground(clip)
+    there = ground_grid(cameras(mount))[1]
+    assert not made.video[~there[:, None].expand_as(made.video)].any()
+    assert (made.classes[~there] == NO_CLASS).all()
+    seen = there & near_ground(clip)
     share, error = agreement(made.video, to_pictures(clip.target), seen)
     assert share > 0.15
     assert error < 0.03
     assert (made.classes == torch.from_numpy(clip.target_classes))[seen].float().mean() > 0.97
-
-
-def test_the_majority_map_takes_the_commonest_class_of_each_pixel() -> None:
-    clips = PlaneClips.make(3)
-    clips[0].target_classes[1, 5, 7] = clips[2].target_classes[1, 5, 7] = 9
-    clips[1].target_classes[2, 3, 4] = 9
-    usual = clips[0].target_classes[2, 3, 4]
-    majority = fit_statistics(clips).majority
-    assert majority is not None
-    assert (majority[1, 5, 7], majority[2, 3, 4]) == (9, usual)
 
 
 def turned(azimuth_deg: float, elevation_deg: float = 0.0, radius_m: float = 0.0) -> SphericalDelta:
@@ -83,11 +64,10 @@ def test_on_a_plane_that_a_camera_orbits_the_ground_homography_gives_what_rays_d
     path = spherical_trajectory(STAGE_SOURCE, change, frames=FRAMES, move_time=FRAMES - 1)
     pair = CameraPair.orbit(path, hfov_deg=53.13, height=HEIGHT, width=WIDTH)
     clip = plane_clip(pair)
-    fill = TargetStatistics(mean=marked_fill().mean)
-    made = GroundHomography(fill=fill).predict(replace(seen_by(pair, clip), source_classes=None))
+    made = GroundHomography().predict(replace(seen_by(pair, clip), source_classes=None))
     assert made.classes is None
     assert made.video is not None
-    seen = made.video[:, 0] > MARK / 2
-    share, error = agreement(made.video, to_pictures(clip.target), seen & near_ground(clip))
+    seen = ground_grid(pair)[1] & near_ground(clip)
+    share, error = agreement(made.video, to_pictures(clip.target), seen)
     assert share > 0.3
     assert error < 0.03

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import msgspec
 import pytest
@@ -39,7 +40,7 @@ class Counting:
 class SomeDamaged(PairedSet):
     """Pairs of which some cannot be read."""
 
-    damaged: Sequence[str] = ("plane-00000001",)
+    damaged: ClassVar[Sequence[str]] = ("plane-00000001",)
 
     def clip(self, key: str, /) -> HeldOutClip:
         if key in self.damaged:
@@ -52,7 +53,7 @@ class AllDamaged(SomeDamaged):
 
 
 def pairs(count: int = 3, kind: type[PairedSet] = PairedSet) -> PairedSet:
-    return kind(clips=PlaneClips.make(count), identity="plane")
+    return kind.of(PlaneClips.make(count), "plane")
 
 
 def finished(folder: Path, clips: PairedSet, *methods: Predictor, views: KeptViews = "none") -> Account:
@@ -171,15 +172,6 @@ def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> No
     assert records_in(tmp_path) == others
 
 
-def test_rows_of_the_contact_sheet_are_kept_and_drawn_again_only_where_they_lack(tmp_path: Path) -> None:
-    method = Counting()
-    for sheet in (("plane-00000000",), ("plane-00000000", "plane-00000001")) * 2:
-        work = ClipWork(folder=tmp_path, clips=pairs(2), makers={"counting": lambda: method}, sheet=sheet)
-        *_, account = measure_all(work)
-        assert account.failures == {}
-    assert method.met == ["plane-00000000", "plane-00000001", "plane-00000001"]
-
-
 def test_a_run_in_which_nothing_goes_right_gives_up(tmp_path: Path) -> None:
     account = finished(tmp_path, pairs(7, AllDamaged), Counting())
     assert (account.measured, account.done, account.gave_up) == (0, GIVE_UP_AFTER, True)
@@ -228,21 +220,16 @@ def pictures_in(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted((folder / "views").rglob("*.png"))}
 
 
-def test_frames_that_a_finished_run_did_not_keep_are_drawn_again_and_records_stay(tmp_path: Path) -> None:
+def test_a_clip_without_the_frames_that_are_to_be_kept_is_measured_again(tmp_path: Path) -> None:
     finished(tmp_path / "whole", pairs(2), CopySource(), views="all")
-    method = CopySource()
-    finished(tmp_path / "run", pairs(2), method)
-    records = [(tmp_path / "run" / "records" / path).read_bytes() for path in records_in(tmp_path / "run")]
-    wanted: tuple[tuple[KeptViews, int], ...] = (("last", 2), ("all", 2), ("all", 0), ("last", 0), ("none", 0))
+    wanted: tuple[tuple[KeptViews, int], ...] = (("none", 2), ("last", 2), ("few", 2), ("all", 0), ("last", 0))
     for views, count in wanted:
-        account = finished(tmp_path / "run", pairs(2), method, views=views)
-        assert (account.measured, account.drawn, account.there) == (0, count, 2 - count)
+        account = finished(tmp_path / "run", pairs(2), CopySource(), views=views)
+        assert (account.measured, account.there) == (count, 2 - count)
     assert pictures_in(tmp_path / "run") == pictures_in(tmp_path / "whole")
     next((tmp_path / "run" / "views").rglob("sample_0/0001.png")).unlink()
-    account = finished(tmp_path / "run", pairs(2), method, views="all")
-    told = "clips: 0 measured, 1 there already, 1 drawn again for their frames; 0 failures"
-    assert (account.lines(), pictures_in(tmp_path / "run")) == ([told], pictures_in(tmp_path / "whole"))
-    assert records == [(tmp_path / "run" / "records" / path).read_bytes() for path in records_in(tmp_path / "run")]
+    account = finished(tmp_path / "run", pairs(2), CopySource(), views="all")
+    assert (account.measured, pictures_in(tmp_path / "run")) == (1, pictures_in(tmp_path / "whole"))
 
 
 # --- the command ---------------------------------------------------------------------------------------------------
@@ -256,7 +243,7 @@ def test_the_identity_follows_the_pictures_and_not_the_place(tmp_path: Path) -> 
 
 
 def evaluated(folder: Path, *options: str) -> tuple[int, str]:
-    every = ["evaluate", "--data", str(folder / "data"), "--out", str(folder / "run"), "--sheet-clips", "1", *options]
+    every = ["evaluate", "--data", str(folder / "data"), "--out", str(folder / "run"), *options]
     result = CliRunner().invoke(app, every, env={"COLUMNS": "200"})
     return result.exit_code, result.output
 
@@ -267,7 +254,7 @@ def test_the_command_measures_and_goes_on(tmp_path: Path) -> None:
     assert code == 0, said
     assert "IoU of each class" in said
     assert "has 2 of its 40 scenes" in said
-    for file in ("run.json", "report.md", "tables/figures.csv", "contact_sheet.png"):
+    for file in ("run.json", "report.md", "tables/figures.csv", "gallery/sheet.png"):
         assert (tmp_path / "run" / file).is_file()
     told, records = read_run(tmp_path / "run")
     assert (told.protocol, told.kind, told.frames) == ("pairs", "driving", 4)
@@ -332,8 +319,6 @@ def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> N
         (["--methods", "copy_source,hexplane_2"], 78, "hexplane_2 wants 2 cameras, and these clips have the source"),
         (["--no-baselines", "--predictions", "frames"], 78, "NAME=FOLDER"),
         (["--methods", "copy_source", "--privileged", "mine"], 78, "got 'mine'; there are none"),
-        ([], 78, "baselines want training clips"),
-        (["--train", "nowhere"], 66, "nowhere"),
     ],
 )
 def test_the_command_says_what_is_wrong(tmp_path: Path, options: list[str], code: int, words: str) -> None:

@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,12 +12,25 @@ from gcd_model.geometry import CameraMount
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
-from gcd_train.evaluation.predictors import CameraPair, Fixed, Prediction, SourceClip, to_pictures
-from gcd_train.evaluation.statistics import Selection, bootstrap, class_counts, class_iou
+from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, to_pictures
+from gcd_train.evaluation.statistics import Selection, class_counts, class_iou, scene_sums
 from gcd_train.evaluation.store import ClipRecord
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
 KINDS = tuple(SemanticClass(name=f"kind {number}", colour=(number, 0, 0)) for number in range(CLASSES))
+
+
+@dataclass
+class Fixed:
+    """The same of every clip."""
+
+    name: str
+    prediction: Prediction
+    privileged: bool = False
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        del clip
+        return self.prediction
 
 
 def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
@@ -80,7 +93,6 @@ def test_a_method_that_only_names_classes_has_no_picture_figures() -> None:
     region = record.regions["occluded"]
     assert (region.psnr_db, region.ssim, region.diversity, region.gradient, record.step, record.lpips) == (None,) * 6
     assert region.confusion is not None
-    assert record.grid_confusion is not None
     assert len(record.step_target) == FRAMES - 1
 
 
@@ -89,20 +101,17 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
     true = torch.from_numpy(clip.target_classes.copy())
     void, road = int(true[0, 0, 0]), int(true[0, -1, WIDTH // 2])
     said = true.clone()
-    said[:, -2:] = void  # on the ground, the last row of the class grid
+    said[:, -2:] = void  # on the ground
     kinds = [SemanticClass(name="Void", colour=(0, 0, 0)) if i == void else kind for i, kind in enumerate(KINDS)]
     named = Fixed(name="noisy", prediction=Prediction(classes=said))
     record = predicted_and_measured(named, clip, classes=kinds)[1]
-    for counted, rows, shape in (
-        (record.regions["all"].confusion, 2, true[0].shape),
-        (record.grid_confusion, 1, (HEIGHT // 2, WIDTH // 2)),
-    ):
-        assert void not in {label for frame in counted for entry in frame for label in entry[:2]}
-        wrong = [sum(count for _, label, count in frame if label == NO_CLASS) for frame in counted]
-        assert wrong == [rows * shape[1]] * FRAMES
-        assert road in {entry[0] for frame in counted for entry in frame if entry[1] == NO_CLASS}
-    found = bootstrap([record], Selection(), classes=CLASSES)
-    assert math.isnan(class_iou(found.scenes.full[0])[void])
+    counted = record.regions["all"].confusion
+    assert void not in {label for frame in counted for entry in frame for label in entry[:2]}
+    wrong = [sum(count for _, label, count in frame if label == NO_CLASS) for frame in counted]
+    assert wrong == [2 * WIDTH] * FRAMES
+    assert road in {entry[0] for frame in counted for entry in frame if entry[1] == NO_CLASS}
+    found = scene_sums([record], Selection(), class_counts([record], CLASSES))
+    assert math.isnan(class_iou(found.classes[0])[void])
     assert void not in class_counts([record], CLASSES).common
     assert found.value("miou_full") < 1.0
 
@@ -121,3 +130,12 @@ def test_a_view_that_is_no_number_somewhere_is_an_error_not_a_missing_figure() -
     video[1, 0, 3, 3] = torch.nan
     with pytest.raises(NonFiniteError, match="noisy on plane-0"):
         record_of(clip, Prediction(video=video))
+
+
+def test_where_targets_are_class_maps_only_class_maps_count() -> None:
+    clip = held_out()
+    named = Fixed(name="noisy", prediction=drawn(clip, 2))
+    prediction, record = predicted_and_measured(named, clip, classes=KINDS, painted=True)
+    assert (record.regions["all"].psnr_db, record.draws) == (None, 2)
+    assert record.regions["all"].confusion is not None
+    assert [draw.video for draw in prediction.draws] == [None, None]

@@ -13,7 +13,6 @@ from gcd_train.evaluation.metrics import (
     diversity,
     frame_confusions,
     gradient_map,
-    majority_classes,
     masked_psnr,
     mean_iou,
     psnr,
@@ -112,11 +111,6 @@ def test_iou_by_hand_with_an_absent_class() -> None:
     assert iou[:3].tolist() == pytest.approx([1 / 2, 1 / 3, 0.0])
     assert math.isnan(float(iou[3]))
     assert mean_iou(confusion) == pytest.approx((1 / 2 + 1 / 3 + 0) / 3)
-
-
-def test_the_majority_of_each_cell_wins_and_ties_go_to_the_lowest_id() -> None:
-    labels = torch.tensor([[2, 2, 0, 1], [2, 1, 1, 1], [0, 3, 2, 2], [3, 0, 3, 3]], dtype=torch.uint8)
-    assert majority_classes(labels[None], 2, 2, 4).tolist() == [[[2, 1], [0, 2]]]
 
 
 def test_predictions_of_no_class_are_wrong_and_nobodys() -> None:

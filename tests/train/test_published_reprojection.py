@@ -12,9 +12,10 @@ from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings, ClassesAlone, build, described, usual_baselines
+from gcd_train.evaluation.baselines import BaselineSettings, baselines
+from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import CameraPair, SourceClip, fit_statistics
+from gcd_train.evaluation.predictors import CameraPair, SourceClip
 from gcd_train.evaluation.reprojection import ReprojectRgbd, ReprojectSemd, source_views
 from gcd_train.pointcloud import visibility
 
@@ -30,7 +31,6 @@ SEEN = SourceClip(
     fps=10.0,
     key="plane-0",
 )
-SETTINGS = BaselineSettings(frames=FRAMES, height=HEIGHT, width=WIDTH, classes=CLASSES)
 
 
 @cache
@@ -92,45 +92,23 @@ def test_points_of_the_data_sets_own_views_are_drawn_instead_where_there_are_som
     assert (classes(finer) == classes())[both].float().mean() > 0.9
 
 
-def test_a_run_is_told_where_holes_of_class_maps_are_of_no_class() -> None:
-    filled = replace(SETTINGS, statistics=fit_statistics(PlaneClips.make(1)))
-    names = ("copy_source", "ground_homography", "reproject_semd")
-    told = {name: [described(name, each).get("holes") for each in (SETTINGS, filled)] for name in names}
-    nothing = "of no class"
-    assert told == {
-        "copy_source": [None, None],
-        "ground_homography": [nothing, None],
-        "reproject_semd": [nothing, nothing],
-    }
-    assert described("ground_homography", replace(SETTINGS, classes=())) == {
-        "baseline": "ground_homography",
-        "means of": "nothing",
-    }
+def test_the_usual_baselines_are_those_that_the_clips_have_enough_for() -> None:
+    clips = PairedSet.of(PlaneClips.make(1), "plane")
+    every = ["copy_source", "ground_homography", "reproject_rgbd", "reproject_semd"]
 
+    def usual(of: PairedSet) -> list[str]:
+        return [method.name for method in baselines(None, of, BaselineSettings())]
 
-def test_without_training_clips_holes_are_black_and_the_others_are_offered() -> None:
-    assert usual_baselines(SETTINGS) == (
-        "copy_source",
-        "ground_homography",
-        "reproject_rgbd",
-        "reproject_semd",
+    assert usual(clips) == every
+    assert usual(replace(clips, classes=())) == every[:3]
+    assert usual(replace(clips, painted=True)) == [*every[:2], every[3]]
+    for name in ("reproject_rgbd", "hexplane_1"):
+        with pytest.raises(RecipeError, match=f"{name} makes no class maps"):
+            baselines([name], replace(clips, painted=True), BaselineSettings())
+    with pytest.raises(RecipeError, match="reproject_semd wants clips with class maps"):
+        baselines(["reproject_semd"], replace(clips, classes=()), BaselineSettings())
+    (told,) = baselines(["reproject_rgbd"], clips, BaselineSettings(published=True))
+    assert (told.told, told.make()) == (
+        {"baseline": "reproject_rgbd", "published rounding": "yes"},
+        ReprojectRgbd(published=True),
     )
-    made = build("ground_homography", SETTINGS).predict(SEEN)
-    assert made.video is not None
-    assert made.classes is not None
-    assert not made.video[:, :, 0].any()  # the horizon lies lower
-    assert (made.classes[:, 0] == NO_CLASS).all()
-
-
-def test_where_targets_are_class_maps_only_class_maps_count() -> None:
-    painted = replace(SETTINGS, painted=True)
-    assert "reproject_rgbd" not in usual_baselines(painted)
-    copied = build("copy_source", painted)
-    assert isinstance(copied, ClassesAlone)
-    assert (copied.name, copied.privileged) == ("copy_source", False)
-    made = copied.predict(SEEN)
-    assert made.video is None
-    assert made.classes is not None
-    for name in ("reproject_rgbd", "hexplane_2"):
-        with pytest.raises(RecipeError, match=name):
-            build(name, painted)

@@ -3,17 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import msgspec
 import pytest
 from made_records import FRAMES, note, record, region
 
-from gcd_train.evaluation.comparisons import differences
-from gcd_train.evaluation.comparisons import differences_markdown as differences_told
-from gcd_train.evaluation.galleries import caption
-from gcd_train.evaluation.runs import EvaluatedSet, Measured, Run, gather, on_the_same_goals
+from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
 from gcd_train.evaluation.store import ClipRecord
-from gcd_train.evaluation.tables import main_tables, region_table, to_markdown
+from gcd_train.evaluation.tables import differences, differences_markdown, main_tables, region_table, to_markdown
 
 COUNTS = [(0, 0, 9), (1, 0, 1)]
 
@@ -29,11 +25,11 @@ def two(method: str, *, draws: int = 1, classes: bool = False, pictures: bool = 
     return [record(method, f"scn{n:05d}.sample_00", regions=regions, draws=draws) for n in range(2)]  # pyright: ignore[reportArgumentType]
 
 
-def measured(*methods: list[ClipRecord], **told: object) -> Measured:
+def measured(*methods: list[ClipRecord], **told: object) -> EvaluatedSet:
     named = {each[0].method: {"baseline": each[0].method} for each in methods}
     note_ = note(methods=named, **told)  # pyright: ignore[reportArgumentType]
     (found,) = gather([Run(folder=Path("run"), note=note_, records=tuple(r for each in methods for r in each))])
-    return Measured(of=found)
+    return found
 
 
 # --- rows ---------------------------------------------------------------------------------------------------------
@@ -62,7 +58,7 @@ def test_a_mean_iou_from_exact_classes_is_starred_and_the_star_is_explained() ->
     assert cells["copy_source"] == [heading.startswith("mIoU") for heading in table.headings]
     assert not any(cells["majority_map"])
     assert any("made from the source's exact ones" in line for line in table.notes)
-    apart = differences_told(differences(of, of.of.method("majority_map")), of.of)
+    apart = differences_markdown(differences(of, of.method("majority_map")), of)
     assert [cell.strip().endswith("*") for cell in apart.splitlines()[-1].split("|")[2:-1]] == cells["copy_source"][
         :2
     ] + (cells["copy_source"][3:])
@@ -83,17 +79,6 @@ def test_visible_pixels_diversity_and_sharpness_stand_in_a_table() -> None:
     assert values == ["20.00", "30.00", "10.00", "0.500", "0.500", "0.500", "0.0100", "0.50"]
     assert str(table.rows[1].cells[6]) == "-"
     assert "nan" not in to_markdown(table)
-
-
-# --- pictures -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("width", [32, 64, 192])
-@pytest.mark.parametrize("name", ["source", "majority_map_of_many_clips", "plain-small (4 steps)", "W" * 40])
-def test_a_caption_is_no_wider_than_its_picture_and_nothing_of_it_is_lost(name: str, width: int) -> None:
-    lines, scale = caption(name, width)
-    assert all(cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] + 2 <= width for line in lines)
-    assert "".join("".join(lines).split()) == "".join(name.split())
 
 
 # --- sets that end at the same goals --------------------------------------------------------------------------------

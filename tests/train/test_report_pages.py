@@ -13,13 +13,12 @@ from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
-from gcd_train.evaluation.comparisons import differences, worst_clips
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
 from gcd_train.evaluation.plots import all_plots
-from gcd_train.evaluation.report import Choices, make_report
-from gcd_train.evaluation.runs import Measured, Run, gather
+from gcd_train.evaluation.report import make_report
+from gcd_train.evaluation.runs import EvaluatedSet, Run, gather
 from gcd_train.evaluation.store import ClipRecord, RunKeeper, RunNote
-from gcd_train.evaluation.tables import main_tables, to_csv, to_markdown
+from gcd_train.evaluation.tables import differences, main_tables, to_csv, to_markdown
 
 WEIGHTS = {"weights": "0123456789ab", "steps": "4"}
 SCENES = 6
@@ -45,10 +44,10 @@ def run(note_: RunNote, *methods: Sequence[ClipRecord], folder: str = "run") -> 
     return Run(folder=Path(folder), note=note_, records=tuple(each for method in methods for each in method))
 
 
-def measured(*methods: Sequence[ClipRecord], **told: object) -> Measured:
+def measured(*methods: Sequence[ClipRecord], **told: object) -> EvaluatedSet:
     names = {each[0].method: {} if each[0].method in ("copy_source", "oracle") else WEIGHTS for each in methods}
     (found,) = gather([run(note(methods=names, **told), *methods)])  # pyright: ignore[reportArgumentType]
-    return Measured(of=found)
+    return found
 
 
 # --- tables -------------------------------------------------------------------------------------------------------
@@ -68,7 +67,7 @@ def test_a_table_of_the_paper_has_its_rows_and_nobody_is_given_a_printed_figure(
     for name in ("HexPlane", "4D-GS", "DynIBaR", "Vanilla SVD", "ZeroNVS", "Reproject RGB-D"):
         (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
         assert line.count("not run") == 5
-    assert len(ablation.rows) == 8 + 3
+    assert len(ablation.rows) == 8
     direct = next(row for row in lines(to_csv(ablation)) if row["row"] == "GCD (direct, max 90, finetuned)")
     assert (direct["method"], direct["PSNR all"], direct["PSNR all paper"]) == ("not run", "", "17.23")
 
@@ -80,8 +79,7 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
         for each in (*records("gradual-90"), *records("b")):
             first = {"all": region((99.0, *(each.regions["all"].psnr_db or ((),))[0][1:]))}
             keeper.keep(msgspec.structs.replace(each, regions={**each.regions, **first}))
-    choices = Choices(drawn=False, worst=0)
-    text = make_report([tmp_path / "release"], tmp_path / "out", choices).read_text()
+    text = make_report([tmp_path / "release"], tmp_path / "out", drawn=False).read_text()
     assert f"all {FRAMES} frames" in text
     assert text.index("all_frames.csv") < text.index("table4.csv")
     every, table4 = (
@@ -95,7 +93,7 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
     assert float(every["PSNR all"]) == pytest.approx((99.0 + 3 * float(table4["PSNR all"])) / 4, rel=1e-5)
     compared = {row["frames"] for row in lines((tmp_path / "out" / "tables" / "differences.csv").read_text())}
     assert compared == {"all", "2-last", "last"}
-    make_report([tmp_path / "paper"], tmp_path / "other", choices)
+    make_report([tmp_path / "paper"], tmp_path / "other", drawn=False)
     assert not (tmp_path / "other" / "tables" / "all_frames.csv").exists()
 
 
@@ -131,15 +129,6 @@ def test_the_papers_tables_hold_all_it_prints() -> None:
     assert [sum(values) for values in printed] == pytest.approx([277.162, 191.311, 2.751, 203.069, 138.253, 1.189])
 
 
-def test_the_means_that_the_papers_text_tells_follow_from_its_rows() -> None:
-    table = PAPER_TABLES[0]
-    first = {label: row[0] or 0.0 for label, row in table.rows.items()}
-    for gain in table.gains:
-        better = [label for label in first if gain.better in label]
-        apart = [first[label] - first[label.replace(gain.better, gain.worse)] for label in better]
-        assert sum(apart) / len(apart) == pytest.approx(gain.printed, abs=0.0051)
-
-
 # --- differences --------------------------------------------------------------------------------------------------
 
 
@@ -149,11 +138,11 @@ def test_a_claim_is_made_only_where_zero_lies_outside() -> None:
         for number, each in enumerate(records("a"))
     ]
     of = measured(records("a", 1.0), records("b"), noisy)
-    found = {(each.other, each.column.heading): each for each in differences(of, of.of.method("a"))}
+    found = {(each.other, each.column.heading): each for each in differences(of, of.method("a"))}
     assert found["b", "PSNR all"].verdict == "better"
     assert found["b", "PSNR occluded"].verdict == "better"
     assert found["b", "SSIM all"].verdict == "open"
-    back = {(each.other, each.column.heading): each for each in differences(of, of.of.method("b"))}
+    back = {(each.other, each.column.heading): each for each in differences(of, of.method("b"))}
     assert back["a", "PSNR all"].verdict == "worse"
 
 
@@ -199,7 +188,7 @@ def test_last_frames_of_two_ways_to_the_same_goals_are_compared(tmp_path: Path) 
         keeper.begin(note(methods={name: WEIGHTS, "copy_source": {}}, data_identity=name))
         for each in (*records(name, 1.0 - number), *records("copy_source", -number)):
             keeper.keep(each)
-    text = make_report(folders, tmp_path / "out", Choices(drawn=False, worst=0)).read_text()
+    text = make_report(folders, tmp_path / "out", drawn=False).read_text()
     together = text.split("## The last frame together")[1]
     assert "### gradual against the others, last frame" in together
     assert "| direct | **+1.00 [+1.00, +1.00]** better" in together
@@ -217,13 +206,6 @@ def test_error_against_angle_is_of_the_last_frame_and_either_way_round() -> None
     assert [point.x for point in curve.points] == [0.0, 15.0, 30.0, 45.0, 60.0, 75.0]
     assert [point.y.value for point in curve.points] == pytest.approx([18.125 + scene for scene in range(SCENES)])
     assert {point.clips for point in curve.points} == {2}
-
-
-def test_the_worst_clips_are_named_with_who_does_best_there() -> None:
-    of = measured(records("a"), records("b", 1.0), records("c", -1.0))
-    found = worst_clips(of, of.of.method("a"), 2)
-    assert [each.key for each in found] == ["scn00000.sample_00", "scn00000.sample_01"]
-    assert (found[0].value, found[0].occluded, found[0].best, found[0].best_value) == (18.0, 15.0, "b", 19.0)
 
 
 # --- the whole report ---------------------------------------------------------------------------------------------
@@ -251,7 +233,7 @@ def kept(folder: Path, *, views: bool = True) -> Path:
 
 def test_a_report_is_written_from_records_and_kept_frames(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    given = ("report", kept(tmp_path / "run"), "--out", out, "--clips", 2, "--worst", 1)
+    given = ("report", kept(tmp_path / "run"), "--out", out, "--clips", 2)
     done = CliRunner().invoke(app, [str(each) for each in given])
     assert done.exit_code == 0, done.output
     text = (out / "report.md").read_text()
@@ -276,7 +258,7 @@ def test_a_report_is_written_from_records_and_kept_frames(tmp_path: Path) -> Non
 
 def test_a_gallery_has_source_methods_and_target_and_plays(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    make_report([kept(tmp_path / "run")], out, Choices(clips=2, worst=0, drawn=False))
+    make_report([kept(tmp_path / "run")], out, clips=2, drawn=False)
     sheet = cv2.imread(str(out / "gallery" / "sheet.png"))
     assert sheet is not None
     height = 3 * 14 + 4  # of a row: its label's three lines, as these pictures are lower, and a gap

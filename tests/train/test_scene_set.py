@@ -19,24 +19,19 @@ from gcd_model.weights.families import FamilyName
 from gcd_train.cli.main import app
 from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.opening import Choice, SceneCuts, open_scenes, public_split, public_splits
-from gcd_train.evaluation.protocol import (
-    RELEASED_SOURCE,
-    DrawnControls,
-    FrameBounds,
-    ListedControls,
-    released_controls,
-)
+from gcd_train.evaluation.clips import EvaluationSet, SceneSet
+from gcd_train.evaluation.opening import ClipOptions, open_clips, public_split, public_splits
+from gcd_train.evaluation.protocol import RELEASED_SOURCE, SceneControls, released_controls
 from gcd_train.evaluation.store import read_run
 from gcd_train.layouts.manifest import MANIFEST, SceneManifest
 
 SCENES = ("scn02900", "scene_000005")
 VIEWS = tuple(f"view{number}" for number in range(4))
-KUBRIC = SceneCuts(frames=3, height=32, width=48, cameras=VIEWS, bounds=FrameBounds(start=0, skip=1))
-DRIVING = replace(KUBRIC, cameras=("camera0", "yaw-0", "yaw-60"))
-DRAWN = DrawnControls(
-    seed=3, clips=4, frames=FrameSampling(clip=14, strides=(1, 2), latest_start=6), orbit=OrbitSampling()
+DRAWN = ClipOptions(data=(), camera=VIEWS)
+KUBRIC = replace(DRAWN, frame_start=0, frame_skip=1)
+DRIVING = replace(KUBRIC, camera=("camera0", "yaw-0", "yaw-60"))
+PAPER = SceneControls(
+    seed=3, clips=4, sampling=OrbitSampling(frames=FrameSampling(clip=14, strides=(1, 2), latest_start=6))
 )
 
 
@@ -55,8 +50,12 @@ def driving(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def opened(root: Path, cuts: SceneCuts, **choice: object) -> EvaluationSet:
-    return open_scenes(root, Choice(**choice), cuts)[0]  # pyright: ignore[reportArgumentType]
+def opened_and_told(root: Path, options: ClipOptions, **more: object) -> tuple[EvaluationSet, tuple[str, ...]]:
+    return open_clips(replace(options, data=(root,), **more), size=(3, 32, 48))  # pyright: ignore[reportArgumentType]
+
+
+def opened(root: Path, options: ClipOptions, **more: object) -> EvaluationSet:
+    return opened_and_told(root, options, **more)[0]
 
 
 # --- which clips ---------------------------------------------------------------------------------------------------
@@ -65,7 +64,7 @@ def opened(root: Path, cuts: SceneCuts, **choice: object) -> EvaluationSet:
 def test_the_paper_goes_from_one_part_of_a_scene_seen_by_one_low_camera_to_four_goals_in_bounds() -> None:
     sources: set[Spherical] = set()
     for scene in (f"scn{number:05d}" for number in range(2900, 2950)):
-        each = [DRAWN.control(scene, name, 60) for name in DRAWN.names(scene)]
+        each = [PAPER.control(scene, name, 60) for name in PAPER.names(scene)]
         assert len({(one.start, one.frame_start, one.frame_skip) for one in each}) == 1
         start, goals = each[0].start, [one.goal for one in each if one.goal is not None]
         assert start is not None
@@ -83,15 +82,14 @@ def test_the_paper_goes_from_one_part_of_a_scene_seen_by_one_low_camera_to_four_
 
 
 def test_variants_of_one_table_are_measured_at_the_same_goals(kubric: Path) -> None:
-    cuts = replace(KUBRIC, bounds=FrameBounds())
     names: tuple[FamilyName, ...] = ("kubric90", "kubric180")
-    each = [SceneCuts.suiting(traits(name, move_time)) for name in names for move_time in (0, 13)]
-    clips = [
-        opened(kubric, replace(cuts, far=one.far, gradual=one.gradual)).clip("scn02901.sample_02").change
-        for one in each
-    ]
-    assert clips == [clips[0]] * 4
-    assert abs((clips[0] or (999.0,))[0]) <= 90
+    options = replace(KUBRIC, data=(kubric,))
+    each = [open_clips(options, traits(name, move_time))[0] for name in names for move_time in (0, 13)]
+    goals = [one.controls.control("scn02901", "sample_02", 60).goal for one in each if isinstance(one, SceneSet)]
+    assert goals == [goals[0]] * 4
+    assert [one.pairs.sampling.gradual for one in each if isinstance(one, SceneSet)] == [False, True] * 2
+    change = goals[0] - each[0].controls.control("scn02901", "sample_02", 60).start
+    assert abs(change.azimuth_deg) <= 90
 
 
 def traits(family: FamilyName, move_time: int) -> Traits:
@@ -107,9 +105,8 @@ def traits(family: FamilyName, move_time: int) -> Traits:
 
 
 def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
-    control = ListedControls(
-        controls=released_controls(["scn02900"], orbit=True), clips=1, bounds=FrameBounds(skip=4)
-    ).control("scn02900", "sample_00", 60)
+    listed = released_controls(["scn02900"], orbit=True)
+    control = replace(PAPER, listed=listed, clips=1, skip=4).control("scn02900", "sample_00", 60)
     assert control.start == RELEASED_SOURCE
     assert control.goal == Spherical(azimuth_deg=50.0, elevation_deg=25.0, radius_m=15.0)
     assert (control.frame_start, control.frame_skip) == (0, 4)
@@ -125,7 +122,7 @@ def controls(folder: Path, scenes: list[str], samples: int = 3) -> Path:
 
 def test_a_control_list_says_which_clips_there_are_and_who_is_missing_is_told(kubric: Path, tmp_path: Path) -> None:
     listed = controls(tmp_path, ["test/scn02901", "scn02999"])
-    clips, notes = open_scenes(kubric, Choice(), replace(KUBRIC, controls=listed, clips=2, bounds=FrameBounds()))
+    clips, notes = opened_and_told(kubric, DRAWN, controls=listed, trajectories=2)
     assert clips.keys == ("scn02901.sample_00", "scn02901.sample_01")
     assert "scn02900" in "".join(notes)
     clip = clips.clip("scn02901.sample_01")
@@ -134,26 +131,16 @@ def test_a_control_list_says_which_clips_there_are_and_who_is_missing_is_told(ku
 
 
 def test_a_control_list_that_does_not_fit_is_refused_at_once(kubric: Path, driving: Path, tmp_path: Path) -> None:
-    cuts = replace(KUBRIC, bounds=FrameBounds())
     listed = controls(tmp_path, ["scn00001"])
     with pytest.raises(
         DataError, match=r"controls\.json has none of the 2 scenes in .*, first scn02900; give the list"
     ):
-        opened(kubric, replace(cuts, controls=listed))
+        opened(kubric, DRAWN, controls=listed)
     driven = tmp_path / "driven.json"
     driven.write_text(json.dumps({name: {"sample_00": {"frame_start": 0, "frame_skip": 1}} for name in SCENES}))
     with pytest.raises(DataError, match="scn02900, sample_00 has no spherical_start: it is a driving control"):
-        opened(kubric, replace(cuts, controls=driven))
-    assert opened(driving, replace(DRIVING, bounds=FrameBounds(), controls=driven)).keys == ("scene_000005.sample_00",)
-
-
-def test_a_camera_below_the_ground_is_told(kubric: Path, tmp_path: Path) -> None:
-    path = controls(tmp_path, ["scn02900", "scn02901"], samples=1)
-    path.write_text(path.read_text().replace("[50, 40, 14]", "[50, -40, 14]", 1))
-    cuts = replace(KUBRIC, bounds=FrameBounds(), controls=path)
-    (told,) = open_scenes(kubric, Choice(), cuts)[1]
-    assert told.endswith("1 of 2 clips have a camera below the ground, first scn02900, sample_00; see its angles")
-    assert open_scenes(kubric, Choice(), replace(cuts, controls=controls(tmp_path, ["scn02901", "scn02900"])))[1] == ()
+        opened(kubric, DRAWN, controls=driven)
+    assert opened(driving, DRAWN, camera=DRIVING.camera, controls=driven).keys == ("scene_000005.sample_00",)
 
 
 def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Path) -> None:
@@ -163,31 +150,21 @@ def test_cameras_that_no_scene_has_are_refused_at_once(kubric: Path, driving: Pa
         (driving, DRIVING, None),
     ):
         with pytest.raises(DataError, match=r"none of \d scenes can be opened with .*; name those there are"):
-            opened(root, replace(cuts, cameras=names or ("yaw-0", "nope")))
-
-
-def test_rates_follow_the_strides(kubric: Path, tmp_path: Path) -> None:
-    drawn = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="paper"))
-    assert tuple(drawn.rates) == (24.0, 12.0, 8.0, 6.0)
-    released = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), protocol="release"))
-    assert tuple(released.rates) == (12.0,)
-    listed = opened(kubric, replace(KUBRIC, bounds=FrameBounds(), controls=controls(tmp_path, ["scn02900"])))
-    assert tuple(listed.rates) == (24.0,)
-    assert tuple(opened(kubric, replace(KUBRIC, bounds=FrameBounds(skip=3))).rates) == (8.0,)
+            opened(root, cuts, camera=names or ("yaw-0", "nope"))
 
 
 def test_bounds_win_over_controls_in_the_released_protocol_only(kubric: Path, tmp_path: Path) -> None:
-    listed = replace(KUBRIC, controls=controls(tmp_path, ["scn02900"]))
+    listed = controls(tmp_path, ["scn02900"])
     with pytest.raises(RecipeError, match="the paper's protocol takes frames from the controls"):
-        opened(kubric, listed)
-    released = opened(kubric, replace(listed, protocol="release"))
+        opened(kubric, KUBRIC, controls=listed)
+    released = opened(kubric, KUBRIC, controls=listed, protocol="release")
     assert released.keys == ("scn02900.sample_00",)
 
 
 def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
     listed = tmp_path / "test2.txt"
     listed.write_text("# two\ndata/test/scn02901\nkubric/scn02900  # invalid\nscn02950\n")
-    clips, notes = open_scenes(kubric, Choice(listed=listed), KUBRIC)
+    clips, notes = opened_and_told(kubric, KUBRIC, listed=listed)
     assert {key.partition(".")[0] for key in clips.keys} == {"scn02901"}
     assert any("invalid" in line for line in notes)
     assert any("scn02950" in line for line in notes)
@@ -290,7 +267,7 @@ def test_further_cameras_are_given_at_the_clips_size_and_times(kubric: Path) -> 
 
 
 def test_a_driving_clip_has_the_forward_cameras_own_depth_and_classes(driving: Path) -> None:
-    clips = opened(driving, replace(DRIVING, semantic=True))
+    clips = opened(driving, DRIVING, modality="semantic")
     clip = clips.clip("scene_000005.sample_00")
     assert (clips.kind, clips.camera, clip.change) == ("driving", "none", None)
     names = [each.name for each in clips.classes]
@@ -315,7 +292,7 @@ def test_a_driving_clip_has_the_forward_cameras_own_depth_and_classes(driving: P
 def test_the_command_measures_whole_scenes(tmp_path: Path) -> None:
     write_kubric(tmp_path / "data", 2900, frames=15)
     folders = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), "--split", "kubric4d-test20"]
-    cut = ["--trajectories", "1", "--frame-start", "0", "--frame-skip", "1", "--sheet-clips", "0"]
+    cut = ["--trajectories", "1", "--frame-start", "0", "--frame-skip", "1", "--views", "none"]
     cameras = [word for view in VIEWS for word in ("--camera", view)]
     result = CliRunner().invoke(app, ["evaluate", *folders, *cut, *cameras, "--methods", "copy_source"])
     assert result.exit_code == 0, result.output

@@ -36,7 +36,6 @@ def test_an_unknown_family_is_refused_with_the_known_ones() -> None:
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["--declared-height", "0"], 78, "above the ground"),
         (["--no-baselines", "--data", "no[where]"], 66, "no[where]"),
     ],
 )

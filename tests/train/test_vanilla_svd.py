@@ -14,7 +14,8 @@ from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.geometry import CameraMount
 from gcd_train.errors import RecipeError
-from gcd_train.evaluation.baselines import BaselineSettings, VanillaSVD, build, described
+from gcd_train.evaluation.baselines import BaselineSettings, VanillaSVD, baselines
+from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 
 SIZE = (16, 32)
@@ -30,7 +31,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def opened(weights: Path) -> VanillaSVD:
     """With so few steps as show what it does."""
-    return replace(VanillaSVD.open(weights, device="cpu"), size=SIZE, steps=2)
+    return replace(VanillaSVD.open(weights, BaselineSettings(device="cpu")), size=SIZE, steps=2)
 
 
 def seen(frames: int = 4, key: str = "plane-0") -> SourceClip:
@@ -129,20 +130,19 @@ def test_the_network_is_told_what_was_published(told: Told) -> None:
     assert (sampling.steps, sampling.guidance, options.steps, options.guidance) == (25, (1.0, 2.5), None, None)
 
 
-def test_by_its_name_it_is_built_from_the_settings(weights: Path) -> None:
-    settings = BaselineSettings(frames=4, height=32, width=48, device="cpu", samples=2, seed=5)
-    made = build("vanilla_svd", replace(settings, svd=str(weights)))
+def test_by_its_name_it_is_built_from_the_settings_and_told_by_its_weights(opened: VanillaSVD, weights: Path) -> None:
+    clips = PairedSet.of(PlaneClips.make(1), "plane")
+    settings = BaselineSettings(device="cpu", samples=2, seed=5, svd=str(weights))
+    svd, hexplane, copied = baselines(["vanilla_svd", "hexplane_1", "copy_source"], clips, settings)
+    made = svd.make()
     assert isinstance(made, VanillaSVD)
     assert (made.samples, made.seed) == (2, 5)
+    assert svd.told["weights"] == opened.synthesizer.traits.sha256_12
+    assert hexplane.told["updates"] == str(settings.hexplane.updates)
+    assert copied.told == {"baseline": "copy_source"}
+    (drawn,) = baselines(["vanilla_svd"], clips, replace(settings, svd="random:svd"))
+    assert drawn.told["weights"] == "random:svd"
     with pytest.raises(RecipeError, match=r"give the path of svd\.safetensors"):
-        build("vanilla_svd", settings)
+        baselines(["vanilla_svd"], clips, BaselineSettings())
     with pytest.raises(CheckpointError, match="no such file"):
-        build("vanilla_svd", replace(settings, svd="nowhere.safetensors"))
-
-
-def test_a_record_names_the_weights_and_what_a_hexplane_learns(opened: VanillaSVD, weights: Path) -> None:
-    settings = BaselineSettings(frames=4, height=32, width=48, svd=str(weights))
-    assert described("vanilla_svd", settings)["weights"] == opened.synthesizer.traits.sha256_12
-    assert described("vanilla_svd", replace(settings, svd="random:svd"))["weights"] == "random:svd"
-    assert described("hexplane_2", settings)["updates"] == str(settings.hexplane.updates)
-    assert described("copy_source", settings) == {"baseline": "copy_source"}
+        baselines(["vanilla_svd"], clips, BaselineSettings(svd="nowhere.safetensors"))

@@ -1,7 +1,6 @@
 """`gcd-train calibrate`: how far the deviation over samples can be trusted, and the scale that corrects it."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,10 +10,8 @@ from gcd_train.cli.common import errors_shown, progress_bar, say
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
-    from gcd_model import ViewSynthesizer
     from gcd_train.evaluation.calibration import Distances
     from gcd_train.evaluation.clips import EvaluationSet
-    from gcd_train.evaluation.opening import Choice
     from gcd_train.evaluation.predictors import Predictor
 
 
@@ -38,7 +35,7 @@ def calibrate_command(
         from gcd_model import RenderOptions, convert_weights, load_synthesizer
         from gcd_train.evaluation.calibration import CalibrationNote, calibrate, write_calibration
         from gcd_train.evaluation.methods import SynthesizedViews
-        from gcd_train.evaluation.opening import Choice
+        from gcd_train.evaluation.opening import ClipOptions, open_clips
         from gcd_train.evaluation.plots import require_matplotlib
 
         require_matplotlib()  # now, not after an hour
@@ -48,12 +45,13 @@ def calibrate_command(
             raise RecipeError(
                 f"{model.traits.name} states its own spread; gcd_train.live.measure says how well it holds"
             )
-        clips = _clips(data, Choice(split=split, limit=limit), model, seed)
+        clips, notes = open_clips(ClipOptions(data=data, split=split, limit=limit, seed=seed), model.traits)
+        for line in notes:
+            say(line)
         views = SynthesizedViews.of(model, clips, RenderOptions(steps=steps, samples=samples, seed=seed))
         if views.paints_classes:
             raise RecipeError(f"{model.traits.name} paints classes, which have no intervals; calibrate one of colours")
         measured, unreadable = _measured(clips, views)
-        found = calibrate(measured)
         note = CalibrationNote(
             weights=model.traits.name,
             sha256_12=model.traits.sha256_12,
@@ -64,33 +62,19 @@ def calibrate_command(
             samples=samples,
             steps=steps or model.traits.config.sampling.steps,
             seed=seed,
-            found=found,
+            found=calibrate(measured),
         )
         text = write_calibration(note, out)
         if path is not None and store is not None:
-            convert_weights(path, store, uncertainty_scale=found.scale)
+            convert_weights(path, store, uncertainty_scale=note.found.scale)
             say(
-                f"{store} holds the scale {found.scale:.3g}: for {samples} samples in {note.steps} steps, and scenes "
-                "like these; with other --samples it is wrong"
+                f"{store} holds the scale {note.found.scale:.3g}: for {samples} samples in {note.steps} steps, and "
+                "scenes like these; with other --samples it is wrong"
             )
     echo(text)
     if note.warning:
         say(f"warning: {note.warning}")
-    written = f"{out}/calibration.json, calibration.md and reliability.png" + ("" if store is None else f", {store}")
-    say(f"wrote {written}")
-
-
-def _clips(data: Sequence[Path], choice: "Choice", model: "ViewSynthesizer", seed: int) -> "EvaluationSet":
-    """The clips; of whole scenes four each, with goals drawn by the seed as the model was trained."""
-    from gcd_train.evaluation.opening import SceneCuts, data_kind, open_pairs, open_scenes
-
-    if data_kind(data) == "pairs":
-        clips, notes = open_pairs(data, choice, None)
-    else:
-        clips, notes = open_scenes(data[0], choice, replace(SceneCuts.suiting(model.traits), seed=seed, semantic=False))
-    for note in notes:
-        say(note)
-    return clips
+    say(f"wrote {out}/calibration.json, calibration.md and reliability.png")
 
 
 def _weights_file(weights: str, store: Path, steps: int | None) -> Path:

@@ -14,8 +14,8 @@ from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
-from gcd_train.evaluation.plan import EvaluateOptions, planned
-from gcd_train.evaluation.report import Choices, make_report
+from gcd_train.evaluation.plan import EvaluateOptions, planned, run_note
+from gcd_train.evaluation.report import make_report
 from gcd_train.evaluation.store import RunKeeper
 
 _FIELD = HexPlaneSettings()
@@ -29,8 +29,7 @@ Guidance = Annotated[tuple[float, float] | None, Option(help="Of the first and t
 QualityChoice = Annotated[Quality, Option(help="As the weights ship, or in fewer steps where they take many.")]
 Solver = Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")]
 Interval = Annotated[tuple[float, float] | None, Option(help="Noise levels guidance applies at; by default all.")]
-Train = Annotated[list[Path] | None, Option(help="Folder of training pairs: mean target, majority map.")]
-Baselines = Annotated[bool, Option(help="Also measure what has to be beaten; of pairs that needs --train.")]
+Baselines = Annotated[bool, Option(help="Also measure what has to be beaten.")]
 Methods = Annotated[list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")]
 Svd = Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")]
 Predictions = Annotated[list[str] | None, Option(help="NAME=FOLDER with frames of another method; may be repeated.")]
@@ -51,14 +50,10 @@ Modality = Annotated[Literal["rgb", "semantic"] | None, Option(help="Scenes: tar
 Exact = Annotated[bool, Option("--exact", help="Our scenes: targets from their geometry instead of from points.")]
 Camera = Annotated[list[str] | None, Option(help="Scenes: a camera to read; may be repeated. By default all.")]
 Limit = Annotated[int | None, Option(min=1, help="Only the first so many scenes.")]
-TrainLimit = Annotated[int, Option(min=1, help="At most so many training clips for the means.")]
-Height = Annotated[float | None, Option(help="Driving pairs: mount declared, height in metres; by default as trained.")]
-Tilt = Annotated[float | None, Option(help="Driving pairs: mount declared, degrees down; by default as trained.")]
-Views = Annotated[Literal["none", "last", "all"], Option(help="Frames to keep as PNG, for galleries.")]
+Views = Annotated[KeptViews, Option(help="Frames to keep as PNG, for the gallery: few are all of four clips.")]
 Workers = Annotated[int, Option(min=1, help="Processes; where there are several GPUs they take them in turn.")]
 Ray = Annotated[str | None, Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")]
 Seed = Annotated[int, Option(min=0, help="Of drawn clips and of all noise.")]
-SheetClips = Annotated[int, Option(min=0, help="Clips on the contact sheet; 0 for none.")]
 Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")]
 Dtype = Annotated[str | None, Option(help="float32, bfloat16 or float16.")]
 
@@ -73,7 +68,6 @@ def evaluate_command(
     quality: QualityChoice = "exact",
     solver: Solver = None,
     guidance_interval: Interval = None,
-    train: Train = None,
     baselines: Baselines = True,
     methods: Methods = None,
     svd: Svd = None,
@@ -95,14 +89,10 @@ def evaluate_command(
     exact: Exact = False,
     camera: Camera = None,
     limit: Limit = None,
-    train_limit: TrainLimit = 1000,
-    declared_height: Height = None,
-    declared_tilt: Tilt = None,
-    views: Views = "none",
+    views: Views = "few",
     workers: Workers = 1,
     ray: Ray = None,
     seed: Seed = 0,
-    sheet_clips: SheetClips = 4,
     device: Device = "auto",
     dtype: Dtype = None,
 ) -> None:
@@ -111,7 +101,7 @@ def evaluate_command(
     with errors_shown():
         given |= {"weights": _one(weights), "hexplane": HexPlaneSettings(updates=updates, rays=rays)}
         options = EvaluateOptions(**{field.name: given[field.name] for field in fields(EvaluateOptions)})
-        _evaluate(options, out, views=views, workers=workers, ray=ray, sheet_clips=sheet_clips)
+        _evaluate(options, out, views=views, workers=workers, ray=ray)
 
 
 def _one(weights: list[str] | None) -> str | None:
@@ -122,30 +112,24 @@ def _one(weights: list[str] | None) -> str | None:
     return weights[0] if weights else None
 
 
-def _evaluate(
-    options: EvaluateOptions, out: Path, *, views: KeptViews, workers: int, ray: str | None, sheet_clips: int
-) -> None:
+def _evaluate(options: EvaluateOptions, out: Path, *, views: KeptViews, workers: int, ray: str | None) -> None:
     out.mkdir(parents=True, exist_ok=True)  # to know at once
-    plan, keeper = planned(options), RunKeeper(out)
+    plan = planned(options)
     for line in plan.notes:
         say(line)
-    with keeper.in_use(plan.note(command_line())):
-        plan = plan.with_means(progress_bar)
+    with RunKeeper(out).in_use(run_note(plan, options, command_line())):
         work = ClipWork(
             folder=out.resolve(),
             clips=plan.clips,
             makers={method.name: method.make for method in plan.methods},
             lpips=None if options.lpips is None else options.lpips.resolve(),
             views=views,
-            sheet=tuple(plan.clips.keys[:sheet_clips]),
         )
         account = _measured(work, workers, ray, options.device)
     for line in account.lines():
         say(line)
-    report = make_report([out], out, Choices(clips=0, worst=0, drawn=False))
-    shown = plan.write_sheet(out / "contact_sheet.png", work.sheet, keeper)
-    typer.echo(report.read_text())
-    say(f"wrote {out}/run.json, records, report.md, tables" + " and contact_sheet.png" * shown)
+    typer.echo(make_report([out], out, drawn=False).read_text())
+    say(f"wrote {out}/run.json, records, report.md, tables" + " and gallery" * (views != "none"))
     if account.failures:
         raise typer.Exit(TrainError.exit_code)
 

@@ -12,7 +12,7 @@ from gcd_train.errors import RecipeError
 
 def report_command(
     runs: Annotated[list[Path], typer.Argument(help="Folders that `gcd-train evaluate` wrote.", metavar="RUN...")],
-    out: Annotated[Path, typer.Option(help="Folder for report.md, tables/, plots/, gallery/ and worst/.")],
+    out: Annotated[Path, typer.Option(help="Folder for report.md, tables/, plots/ and gallery/.")],
     lead: Annotated[
         list[str] | None, typer.Option(help="Method to compare with all others; by default every model.")
     ] = None,
@@ -20,18 +20,15 @@ def report_command(
         list[str] | None, typer.Option(help="METHOD=ROW: where a method stands in the paper's tables.")
     ] = None,
     clips: Annotated[int, typer.Option(min=0, help="Clips in the gallery.")] = 4,
-    worst: Annotated[int, typer.Option(min=0, help="Worst clips of each compared method.")] = 4,
     plots: Annotated[bool, typer.Option(help="Draw plots; needs matplotlib.")] = True,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draws of scenes that intervals come from.")] = 0,
 ) -> None:
     """Write the paper's tables, or the same for our own clips, from what was measured; nothing is measured again."""
-    from gcd_train.evaluation.report import Choices, make_report  # here: `--help` wants none of it
+    from gcd_train.evaluation.report import make_report  # here: `--help` wants none of it
 
     with errors_shown():
-        choices = Choices(
-            leads=tuple(lead or ()), rows=_rows(row or ()), clips=clips, worst=worst, drawn=plots, seed=seed
+        path = make_report(
+            runs, out, leads=lead or (), rows=_rows(row or ()), clips=clips, drawn=plots, command=command_line()
         )
-        path = make_report(runs, out, choices, command=command_line())
     typer.echo(f"wrote {path}")
 
 

@@ -3,8 +3,9 @@
 import difflib
 import hashlib
 import re
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -23,21 +24,12 @@ from gcd_model import (
     pose_trajectory,
     weights_path,
 )
-from gcd_model.config import SemanticClass
 from gcd_model.diffusion import unit_noise
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.clips import EvaluationSet
 from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
-from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import (
-    CopySource,
-    Fixed,
-    Prediction,
-    Predictor,
-    SourceClip,
-    TargetStatistics,
-    to_pictures,
-)
+from gcd_train.evaluation.predictors import CopySource, Maker, Method, Prediction, SourceClip, to_pictures
 from gcd_train.evaluation.reprojection import (
     REPROJECT_RGBD,
     REPROJECT_SEMD,
@@ -56,52 +48,20 @@ FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BaselineSettings:
-    """What baselines are built from; may be sent to another process.
+    """What baselines are built from.
 
-    frames, height, width: T, H and W of the clips. classes: of the clips, by id; empty for none. painted: the targets
-    are painted in the colours of the classes, and all that counts is class maps.
-    statistics: of training targets; None where there are none, and then holes are black.
     svd: the published weights, for vanilla SVD. device, dtype: see `gcd_model.load_synthesizer`. samples: draws of
     what draws. seed: of all noise. published: points are counted as released, see `SplatOptions`. hexplane: what is
     learnt of each clip.
     """
 
-    frames: int
-    height: int
-    width: int
-    classes: tuple[SemanticClass, ...] = ()
-    painted: bool = False
-    statistics: TargetStatistics | None = None
     svd: str | None = None
     device: str = "auto"
     dtype: str | None = None
     samples: int = 1
     seed: int = 0
     published: bool = False
-    hexplane: HexPlaneSettings = field(default_factory=HexPlaneSettings)
-
-    @property
-    def fill(self) -> TargetStatistics:
-        """What stands in holes: means over training targets, or black and no class."""
-        if self.statistics is not None:
-            return self.statistics
-        black = torch.zeros(self.frames, 3, self.height, self.width)
-        nothing = torch.full((self.frames, self.height, self.width), NO_CLASS, dtype=torch.uint8)
-        return TargetStatistics(mean=black, majority=nothing if self.classes else None)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClassesAlone:
-    """A predictor whose pictures do not count, as the targets are class maps."""
-
-    inner: Predictor
-    name: str
-    privileged: bool
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor."""
-        made = self.inner.predict(clip)
-        return replace(made, video=None, more=tuple(replace(each, video=None) for each in made.more))
+    hexplane: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -182,17 +142,20 @@ class VanillaSVD:
     privileged: bool = False
 
     @classmethod
-    def open(cls, weights: str | Path, *, device: str = "auto", dtype: str | None = None) -> Self:
+    def open(cls, weights: str | Path, settings: BaselineSettings | None = None) -> Self:
         """The published file `svd.safetensors`, its diffusers folder, or our own weights of the same task.
 
-        Args: see `gcd_model.load_synthesizer`; a published file is taken to be SVD, whatever it is called.
+        Args:
+            weights: see `gcd_model.load_synthesizer`; a published file is taken to be SVD, whatever it is called.
         Raises:
             CheckpointError: the file is missing, damaged or of another architecture.
             DataError: it is steered: that is another task.
         """
+        settings = settings or BaselineSettings()
         of_ours = isinstance(weights, str) and weights.startswith(("package:", "random:"))
         family = None if of_ours or inspect_weights(weights).family else "svd"
-        return cls(synthesizer=load_synthesizer(weights, family=family, device=device, dtype=dtype))
+        opened = load_synthesizer(weights, family=family, device=settings.device, dtype=settings.dtype)
+        return cls(synthesizer=opened, samples=settings.samples, seed=settings.seed)
 
     def __post_init__(self) -> None:
         traits = self.synthesizer.traits
@@ -254,85 +217,73 @@ def hexplane_views(name: str) -> int | None:
     return None if found is None else int(found[1])
 
 
-def build(name: str, settings: BaselineSettings) -> Predictor:
-    """A baseline by its name.
+def baselines(names: Sequence[str] | None, clips: EvaluationSet, settings: BaselineSettings) -> tuple[Method, ...]:
+    """Baselines by name; those that need nothing but the clips where none are named.
 
     Raises:
-        RecipeError: there is none of this name, or what it needs is not there.
-        CheckpointError: vanilla SVD's weights cannot be used.
+        RecipeError: there is none of a name, or it lacks what it needs.
+        CheckpointError: vanilla SVD's weights cannot be opened.
     """
+    if names is None:
+        left_out = {REPROJECT_RGBD} if clips.painted else set[str]() if clips.classes else {REPROJECT_SEMD}
+        names = [name for name in _USUAL if name not in left_out]
+    return tuple(_baseline(name, clips, settings) for name in names)
+
+
+def _baseline(name: str, clips: EvaluationSet, settings: BaselineSettings) -> Method:
     views = hexplane_views(name)
-    if name not in _NAMES and not views:
-        every = (*_NAMES, *(f"hexplane_{views}" for views in (1, 2, 4, 8)))  # any other number goes too
+    if clips.painted and (views or name in (REPROJECT_RGBD, VANILLA_SVD)):
+        raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
+    if views:
+        return _hexplane(name, views, clips.cameras, settings)
+    if name == VANILLA_SVD:
+        return _vanilla_svd(settings)
+    if name == REPROJECT_SEMD and not clips.classes:
+        raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
+    makers: dict[str, Maker] = {
+        "copy_source": CopySource,
+        "ground_homography": GroundHomography,
+        REPROJECT_RGBD: partial(ReprojectRgbd, published=settings.published),
+        REPROJECT_SEMD: partial(ReprojectSemd, classes=clips.classes, published=settings.published),
+    }
+    if name not in makers:
+        every = (*makers, VANILLA_SVD, *(f"hexplane_{views}" for views in (1, 2, 4, 8)))  # any other number goes too
         near = difflib.get_close_matches(name, every, n=1)
         meant = f"did you mean {near[0]}? " if near else ""
         raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")
-    if settings.painted and (views or name in _PICTURES_ALONE):
-        raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
-    if views:
-        return HexPlane(views=views, settings=settings.hexplane, seed=settings.seed, device=settings.device)
-    made = _made(name, settings)
-    return ClassesAlone(inner=made, name=made.name, privileged=made.privileged) if settings.painted else made
+    rounded = settings.published and name in (REPROJECT_RGBD, REPROJECT_SEMD)
+    told = {"baseline": name} | ({"published rounding": "yes"} if rounded else {})
+    return Method(name=name, make=makers[name], told=told)
 
 
-def described(name: str, settings: BaselineSettings, trained_on: str = "nothing") -> dict[str, str]:
-    """What a baseline is and works with, for the record of a run: it is the same method wherever this is the same.
-
-    Args:
-        trained_on: identity of the training clips, "nothing" without.
-    Raises: CheckpointError for vanilla SVD's weights.
-    """
-    told, hexplane, svd = {"baseline": name}, hexplane_views(name), name == VANILLA_SVD
-    told |= {"samples": str(settings.samples)} if svd else {}
-    told |= {"seed": str(settings.seed)} if svd or hexplane else {}
-    told |= {"means of": trained_on} if name in _OF_MEANS else {}
-    told |= {"published rounding": "yes"} if settings.published and name in (REPROJECT_RGBD, REPROJECT_SEMD) else {}
-    if svd and settings.svd is not None:  # 12 digits of the digest, or `random:...` as it is
-        of_ours = settings.svd.startswith("random:")
-        told["weights"] = settings.svd if of_ours else inspect_weights(weights_path(settings.svd)).digest[:12]
-    told |= {key: str(value) for key, value in asdict(settings.hexplane).items()} if hexplane else {}
-    filled = settings.statistics is not None and name != REPROJECT_SEMD
-    return told | ({"holes": "of no class"} if settings.classes and name in _WITH_HOLES and not filled else {})
+def _hexplane(name: str, views: int, cameras: int, settings: BaselineSettings) -> Method:
+    if views > cameras:
+        there = f"{cameras - 1} beside the source" if cameras > 1 else "the source alone"
+        raise RecipeError(
+            f"{name} wants {views} cameras, and these clips have {there}; give hexplane_{cameras} or less"
+        )
+    learnt = {key: str(value) for key, value in asdict(settings.hexplane).items()}
+    make = partial(HexPlane, views=views, settings=settings.hexplane, seed=settings.seed, device=settings.device)
+    return Method(name=name, make=make, told={"baseline": name, "seed": str(settings.seed), **learnt})
 
 
-def usual_baselines(settings: BaselineSettings) -> tuple[str, ...]:
-    """Names of those that need nothing but the clips and, for means, training targets."""
-    means = () if settings.statistics is None else ("mean_target", "majority_map")
-    always = ("copy_source", "ground_homography", REPROJECT_RGBD, REPROJECT_SEMD)
-    wanted = {*means, *always}
-    if not settings.classes:
-        wanted -= {"majority_map", REPROJECT_SEMD}
-    if settings.painted:
-        wanted -= set(_PICTURES_ALONE)
-    return tuple(name for name in _NAMES if name in wanted)
+def _vanilla_svd(settings: BaselineSettings) -> Method:
+    """Its weights are opened where they are used; what they are is asked here."""
+    if settings.svd is None:
+        raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
+    kind, _, name = settings.svd.partition(":")
+    if kind == "random":
+        family, weights = name, settings.svd
+    else:
+        inspected = inspect_weights(weights_path(settings.svd))
+        family, weights = inspected.family or "svd", inspected.digest[:12]
+    if family != "svd":
+        raise RecipeError(
+            f"{VANILLA_SVD} wants weights that make a video out of a picture, {settings.svd} is of the family "
+            f"{family}; give svd.safetensors"
+        )
+    told = {"baseline": VANILLA_SVD, "samples": str(settings.samples), "seed": str(settings.seed), "weights": weights}
+    return Method(name=VANILLA_SVD, make=partial(VanillaSVD.open, settings.svd, settings), told=told)
 
 
-def _made(name: str, settings: BaselineSettings) -> Predictor:
-    """Raises RecipeError where what it needs is not there."""
-    classes, trained = settings.classes, settings.statistics
-    if trained is None and name in ("mean_target", "majority_map"):
-        raise RecipeError(f"{name} wants training clips for its means: give --train FOLDER, or leave it out")
-    fill = settings.fill
-    if name in ("majority_map", REPROJECT_SEMD) and not (classes and fill.majority is not None):
-        raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
-    if name == "majority_map":
-        return Fixed(name=name, prediction=Prediction(classes=fill.majority))
-    if name == VANILLA_SVD:
-        if settings.svd is None:
-            raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
-        opened = VanillaSVD.open(settings.svd, device=settings.device, dtype=settings.dtype)
-        return replace(opened, samples=settings.samples, seed=settings.seed)
-    makers: dict[str, Callable[[], Predictor]] = {
-        "copy_source": CopySource,
-        "mean_target": lambda: Fixed(name=name, prediction=Prediction(video=fill.mean)),
-        "ground_homography": lambda: GroundHomography(fill=fill),
-        REPROJECT_RGBD: lambda: ReprojectRgbd(published=settings.published),
-        REPROJECT_SEMD: lambda: ReprojectSemd(classes=classes, published=settings.published),
-    }
-    return makers[name]()
-
-
-_OF_MEANS = ("mean_target", "majority_map", "ground_homography")
-_NAMES = ("copy_source", *_OF_MEANS, REPROJECT_RGBD, REPROJECT_SEMD, VANILLA_SVD)
-_WITH_HOLES = ("ground_homography", REPROJECT_SEMD)
-_PICTURES_ALONE = ("mean_target", REPROJECT_RGBD, VANILLA_SVD)
+_USUAL = ("copy_source", "ground_homography", REPROJECT_RGBD, REPROJECT_SEMD)

@@ -2,12 +2,13 @@
 
 import hashlib
 import zipfile
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal, Protocol, Self, TypeAlias, TypeVar
+from typing import Literal, Self, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -21,10 +22,9 @@ from gcd_train.data.files import ZIP_FAULTS
 from gcd_train.data.pairs import PairedClip, PairedClips
 from gcd_train.data.pictures import SAME_POSE, ViewPairs, trained_lens, trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
-from gcd_train.data.splits import Control
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_views
-from gcd_train.evaluation.protocol import ClipControls
+from gcd_train.evaluation.protocol import SceneControls
 from gcd_train.pointcloud import depth_visibility, render_lens, splat
 
 Number = TypeVar("Number", bound=np.generic)
@@ -52,36 +52,37 @@ class HeldOutClip:
     change: tuple[float, float, float] | None = None
 
 
-class EvaluationSet(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSet(ABC):
     """Clips by key, the same whenever they are asked for, in any process.
 
-    frames, height, width: T, H and W of each clip. camera: "none" for the one path of driving, "spherical" for a path
-    of each clip's own. classes: the ontology, empty for none. rates: frames per second that clips may have, the highest
-    first. identity: digest of what the clips are read from and how they were drawn.
+    frames, height, width: T, H and W of each clip. identity: digest of what the clips are read from and how they were
+    drawn. classes: the ontology, empty for none. painted: targets are painted in the colours of the classes, and all
+    that counts is class maps. cameras: that a method may be given, the source and further ones of the scene.
     """
 
-    @property
-    def frames(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def camera(self) -> CameraControl: ...
-    @property
-    def classes(self) -> Sequence[SemanticClass]: ...
-    @property
-    def keys(self) -> Sequence[str]: ...
-    @property
-    def kind(self) -> SetKind: ...
-    @property
-    def rates(self) -> Sequence[float]: ...
-    @property
-    def identity(self) -> str: ...
+    frames: int
+    height: int
+    width: int
+    kind: SetKind
+    identity: str
+    classes: tuple[SemanticClass, ...] = ()
+    painted: bool = False
+    cameras: int = 1
 
+    @property
+    def camera(self) -> CameraControl:
+        """How a network is told where the target camera goes: driving has one path, others one of each clip's own."""
+        return "none" if self.kind == "driving" else "spherical"
+
+    @property
+    @abstractmethod
+    def keys(self) -> tuple[str, ...]:
+        """Names of the clips, in order."""
+
+    @abstractmethod
     def clip(self, key: str, /) -> HeldOutClip:
         """Raises DataError, naming the file, where it cannot be read; nothing stands in for it."""
-        ...
 
 
 def cameras_of(clips: PairedClips, number: int, declared: CameraMount | None = None) -> CameraPair:
@@ -99,57 +100,48 @@ def names_of(classes: Sequence[SemanticClass]) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairedSet:
+class PairedSet(EvaluationSet):
     """Pairs by name: `driving-01000100`, the world and the clip's number.
 
-    clips: the pairs. declared: mount that methods are told for the source camera of driving clips, None for the true
-    one. identity: see EvaluationSet. picked: where in a pixel its depth was taken, pixels from its middle towards the
-    lower right corner.
+    picked: where in a pixel its depth was taken, pixels from its middle towards the lower right corner.
     """
 
     clips: PairedClips
-    identity: str
-    declared: CameraMount | None = None
     picked: float = 0.0
-    kind: SetKind = field(init=False)
-    camera: CameraControl = field(init=False)
-    classes: Sequence[SemanticClass] = field(init=False)
-    frames: int = field(init=False)
-    height: int = field(init=False)
-    width: int = field(init=False)
-    rates: Sequence[float] = field(init=False)
-    _numbers: dict[str, int] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        for name in ("camera", "classes", "frames", "height", "width"):
-            object.__setattr__(self, name, getattr(self.clips, name))
-        object.__setattr__(self, "kind", "driving" if self.camera == "none" else "orbit")
-        object.__setattr__(self, "rates", (self.clips.fps,))
-        object.__setattr__(self, "_numbers", {key: number for number, key in enumerate(_keys(self.clips))})
 
     @classmethod
-    def of(cls, clips: PairedClips, *, declared: CameraMount | None = None) -> Self:
-        """The set of some clips. Raises DataError if a shard is damaged."""
+    def of(cls, clips: PairedClips, identity: str | None = None) -> Self:
+        """The set of some clips. identity: by default that of their files. Raises DataError if a shard is damaged."""
         oversample = clips.world.oversample
         return cls(
             clips=clips,
-            identity=identity_of(clips, declared),
-            declared=declared,
+            frames=clips.frames,
+            height=clips.height,
+            width=clips.width,
+            kind="driving" if clips.camera == "none" else "orbit",
+            identity=identity_of(clips) if identity is None else identity,
+            classes=tuple(clips.classes),
             picked=(oversample // 2 + 0.5) / oversample - 0.5,
         )
 
-    @property
-    def keys(self) -> Sequence[str]:
-        """Names, in the order of the clips."""
-        return tuple(self._numbers)
+    @cached_property
+    def numbers(self) -> dict[str, int]:
+        """Of all clips by name; what is there again, in another folder, gets a number."""
+        found, times = dict[str, int](), Counter[str]()
+        for number in range(len(self.clips)):
+            key = f"{self.clips.scene(number)[0]}-{self.clips.name(number)}"
+            times[key] += 1
+            found[key if times[key] == 1 else f"{key}.{times[key]}"] = number
+        return found
 
-    def number(self, key: str, /) -> int:
-        """Of the clip with this name, which there must be."""
-        return self._numbers[key]
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """See EvaluationSet."""
+        return tuple(self.numbers)
 
     def clip(self, key: str, /) -> HeldOutClip:
-        """See EvaluationSet."""
-        number = self.number(key)
+        """See EvaluationSet. In driving, methods are told the usual mount, wherever the camera really sits."""
+        number = self.numbers[key]
         clip, classes = self.clips[number], bool(self.classes)
         goal = self.clips.trajectory(number).goal_delta
         world, scene = self.clips.scene(number)
@@ -160,7 +152,7 @@ class PairedSet:
                 source=clip.source,
                 source_depth=clip.source_depth,
                 source_classes=clip.source_classes if classes else None,
-                cameras=cameras_of(self.clips, number, self.declared),
+                cameras=cameras_of(self.clips, number, CameraMount()),
                 fps=self.clips.fps,
                 key=key,
             ),
@@ -205,20 +197,9 @@ def seen_too(clip: PairedClip, cameras: CameraPair, *, picked: float = 0.0) -> N
     return np.stack([depth_visibility(view, depth[t], poses[t], target) for t, view in enumerate(views)])
 
 
-def _keys(clips: PairedClips) -> list[str]:
-    """Names of all clips; what is there again, in another folder, gets a number."""
-    keys, times = list[str](), Counter[str]()
-    for number in range(len(clips)):
-        key = f"{clips.scene(number)[0]}-{clips.name(number)}"
-        times[key] += 1
-        keys.append(key if times[key] == 1 else f"{key}.{times[key]}")
-    return keys
-
-
-def identity_of(clips: PairedClips, declared: CameraMount | None = None) -> str:
-    """Digest of the worlds, of every file of every clip by its checksum, and of what is declared. Raises DataError."""
+def identity_of(clips: PairedClips) -> str:
+    """Digest of the worlds, and of every file of every clip by its checksum. Raises DataError."""
     digest = hashlib.sha256(msgspec.json.encode(clips.worlds))
-    digest.update(repr(declared).encode())
     sums: dict[Path, dict[str, list[int]]] = {}
     for path, name in clips.places:
         if path not in sums:
@@ -240,29 +221,20 @@ def _checksums(shard: Path) -> dict[str, list[int]]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneSet:
+class SceneSet(EvaluationSet):
     """Clips of whole scenes by name: `scn02900.sample_00`, the scene and its control.
 
-    pairs: makes the pictures; it must tell what is visible, and class ids where `classes` are wanted. controls: which
-    clips there are. frames, height, width: T, H and W of the clips. semantic: class maps are wanted. kind, identity:
-    see EvaluationSet.
+    pairs: makes the pictures; it must tell what is visible, and class ids where targets are `painted`. controls: which
+    clips there are.
     """
 
     pairs: ViewPairs
-    controls: ClipControls
-    frames: int
-    height: int
-    width: int
-    kind: SetKind
-    identity: str
-    semantic: bool = False
-    _places: dict[str, tuple[str, str]] = field(init=False, repr=False)
+    controls: SceneControls
 
-    def __post_init__(self) -> None:
-        places = {
-            f"{scene}.{name}": (scene, name) for scene in self.dataset.scenes for name in self.controls.names(scene)
-        }
-        object.__setattr__(self, "_places", places)
+    @cached_property
+    def _places(self) -> dict[str, tuple[str, str]]:
+        scenes = self.dataset.scenes
+        return {f"{scene}.{name}": (scene, name) for scene in scenes for name in self.controls.names(scene)}
 
     @property
     def dataset(self) -> Dataset4D:
@@ -272,29 +244,12 @@ class SceneSet:
     @property
     def ontology(self) -> Ontology | None:
         """Of the data set, where class maps are wanted."""
-        return self.dataset.ontology if self.semantic else None
+        return self.dataset.ontology if self.painted else None
 
     @property
-    def keys(self) -> Sequence[str]:
-        """Names, scene by scene."""
+    def keys(self) -> tuple[str, ...]:
+        """See EvaluationSet; scene by scene."""
         return tuple(self._places)
-
-    @property
-    def rates(self) -> Sequence[float]:
-        """As networks are told them, from the strides of all scenes."""
-        strides = {stride for scene in self.dataset.scenes for stride in self.controls.strides(scene)}
-        each = [Control(name="", frame_start=0, frame_skip=stride) for stride in strides]
-        return sorted({control.fps(self.dataset.fps) for control in each}, reverse=True)
-
-    @property
-    def camera(self) -> CameraControl:
-        """How a network is told where the target camera goes: driving has one path."""
-        return "none" if self.kind == "driving" else "spherical"
-
-    @property
-    def classes(self) -> Sequence[SemanticClass]:
-        """See EvaluationSet."""
-        return self.ontology.classes if self.ontology is not None else ()
 
     def clip(self, key: str, /) -> HeldOutClip:
         """See EvaluationSet. Every picture is made anew from the scene's files."""

@@ -19,13 +19,15 @@ from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.predictors import Prediction, to_labels
 from gcd_train.evaluation.runs import EvaluatedSet, Method
-from gcd_train.evaluation.store import ClipRecord, RunKeeper
+from gcd_train.evaluation.store import RunKeeper
 from gcd_train.files import write_whole
 
 Pictures = NDArray[np.uint8]
 
-KeptViews: TypeAlias = Literal["none", "last", "all"]
-"""Which frames are kept: none, the last of each clip, or all."""
+KeptViews: TypeAlias = Literal["none", "few", "last", "all"]
+"""Which frames are kept: none, all of the first clips, the last of each clip, or all."""
+FEW_CLIPS = 4
+"""Clips that "few" are."""
 
 SHOWN_FRAMES = 6
 """Frames that a row of a sheet has at most."""
@@ -69,36 +71,7 @@ def has_views(folder: Path, which: KeptViews, frames: int) -> bool:
 
 
 def _wanted(which: KeptViews, frames: int) -> range:
-    return {"none": range(0), "last": range(frames - 1, frames), "all": range(frames)}[which]
-
-
-def write_rows(place: Path, prediction: Prediction, classes: Sequence[SemanticClass]) -> None:
-    """Keep what a method has on the contact sheet: `KEY.png` of its pictures, `KEY.classes.png` of its class maps.
-
-    place: of both, without a suffix.
-    """
-    made: dict[str, Pictures] = {}
-    if prediction.classes is not None and classes:
-        made[".classes.png"] = painted(prediction.classes, classes)
-    if prediction.video is not None:
-        made[".png"] = to_bytes(prediction.video)
-    for suffix, frames in made.items():
-        write_whole(Path(f"{place}{suffix}"), png(np.concatenate(list(frames[shown_frames(len(frames))]), axis=1)))
-
-
-def has_rows(place: Path, record: ClipRecord) -> bool:
-    """Whether there is a row at this place of all that a method made."""
-    made = {".png": record.step is not None, ".classes.png": record.grid_confusion is not None}
-    return all(Path(f"{place}{suffix}").exists() for suffix, is_made in made.items() if is_made)
-
-
-def read_row(path: Path, width: int) -> Pictures:
-    """Frames [N, H, W, 3] of a row. Raises RunError if it is damaged."""
-    picture = cv2.imread(str(path))
-    if picture is None or picture.shape[1] % width:
-        raise RunError(f"{path} is damaged; delete it, and run the same line again")
-    rows = np.ascontiguousarray(picture[..., ::-1]).astype(np.uint8)
-    return rows.reshape(len(rows), -1, width, 3).swapaxes(0, 1)
+    return {"none": range(0), "last": range(frames - 1, frames)}.get(which, range(frames))
 
 
 def shown_frames(count: int) -> list[int]:
@@ -128,7 +101,7 @@ def png(picture: Pictures) -> bytes:
 
 _GAP, _MARGIN, _INK = 4, 140, (40, 40, 40)
 _LINE, _LETTERS, _FONT = 14, 20, cv2.FONT_HERSHEY_SIMPLEX
-_SCALE, _SMALL = 0.38, 0.3  # of captions; the small one where the other would be broken
+_SCALE, _LETTER = 0.38, 8  # of captions, and pixels that a letter of theirs takes at most
 HOLD_S = 0.7
 """How long a video shows its last frame."""
 
@@ -157,32 +130,22 @@ def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tupl
 
 
 def strips(methods: Sequence[Method], key: str) -> tuple[Strip, ...]:
-    """Source, each method that kept frames of this clip, target. Raises DataError for a damaged picture."""
-    folders = [_folder(method, key) for method in methods]
-    made = [Strip(name=of.name, frames=_read(at / "sample_0")) for of, at in zip(methods, folders, strict=True)]
-    seen = {side: next(filter(None, (_read(at / side) for at in folders)), {}) for side in ("source", "target")}
-    every = [Strip(name="source", frames=seen["source"]), *made, Strip(name="target", frames=seen["target"])]
-    return tuple(strip for strip in every if strip.frames)
+    """Source, each method that kept frames of this clip, target; class maps beside the pictures they belong to.
 
-
-def contact_rows(
-    clip: HeldOutClip, methods: Sequence[tuple[str, Path]], classes: Sequence[SemanticClass]
-) -> tuple[Strip, ...]:
-    """A clip's rows of the contact sheet: source, each method's picture and class map, the true ones.
-
-    Args:
-        methods: by name, each with the place of its rows, see `write_rows`. classes: the ontology, empty for none.
-    Raises: RunError if a row is damaged.
+    Raises DataError for a damaged picture.
     """
-    shown, width = shown_frames(len(clip.target)), clip.target.shape[2]
-    rows = [("source", clip.seen.source[shown])]
-    for name, place in methods:
-        files = {name: Path(f"{place}.png"), f"{name}: classes": Path(f"{place}.classes.png")}
-        rows += [(kind, read_row(file, width)) for kind, file in files.items() if file.exists()]
-    true = to_labels(clip.target_classes if classes else None)
-    rows += [] if true is None else [("true classes", painted(true[shown], classes))]
-    rows.append(("target", clip.target[shown]))
-    return tuple(Strip.of(kind, frames) for kind, frames in rows)
+    folders = [_folder(method, key) for method in methods]
+    made: list[Strip] = []
+    for method, at in zip(methods, folders, strict=True):
+        made.append(Strip(name=method.name, frames=_read(at / "sample_0")))
+        made.append(Strip(name=f"{method.name}: classes", frames=_read(at / "classes_0")))
+
+    def shared(name: str) -> Strip:
+        frames = next(filter(None, (_read(at / name) for at in folders)), {})
+        return Strip(name=name.replace("target_classes", "true classes"), frames=frames)
+
+    every = [shared("source"), *made, shared("target_classes"), shared("target")]
+    return tuple(strip for strip in every if strip.frames)
 
 
 def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None:
@@ -256,42 +219,15 @@ def _row(label: str, strip: Strip) -> Pictures:
 def beside(rows: Sequence[Strip], moment: int) -> Pictures:
     """All rows' pictures of one moment with their names above, of even size as codecs want it."""
     pictures = [row.frames[moment] for row in rows]
-    captions = [caption(row.name, each.shape[1]) for row, each in zip(rows, pictures, strict=True)]
-    most, named = max(len(lines) for lines, _ in captions), list[Pictures]()
-    for (lines, scale), picture in zip(captions, pictures, strict=True):
+    captions = [wrap(row.name, max(each.shape[1] // _LETTER, 1)) for row, each in zip(rows, pictures, strict=True)]
+    most, named = max(map(len, captions)), list[Pictures]()
+    for lines, picture in zip(captions, pictures, strict=True):
         above = np.full((_LINE * most + _GAP, picture.shape[1], 3), 255, np.uint8)
         for line, words in enumerate(lines, start=1 + most - len(lines)):
-            cv2.putText(above, words, (2, _LINE * line - 1), _FONT, scale, _INK, 1, cv2.LINE_AA)
+            cv2.putText(above, words, (2, _LINE * line - 1), _FONT, _SCALE, _INK, 1, cv2.LINE_AA)
         named.append(np.concatenate([above, picture]))
     height = max(each.shape[0] for each in named)
     panels = [np.pad(each, ((0, height - each.shape[0]), (0, _GAP), (0, 0)), constant_values=255) for each in named]
     whole = np.concatenate(panels, axis=1)
     odd = whole.shape[0] % 2, whole.shape[1] % 2
     return np.pad(whole, ((0, odd[0]), (0, odd[1]), (0, 0)), constant_values=255)
-
-
-def caption(name: str, width: int) -> tuple[tuple[str, ...], float]:
-    """A name over a picture of so many pixels: in one line, else in smaller letters, else broken into lines.
-
-    Returns: the lines, and the scale of their letters.
-    """
-    for scale in (_SCALE, _SMALL):
-        if _width(name, scale) <= width - 2:
-            return (name,), scale
-    return _broken(name, width), _SMALL
-
-
-def _broken(name: str, width: int) -> tuple[str, ...]:
-    """Lines that fit, broken behind a space, underscore or hyphen where there is one; a letter at the least."""
-    lines, rest = list[str](), name
-    while rest:
-        fitting = max([count for count in range(1, len(rest) + 1) if _width(rest[:count], _SMALL) <= width - 2] or [1])
-        ends = [count for count in range(1, fitting + 1) if count == len(rest) or rest[count - 1] in " _-"]
-        taken = ends[-1] if ends else fitting
-        lines.append(rest[:taken].strip())
-        rest = rest[taken:].lstrip()
-    return tuple(lines)
-
-
-def _width(text: str, scale: float) -> int:
-    return cv2.getTextSize(text, _FONT, scale, 1)[0][0] + 2  # the margin before it

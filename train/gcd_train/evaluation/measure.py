@@ -4,15 +4,15 @@ import math
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
 
 import msgspec
+import numpy as np
 import torch
-import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.config import SemanticClass
@@ -20,15 +20,20 @@ from gcd_model.errors import ModelError, NonFiniteError, ShapeError
 from gcd_train.errors import DataError, RunError, TrainError
 from gcd_train.evaluation import metrics
 from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
-from gcd_train.evaluation.galleries import KeptViews, has_rows, has_views, write_rows, write_views
-from gcd_train.evaluation.predictors import Prediction, Predictor, to_labels, to_pictures
+from gcd_train.evaluation.galleries import FEW_CLIPS, KeptViews, has_views, write_views
+from gcd_train.evaluation.predictors import Maker, Prediction, Predictor, to_labels, to_pictures
 from gcd_train.evaluation.statistics import FIRST_MEASURED
 from gcd_train.evaluation.store import ClipRecord, Counted, Frames, Region, RegionRecord, RunKeeper
 from gcd_train.parallel import Outcome, map_items, one_thread_each
 
 
 def predicted_and_measured(
-    predictor: Predictor, clip: HeldOutClip, *, classes: Sequence[SemanticClass], lpips: metrics.Lpips | None = None
+    predictor: Predictor,
+    clip: HeldOutClip,
+    *,
+    classes: Sequence[SemanticClass],
+    painted: bool = False,
+    lpips: metrics.Lpips | None = None,
 ) -> tuple[Prediction, ClipRecord]:
     """What a method makes of a clip, and all figures of that, of every frame from the first on.
 
@@ -36,7 +41,8 @@ def predicted_and_measured(
 
     Args:
         classes: the ontology, empty for none. Those that stand for no class, see `void_ids`, are not counted where they
-            are true, and wrong where they are said. lpips: None for no such figure.
+            are true, and wrong where they are said. painted: targets are painted in the classes' colours, and
+            class maps alone count. lpips: None for no such figure.
     Raises:
         what the method raises; ShapeError: a view is of another size or length than its target, a class id is unknown,
             or the draws of one prediction do not all show the same kinds of things; NonFiniteError: a view holds values
@@ -45,13 +51,11 @@ def predicted_and_measured(
     start = time.perf_counter()
     prediction = predictor.predict(clip.seen)
     seconds = time.perf_counter() - start
+    if painted:
+        first, *more = (replace(draw, video=None, more=()) for draw in prediction.draws)
+        prediction = replace(first, more=tuple(more))
     target, draws = to_pictures(clip.target), _pictures(prediction, f"{predictor.name} on {clip.key}")
-    painted = _Painted.of(clip, prediction, classes)
-    shown = None if draws is None else _Shown.of(draws, target)
-    masks: dict[Region, Tensor | None] = {"all": None}
-    if clip.visible is not None:
-        visible = torch.from_numpy(clip.visible.copy())
-        masks |= {"visible": visible, "occluded": ~visible}
+    labels = _class_maps(clip, prediction, classes)
     return prediction, ClipRecord(
         method=predictor.name,
         privileged=predictor.privileged,
@@ -62,87 +66,60 @@ def predicted_and_measured(
         fps=clip.seen.fps,
         draws=len(prediction.draws),
         seconds=seconds,
-        regions={region: _region(mask, target, shown, painted) for region, mask in masks.items()},
+        regions=_regions(clip.visible, target, draws, labels, len(classes)),
         lpips=None if lpips is None or draws is None else tuple(map(_frames, lpips(draws, target))),
         step=None if draws is None else tuple(tuple(metrics.frame_change(each).tolist()) for each in draws),
         step_target=tuple(metrics.frame_change(target).tolist()),
-        grid_confusion=None if painted is None else _counted(painted.halved().confusion(None)),
     )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Shown:
-    """Pictures that a method made. draws: [S, T, 3, H, W]. likeness: SSIM maps of each draw, [S][T, H-6, W-6].
+def _regions(
+    visible: NDArray[np.bool_] | None,
+    target: Tensor,
+    draws: Tensor | None,
+    labels: tuple[Tensor, Tensor] | None,
+    classes: int,
+) -> dict[Region, RegionRecord]:
+    """Figures on all pixels and, where it is known which are visible, on those and the others.
 
-    detail, target_detail: length of the gradient, [S][T, H, W] and [T, H, W].
+    draws: [S, T, 3, H, W]. labels: see `_class_maps`. classes: how many there are.
     """
-
-    draws: Tensor
-    likeness: tuple[Tensor, ...]
-    detail: tuple[Tensor, ...]
-    target_detail: Tensor
-
-    @classmethod
-    def of(cls, draws: Tensor, target: Tensor) -> "_Shown":
-        return cls(
-            draws=draws,
-            likeness=tuple(metrics.ssim_map(each, target) for each in draws),
-            detail=tuple(map(metrics.gradient_map, draws)),
-            target_detail=metrics.gradient_map(target),
+    likeness = [] if draws is None else [metrics.ssim_map(each, target) for each in draws]  # [S][T, H-6, W-6]
+    detail = [] if draws is None else [metrics.gradient_map(each) for each in draws]
+    target_detail, found = metrics.gradient_map(target), dict[Region, RegionRecord]()
+    masks: dict[Region, Tensor | None] = {"all": None}
+    if visible is not None:
+        seen = torch.from_numpy(visible.copy())
+        masks |= {"visible": seen, "occluded": ~seen}
+    for name, mask in masks.items():
+        share = torch.ones(len(target)) if mask is None else mask.double().mean(dim=(1, 2))
+        found[name] = RegionRecord(
+            pixels=tuple(share.tolist()),
+            gradient_target=_within(target_detail, mask),
+            confusion=None if labels is None else _counted(*labels, classes, mask),
         )
+        if draws is not None:
+            near = [metrics.psnr(d, target) if mask is None else metrics.masked_psnr(d, target, mask) for d in draws]
+            inside = None if mask is None else metrics.window_mask(mask)
+            found[name] = msgspec.structs.replace(
+                found[name],
+                psnr_db=tuple(map(_frames, near)),
+                ssim=tuple(_within(each, inside) for each in likeness),
+                diversity=None if len(draws) < 2 else _frames(metrics.diversity(draws, mask)),
+                gradient=tuple(_within(each, mask) for each in detail),
+            )
+    return found
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Painted:
-    """Class maps: what was said, [S, T, H, W], and what is true, [T, H, W]. classes: how many there are."""
-
-    said: Tensor
-    true: Tensor
-    classes: int
-
-    @classmethod
-    def of(cls, clip: HeldOutClip, prediction: Prediction, classes: Sequence[SemanticClass]) -> "_Painted | None":
-        said = _alike([draw.classes for draw in prediction.draws], "class maps")
-        true, void = to_labels(clip.target_classes), metrics.void_ids([each.name for each in classes])
-        if said is None or true is None or not classes:
-            return None
-        said, true = metrics.without_classes(said.cpu(), void), metrics.without_classes(true, void)
-        return cls(said=said, true=true, classes=len(classes))
-
-    def confusion(self, mask: Tensor | None) -> Tensor:
-        """Of each frame, all draws together: int64 [T, K, K + 1], last what is said to be of no class."""
-        each = [metrics.frame_confusions(said, self.true, self.classes, mask) for said in self.said]
-        return torch.stack(each).sum(dim=0)
-
-    def halved(self) -> "_Painted":
-        """At half the height and width; an odd last row or column is left out."""
-        return _Painted(said=self._coarse(self.said), true=self._coarse(self.true), classes=self.classes)
-
-    def _coarse(self, labels: Tensor) -> Tensor:
-        height, width = labels.shape[-2] // 2, labels.shape[-1] // 2
-        even = labels[..., : 2 * height, : 2 * width]
-        coarse = metrics.majority_classes(even, height, width, self.classes)
-        there = F.max_pool2d((even < self.classes).flatten(end_dim=-3).float(), 2) > 0
-        return torch.where(there.view(coarse.shape), coarse, metrics.NO_CLASS)
-
-
-def _region(mask: Tensor | None, target: Tensor, shown: _Shown | None, painted: _Painted | None) -> RegionRecord:
-    """Figures on some pixels. mask: bool [T, H, W], or None for all."""
-    share = torch.ones(len(target)) if mask is None else mask.double().mean(dim=(1, 2))
-    confusion = None if painted is None else _counted(painted.confusion(mask))
-    found = RegionRecord(pixels=tuple(share.tolist()), confusion=confusion)
-    if shown is None:
-        return found
-    near = (metrics.psnr(d, target) if mask is None else metrics.masked_psnr(d, target, mask) for d in shown.draws)
-    inside = None if mask is None else metrics.window_mask(mask)
-    return msgspec.structs.replace(
-        found,
-        psnr_db=tuple(map(_frames, near)),
-        ssim=tuple(_within(each, inside) for each in shown.likeness),
-        diversity=None if len(shown.draws) < 2 else _frames(metrics.diversity(shown.draws, mask)),
-        gradient=tuple(_within(each, mask) for each in shown.detail),
-        gradient_target=_within(shown.target_detail, mask),
-    )
+def _class_maps(
+    clip: HeldOutClip, prediction: Prediction, classes: Sequence[SemanticClass]
+) -> tuple[Tensor, Tensor] | None:
+    """What was said, [S, T, H, W], and what is true, [T, H, W]; None where one of the two is not there."""
+    said = _alike([draw.classes for draw in prediction.draws], "class maps")
+    true, void = to_labels(clip.target_classes), metrics.void_ids([each.name for each in classes])
+    if said is None or true is None or not classes:
+        return None
+    return metrics.without_classes(said.cpu(), void), metrics.without_classes(true, void)
 
 
 def _within(values: Tensor, mask: Tensor | None) -> Frames:
@@ -169,14 +146,15 @@ def _alike(draws: list[Tensor | None], what: str) -> Tensor | None:
     return torch.stack(made) if made else None
 
 
-def _counted(confusions: Tensor) -> tuple[Counted, ...]:
-    """What occurs in each frame's matrix, [T, K, K + 1]."""
-    classes, frames = confusions.shape[1], list[Counted]()
-    for confusion in confusions:
+def _counted(said: Tensor, true: Tensor, classes: int, mask: Tensor | None) -> tuple[Counted, ...]:
+    """What occurs in each frame, all draws together."""
+    each = [metrics.frame_confusions(draw, true, classes, mask) for draw in said]
+    frames: list[Counted] = []
+    for confusion in torch.stack(each).sum(dim=0):  # [K, K + 1], last what is said to be of no class
         places = confusion.nonzero()
         pixels = confusion[places[:, 0], places[:, 1]].tolist()
         pairs = zip(places.tolist(), pixels, strict=True)
-        frames.append(tuple((true, said if said < classes else metrics.NO_CLASS, n) for (true, said), n in pairs))
+        frames.append(tuple((row, column if column < classes else metrics.NO_CLASS, n) for (row, column), n in pairs))
     return tuple(frames)
 
 
@@ -188,9 +166,6 @@ def _frames(values: Tensor) -> Frames:
 GIVE_UP_AFTER = 5
 """Clips in a row of which nothing could be measured, after which a run stops: something is wrong with all of them."""
 
-Maker: TypeAlias = Callable[[], Predictor]
-"""Makes a method where it is to run. It is sent to other processes: a function of a module, or `partial` of one."""
-
 _MADE: dict[tuple[str, str], Predictor] = {}
 """Methods of this process by run and name: weights are opened once, and those of an earlier run are let go."""
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -198,20 +173,18 @@ _VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipItem:
-    """One clip, the methods that have no record of it yet, and those that only lack frames that are to be kept."""
+    """One clip, and the methods that have no record of it yet, or not the frames that are to be kept."""
 
     key: str
     methods: tuple[str, ...]
-    unseen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipDone:
-    """What became of a clip's methods. drawn: for their frames alone. failed: name to why there is nothing."""
+    """What became of a clip's methods. measured: how many. failed: name to why there is nothing."""
 
-    measured: tuple[ClipRecord, ...]
+    measured: int
     failed: dict[str, str]
-    drawn: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -219,7 +192,7 @@ class ClipWork:
     """Measures methods on one clip and keeps the records; goes to other processes whole.
 
     folder: the run's. makers: of all methods, by name. lpips: folder of the weights, or None. views: frames to keep.
-    sheet: clips of the contact sheet. run: names this run within a process.
+    run: names this run within a process.
     """
 
     folder: Path
@@ -227,49 +200,44 @@ class ClipWork:
     makers: Mapping[str, Maker]
     lpips: Path | None = None
     views: KeptViews = "none"
-    sheet: tuple[str, ...] = ()
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def __call__(self, item: ClipItem) -> ClipDone:
         """Raises: DataError where the clip cannot be read, RunError where nothing can be written."""
-        predictors = {name: self._predictor(name) for name in (*item.methods, *item.unseen)}
-        clip, measured, drawn = self.clips.clip(item.key), list[ClipRecord](), list[str]()
-        keeper, classes, failed = RunKeeper(self.folder), self.clips.classes, dict[str, str]()
+        predictors = {name: self._predictor(name) for name in item.methods}
+        clip, keeper, views = self.clips.clip(item.key), RunKeeper(self.folder), self._views(item.key)
+        classes, painted, failed = self.clips.classes, self.clips.painted, dict[str, str]()
         lpips = None if self.lpips is None else _opened_lpips(self.lpips)
         for name, predictor in predictors.items():
             try:
-                if name in item.methods:
-                    prediction, record = predicted_and_measured(predictor, clip, classes=classes, lpips=lpips)
-                else:
-                    prediction, record = predictor.predict(clip.seen), None
-                write_views(keeper.views(name, clip.key), clip, prediction, self.views, classes)
-                if clip.key in self.sheet:
-                    write_rows(keeper.sheet_rows(name, clip.key), prediction, classes)
-                if record is None:
-                    drawn.append(name)
-                else:  # written last: what has a record is whole
-                    keeper.keep(record)
-                    measured.append(record)
+                prediction, record = predicted_and_measured(
+                    predictor, clip, classes=classes, painted=painted, lpips=lpips
+                )
+                write_views(keeper.views(name, clip.key), clip, prediction, views, classes)
+                keeper.keep(record)  # written last: what has a record is whole
             except RunError:
                 raise
             except (TrainError, ModelError) as error:
                 failed[name] = str(error)
-        return ClipDone(measured=tuple(measured), failed=failed, drawn=tuple(drawn))
+        return ClipDone(measured=len(predictors) - len(failed), failed=failed)
 
     def missing(self) -> list[ClipItem]:
         """Clips with the methods that have no record of them, or not the frames that are to be kept."""
-        keeper, items = RunKeeper(self.folder), list[ClipItem]()
+        keeper, items, frames = RunKeeper(self.folder), list[ClipItem](), self.clips.frames
         for key in self.clips.keys:
-            lacking = tuple(name for name in self.makers if not keeper.has(name, key))
-            others = [name for name in self.makers if name not in lacking]
-            unseen = tuple(name for name in others if not self._has_frames(keeper, name, key))
-            items += [ClipItem(key=key, methods=lacking, unseen=unseen)] if lacking or unseen else []
+            lacking = [
+                name
+                for name in self.makers
+                if not (keeper.has(name, key) and has_views(keeper.views(name, key), self._views(key), frames))
+            ]
+            items += [ClipItem(key=key, methods=tuple(lacking))] if lacking else []
         return items
 
-    def _has_frames(self, keeper: RunKeeper, name: str, key: str) -> bool:
-        if not has_views(keeper.views(name, key), self.views, self.clips.frames):
-            return False
-        return key not in self.sheet or has_rows(keeper.sheet_rows(name, key), keeper.read(name, key))
+    def _views(self, key: str) -> KeptViews:
+        """The frames of a clip that are kept."""
+        if self.views == "few":
+            return "all" if key in self.clips.keys[:FEW_CLIPS] else "none"
+        return self.views
 
     def _predictor(self, name: str) -> Predictor:
         """The method of that name, made once in each process."""
@@ -287,14 +255,13 @@ _opened_lpips = lru_cache(maxsize=1)(metrics.Lpips.open)
 class Account:
     """How far a run is. there: clips that had all their records before, and all frames that are to be kept.
 
-    measured: clips with a new record. drawn: clips of which only frames were lacking, and now are there. failures:
-    clip, or clip and method, to why. gave_up: stopped before its end, see `GIVE_UP_AFTER`.
+    measured: clips with a new record. failures: clip, or clip and method, to why. gave_up: stopped before its end, see
+    `GIVE_UP_AFTER`.
     """
 
     clips: int
     there: int = 0
     measured: int = 0
-    drawn: int = 0
     failures: dict[str, str] = field(default_factory=dict[str, str])
     _tried: int = 0
     _in_a_row: int = 0
@@ -321,16 +288,14 @@ class Account:
             faults = {key: str(error)}
         else:
             faults = {f"{key}, {name}": why for name, why in found.failed.items()}
-            useful = bool(found.measured or found.drawn)
-            self.measured += bool(found.measured)
-            self.drawn += bool(found.drawn and not found.measured)
+            useful = bool(found.measured)
+            self.measured += useful
         self.failures |= faults
         self._in_a_row = self._in_a_row + 1 if faults and not useful else 0
 
     def lines(self) -> list[str]:
         """What to tell at the end: a summary, and one line for each failure."""
-        again = f", {self.drawn} drawn again for their frames" if self.drawn else ""
-        counts = f"clips: {self.measured} measured, {self.there} there already{again}; {len(self.failures)} failures"
+        counts = f"clips: {self.measured} measured, {self.there} there already; {len(self.failures)} failures"
         lines = [counts, *(f"  {what}: {why}" for what, why in self.failures.items())]
         if self.gave_up:
             lines.append(f"  gave up after {GIVE_UP_AFTER} clips in a row without a record; the same line goes on")
@@ -347,7 +312,7 @@ def measure_all(
 ) -> Iterator[Account]:
     """Measure every method on every clip that has no record of it; gives the account after every clip, the same object.
 
-    Where only frames that are to be kept are missing, they are drawn again and the record stays as it is.
+    Where frames that are to be kept are missing, the clip is measured again.
 
     Args:
         workers, ray_address, gpus, environments: see `map_items`.

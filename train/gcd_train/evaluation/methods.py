@@ -1,43 +1,23 @@
-"""What is measured: weights, baselines and saved frames, each by a name, a way to make it anywhere, and what it is."""
+"""What is measured beside baselines: weights, and the frames that other methods saved."""
 
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Self, TypeAlias
 
 import torch
 from torch import Tensor
 
-from gcd_model import (
-    Clip,
-    RenderOptions,
-    Trajectory,
-    View,
-    ViewSynthesizer,
-    inspect_weights,
-    load_synthesizer,
-    sampler_of,
-    weights_path,
-)
+from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, load_synthesizer, sampler_of
 from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.baselines import (
-    VANILLA_SVD,
-    BaselineSettings,
-    build,
-    described,
-    hexplane_views,
-    usual_baselines,
-)
 from gcd_train.evaluation.clips import EvaluationSet, names_of
-from gcd_train.evaluation.measure import Maker
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import CameraPair, Prediction, Predictor, SavedFrames, SourceClip
+from gcd_train.evaluation.predictors import CameraPair, Method, Prediction, Predictor, SavedFrames, SourceClip
 from gcd_train.evaluation.store import FRAMES_IN
 
 _SAME_PATH_M = 1e-3
@@ -161,15 +141,6 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
         raise DataError(f"{traits.name} has classes {names_of(traits.classes)}, the clips {names_of(clips.classes)}")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Method:
-    """One row of a table. make: the method itself, in any process. told: what it is, for `run.json`."""
-
-    name: str
-    make: Maker
-    told: dict[str, str]
-
-
 OpenedWeights: TypeAlias = Callable[[], ViewSynthesizer]
 """Gives a model, opened once in each process: `partial` of `open_weights`. Raises CheckpointError."""
 
@@ -195,32 +166,6 @@ def of_weights(
     return tuple(_of_weights(weights, clips, replace(options, steps=number)) for number in (None, *others))
 
 
-def of_baselines(
-    names: Sequence[str] | None, settings: BaselineSettings, *, trained_on: str, others: int
-) -> tuple[Method, ...]:
-    """Baselines by name; those that need nothing but the data where none are named.
-
-    Args:
-        trained_on: identity of the training clips, "nothing" without. others: cameras beside the source.
-    Raises:
-        RecipeError: there is none of a name, or it lacks what it needs.
-    """
-    chosen = usual_baselines(settings) if names is None else names
-    for name in chosen:
-        if (hexplane_views(name) or 0) > others + 1:
-            there = f"{others} beside the source" if others else "the source alone"
-            raise RecipeError(
-                f"{name} wants {hexplane_views(name)} cameras, and these clips have {there}; give "
-                f"hexplane_{others + 1} or less"
-            )
-        if name == VANILLA_SVD and settings.svd is not None:  # weights are opened where they are used
-            _require_image_to_video(settings.svd)
-        else:
-            build(name, settings)  # to refuse at once
-    told = {name: described(name, settings, trained_on) for name in chosen}
-    return tuple(Method(name=name, make=partial(build, name, settings), told=told[name]) for name in chosen)
-
-
 def of_saved_frames(
     named: Sequence[str], painted: Sequence[SemanticClass], *, privileged: Sequence[str] = ()
 ) -> tuple[Method, ...]:
@@ -242,27 +187,6 @@ def of_saved_frames(
             f"there are {', '.join(names) or 'none'}"
         )
     return methods
-
-
-def _require_image_to_video(weights: str) -> None:
-    """Raises RecipeError for weights that say they do something else; CheckpointError if they cannot be opened."""
-    kind, _, name = weights.partition(":")
-    family = name if kind == "random" else inspect_weights(weights_path(weights)).family or "svd"
-    if family != "svd":
-        raise RecipeError(
-            f"{VANILLA_SVD} wants weights that make a video out of a picture, {weights} is of the family {family}; "
-            "give svd.safetensors"
-        )
-
-
-def require_names_apart(methods: Sequence[Method]) -> None:
-    """Raises RecipeError where two methods have one name."""
-    names = sorted(method.name for method in methods)
-    for first, second in pairwise(names):
-        if first == second:
-            raise RecipeError(
-                f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
-            )
 
 
 def _of_weights(weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions) -> Method:

@@ -154,26 +154,6 @@ def without_classes(labels: Tensor, void: Sequence[int]) -> Tensor:
     return labels.masked_fill(torch.isin(labels, torch.tensor(void, dtype=labels.dtype)), NO_CLASS)
 
 
-def majority_classes(classes: Tensor, height: int, width: int, count: int) -> Tensor:
-    """Class maps at a coarser grid: the commonest class of each cell, the lowest id where two are as common.
-
-    Args:
-        classes: uint8 [..., H, W], ids below `count`. height, width: of the grid; they divide H and W.
-    Returns:
-        uint8 [..., height, width]; 0 where none of the classes is in a cell.
-    """
-    *leading, rows, columns = classes.shape
-    if rows % height or columns % width:
-        raise ShapeError(f"a grid must divide the class map: wanted {height}x{width} from {rows}x{columns}")
-    flat = classes.reshape(-1, rows, columns)
-    there = torch.bincount(flat.flatten(), minlength=count)[:count] > 0
-    there[0] = True  # what a cell becomes that none of the classes is in
-    labels = there.nonzero()[:, 0]
-    cell = (rows // height, columns // width)
-    shares = torch.stack([F.avg_pool2d((flat == label).float(), cell) for label in labels.tolist()])
-    return labels[shares.argmax(dim=0)].to(torch.uint8).reshape(*leading, height, width)
-
-
 def confusion_matrix(predicted: Tensor, target: Tensor, count: int) -> Tensor:
     """Pixels of each target class (rows) by predicted class (columns): int64 [count, count].
 

@@ -2,17 +2,15 @@
 
 import difflib
 import hashlib
+import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
-import msgspec
-
 from gcd_model import Traits
-from gcd_model.geometry import CameraMount
 from gcd_model.small_files import read_small
 from gcd_train.data.files import Skips
 from gcd_train.data.kubric4d import Kubric4D
@@ -24,29 +22,46 @@ from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
 from gcd_train.evaluation.protocol import (
-    AS_PLANNED,
-    SAMPLES,
-    ClipControls,
-    DrawnControls,
-    FrameBounds,
-    ListedControls,
     ProtocolName,
+    SceneControls,
     controlled,
-    orbit_notes,
     released_controls,
     require_cameras,
+    require_orbits,
     scene_number,
 )
 from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.layouts.manifest import MANIFEST, read_manifest
 
+DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
+"""What a folder holds."""
+Size: TypeAlias = tuple[int, int, int]
+"""T, H and W of clips."""
 
-class _World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One file of `splits_public`. parts: name to runs of scenes, each the first seed and how many."""
+_PARTS: dict[str, Part] = {part: part for part in get_args(Part)}
+_OF_SCENES = ("controls", "trajectories", "frame_start", "frame_skip", "angles", "path", "modality", "exact", "camera")
+_SMALL_BYTES = 4 << 20
 
-    about: str
-    world: str
-    parts: dict[str, tuple[tuple[int, int], ...]]
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClipOptions:
+    """Which clips are measured: one field for each of these options of `gcd-train evaluate`. None: left out."""
+
+    data: Sequence[Path]
+    split: str | None = None
+    listed: Path | None = None
+    limit: int | None = None
+    protocol: ProtocolName = "paper"
+    controls: Path | None = None
+    trajectories: int | None = None
+    frame_start: int | None = None
+    frame_skip: int | None = None
+    angles: Literal["max90", "max180"] | None = None
+    path: Literal["gradual", "direct"] | None = None
+    modality: Literal["rgb", "semantic"] | None = None
+    exact: bool = False
+    camera: Sequence[str] | None = None
+    seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,15 +80,15 @@ class PublicSplit:
 
 
 def public_splits() -> dict[str, PublicSplit]:
-    """All there are by name, such as `driving-test`."""
+    """All there are by name, such as `driving-test`; from `splits_public`."""
     found: dict[str, PublicSplit] = {}
     for file in (files("gcd_train") / "splits_public").iterdir():
         if file.name.endswith(".json"):
-            told = msgspec.json.decode(file.read_bytes(), type=_World)
-            for part, runs in told.parts.items():
+            told = json.loads(file.read_bytes())
+            for part, runs in told["parts"].items():  # each run: the first seed, and how many
                 name = f"{file.name.removesuffix('.json')}-{part}"
                 each = tuple(range(first, first + count) for first, count in runs)
-                found[name] = PublicSplit(name=name, world=told.world, runs=each)
+                found[name] = PublicSplit(name=name, world=told["world"], runs=each)
     return dict(sorted(found.items()))
 
 
@@ -87,22 +102,7 @@ def public_split(name: str) -> PublicSplit:
     return every[name]
 
 
-_PARTS: dict[str, Part] = {part: part for part in get_args(Part)}
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Choice:
-    """Which scenes of a folder. split: a public one's name, or a split file with `:train`, `:val` or `:test` after it.
-
-    listed: a file with a scene a line. limit: only the first so many.
-    """
-
-    split: str | None = None
-    listed: Path | None = None
-    limit: int | None = None
-
-
-def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Skips) -> tuple[str, ...]:
+def wanted_scenes(folder: Path, there: Sequence[str], options: ClipOptions, notes: Skips) -> tuple[str, ...]:
     """Whole scenes of a folder that are chosen, whatever the limit. notes: gets what is missing.
 
     Args:
@@ -111,17 +111,17 @@ def wanted_scenes(folder: Path, there: Sequence[str], choice: Choice, notes: Ski
         RecipeError: a list and a split, or no such split. DataError: a list cannot be read, or the split is of another
             world than the scenes.
     """
-    if choice.listed is not None and choice.split is not None:
+    if options.listed is not None and options.split is not None:
         raise RecipeError("give --list or --split, not both")
-    if choice.listed is not None:
-        return present(read_scene_list(choice.listed, notes), there, notes, choice.listed)
-    if choice.split is None:
+    if options.listed is not None:
+        return present(read_scene_list(options.listed, notes), there, notes, options.listed)
+    if options.split is None:
         return tuple(there)
-    place, _, part = choice.split.rpartition(":")
-    file = Path(place if part in _PARTS and place else choice.split)
+    place, _, part = options.split.rpartition(":")
+    file = Path(place if part in _PARTS and place else options.split)
     if file.is_file():
         return present(read_split(file, _PARTS.get(part, "test")), there, notes, file)
-    split = public_split(choice.split)
+    split = public_split(options.split)
     scenes = tuple(scene for scene in there if scene_number(scene) in split)
     for scene in scenes or there[:1]:
         if (folder / scene / MANIFEST).is_file():
@@ -144,52 +144,6 @@ def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
         notes.add(split.name, "--data", f"has {len(there)} of its {len(split)} scenes")
 
 
-DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
-"""What a folder holds."""
-
-_SMALL_BYTES = 4 << 20
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneCuts:
-    """How clips are cut from whole scenes.
-
-    controls: a control list, None for the protocol's own. clips: of each scene, None for the protocol's number.
-    bounds: first frame and stride of the command line. far: up to 180 degrees of azimuth and 60 of elevation, not 90
-    and 30. gradual: the camera moves through the clip; otherwise it is at the goal from the first frame on.
-    semantic: targets are painted in the colours of their classes. exact: drawn from the geometry of our own scenes.
-    cameras: that a scene must have, None for the published ones. frames, height, width: T, H and W.
-    """
-
-    protocol: ProtocolName = "paper"
-    controls: Path | None = None
-    clips: int | None = None
-    seed: int = 0
-    bounds: FrameBounds = AS_PLANNED
-    far: bool = False
-    gradual: bool = True
-    semantic: bool = False
-    exact: bool = False
-    cameras: tuple[str, ...] | None = None
-    frames: int = CLIP
-    height: int = 256
-    width: int = 384
-
-    @classmethod
-    def suiting(cls, model: Traits | None) -> "SceneCuts":
-        """As the weights were trained; the usual ones without weights."""
-        if model is None:
-            return cls()
-        family, config = model.family, model.config
-        return cls(
-            gradual=model.move_time > 0,
-            semantic=family is not None and family.output == "semantic",
-            frames=config.frames,
-            height=config.height,
-            width=config.width,
-        )
-
-
 def data_kind(folders: Sequence[Path]) -> DataKind:
     """What the folders hold. Raises DataError for nothing that is known, or several folders of scenes."""
     try:
@@ -207,130 +161,137 @@ def data_kind(folders: Sequence[Path]) -> DataKind:
     return found
 
 
-def usual_samples(folders: Sequence[Path], protocol: ProtocolName) -> int:
-    """Draws of each view by default. Raises DataError as `data_kind`."""
-    return 1 if data_kind(folders) == "pairs" else SAMPLES[protocol]
-
-
-def open_pairs(
-    folders: Sequence[Path], choice: Choice, mount: CameraMount | None
+def open_clips(
+    options: ClipOptions, model: Traits | None = None, *, size: Size = (CLIP, 256, 384)
 ) -> tuple[EvaluationSet, tuple[str, ...]]:
-    """Pairs of the folders; and what of the split is not there, line by line.
+    """The clips; and what of a split or list is not there, line by line.
 
     Args:
-        mount: what everybody is told of the source camera of driving clips; None for the usual one.
+        model: clips of whole scenes are of its size, path and modality where the options say nothing. size: of those
+            without a model.
     Raises:
-        DataError: see `PairedClips.open`; or the split is of another world. RecipeError: a list, no such split, or a
-            mount where there is no vehicle.
+        DataError: data cannot be read, are of another world than the split, or no clip is left; or a list or a control
+            list cannot be read. RecipeError: options that contradict each other or the data, or no such split.
     """
-    if choice.listed is not None:
+    if data_kind(options.data) == "pairs":
+        return _open_pairs(options)
+    return _open_scenes(options, model, size)
+
+
+def _open_pairs(options: ClipOptions) -> tuple[EvaluationSet, tuple[str, ...]]:
+    if options.listed is not None:
         raise RecipeError("--list names whole scenes, and these are pairs; give --split NAME, or leave it out")
-    clips = PairedClips.open([folder.resolve() for folder in folders])  # processes may stand elsewhere
+    if any(getattr(options, name) for name in _OF_SCENES) or options.frame_start == 0 or options.protocol != "paper":
+        raise RecipeError(
+            "these are pairs, cut when they were made: leave out --protocol, --"
+            + ", --".join(name.replace("_", "-") for name in _OF_SCENES)
+        )
+    clips = PairedClips.open([folder.resolve() for folder in options.data])  # processes may stand elsewhere
     notes, wanted = Skips(logged=False), None
-    if choice.split is not None:
-        split, scenes = public_split(choice.split), {clips.scene(number) for number in range(len(clips))}
+    if options.split is not None:
+        split, scenes = public_split(options.split), {clips.scene(number) for number in range(len(clips))}
         worlds = sorted({world for world, _ in scenes})
         if split.world not in worlds:
             raise _of_another_world(split, f"these pairs are of {', '.join(worlds) or 'none'}")
         wanted = {(world, seed) for world, seed in scenes if world == split.world and seed in split}
         _note_missing(split, {seed for _, seed in wanted}, notes)
-    if clips.camera != "none" and mount is not None:
-        raise RecipeError("these clips have no vehicle to mount a camera on: leave out --declared-height and -tilt")
-    declared = mount or CameraMount() if clips.camera == "none" else None
-    some = chosen(clips, scenes=wanted, limit=choice.limit)
-    return PairedSet.of(some, declared=declared), tuple(notes.lines())
+    return PairedSet.of(chosen(clips, scenes=wanted, limit=options.limit)), tuple(notes.lines())
 
 
-def open_scenes(folder: Path, choice: Choice, cuts: SceneCuts) -> tuple[EvaluationSet, tuple[str, ...]]:
-    """Whole scenes, in either layout; and what of the list is not there or is odd, line by line.
-
-    Raises:
-        DataError: no scene is left, or a list or a control list cannot be read. RecipeError: options that contradict
-            each other, or no such split.
-    """
-    folder = folder.resolve()  # processes may stand elsewhere
+def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tuple[EvaluationSet, tuple[str, ...]]:
+    """Whole scenes, in either layout."""
+    folder = options.data[0].resolve()  # processes may stand elsewhere
     orbits, notes = data_kind([folder]) == "kubric4d", Skips(logged=False)
-    whole = _dataset(folder, cuts, orbits=orbits)
-    controls = _controls(cuts, whole.scenes, orbits=orbits)
-    scenes = wanted_scenes(folder, whole.scenes, choice, notes)
-    scenes = controlled(scenes, controls, cuts.controls, folder, notes)[: choice.limit]
+    painted, gradual, released = options.modality == "semantic", options.path != "direct", options.protocol == "release"
+    if model is not None:
+        size = (model.config.frames, model.config.height, model.config.width)
+        painted = painted or (
+            options.modality is None and model.family is not None and model.family.output == "semantic"
+        )
+        gradual = gradual and (options.path is not None or model.move_time > 0)
+    whole = _dataset(folder, options, orbits=orbits, painted=painted)
+    sampling = _sampling(options, size[0], orbits=orbits, gradual=gradual)
+    controls = _controls(options, whole.scenes, sampling)
+    scenes = wanted_scenes(folder, whole.scenes, options, notes)
+    scenes = controlled(scenes, controls, options.controls, folder, notes)[: options.limit]
+    if orbits and options.controls is not None and controls.listed is not None:
+        require_orbits(controls.listed, scenes, options.controls)
     data = whole.only(scenes)
-    odd: tuple[str, ...] = ()
-    if orbits and cuts.controls is not None and isinstance(controls, ListedControls):
-        odd = orbit_notes(controls, scenes, cuts.controls)
     require_cameras(data)
-    pairs = ViewPairs(
-        data,
-        _sampling(cuts, orbits=orbits),
-        cuts.seed,
-        PictureOptions(
-            size=(cuts.width, cuts.height),
-            modality="classes" if cuts.semantic else "rgb",
-            class_ids=cuts.semantic,
-            visible=True,
-            exact=cuts.exact,
-            published=cuts.protocol == "release",
-        ),
+    pictures = PictureOptions(
+        size=(size[2], size[1]),
+        modality="classes" if painted else "rgb",
+        class_ids=painted,
+        visible=True,
+        exact=options.exact,
+        published=released,
     )
+    drawn = (controls.clips, controls.seed, controls.start, controls.skip)
+    cuts = (options.protocol, data.cameras, sampling, pictures, drawn)
     clips = SceneSet(
-        pairs=pairs,
+        pairs=ViewPairs(data, sampling, options.seed, pictures),
         controls=controls,
-        frames=cuts.frames,
-        height=cuts.height,
-        width=cuts.width,
+        frames=size[0],
+        height=size[1],
+        width=size[2],
         kind="kubric" if orbits else "driving",
-        identity=_identity(folder, scenes, cuts),
-        semantic=cuts.semantic,
+        identity=_identity(folder, scenes, cuts, options.controls),
+        classes=tuple(data.ontology.classes) if painted and data.ontology is not None else (),
+        painted=painted,
+        cameras=len(data.cameras),
     )
-    return clips, (*notes.lines(), *odd)
+    return clips, tuple(notes.lines())
 
 
-def _dataset(folder: Path, cuts: SceneCuts, *, orbits: bool) -> Kubric4D | ParallelDomain4D:
+def _dataset(folder: Path, options: ClipOptions, *, orbits: bool, painted: bool) -> Kubric4D | ParallelDomain4D:
     names = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
+    cameras = tuple(options.camera or names)
     if not orbits:
-        return ParallelDomain4D.open(folder, cameras=cuts.cameras or names, classes=cuts.semantic)
-    if cuts.semantic:
+        return ParallelDomain4D.open(folder, cameras=cameras, classes=painted)
+    if painted:
         raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
-    return Kubric4D.open(folder, cameras=cuts.cameras or names, published=cuts.protocol == "release")
+    return Kubric4D.open(folder, cameras=cameras, published=options.protocol == "release")
 
 
-def _controls(cuts: SceneCuts, scenes: Sequence[str], *, orbits: bool) -> ClipControls:
-    clips = cuts.clips or (4 if cuts.protocol == "paper" and orbits else 1)
-    if cuts.controls is not None:
-        if cuts.protocol == "paper" and cuts.bounds != AS_PLANNED:
+def _controls(options: ClipOptions, scenes: Sequence[str], sampling: OrbitSampling | DrivingSampling) -> SceneControls:
+    orbits, bound, listed = isinstance(sampling, OrbitSampling), (options.frame_start, options.frame_skip), None
+    if options.controls is not None:
+        if options.protocol == "paper" and bound != (None, None):
             raise RecipeError(
                 "the paper's protocol takes frames from the controls; leave out --frame-start and --frame-skip, or "
                 "give --protocol release"
             )
-        return ListedControls(controls=read_controls(cuts.controls), clips=clips, bounds=cuts.bounds)
-    if cuts.protocol == "release":
-        return ListedControls(controls=released_controls(scenes, orbit=orbits), clips=clips, bounds=cuts.bounds)
-    sampling = _sampling(cuts, orbits=orbits)
-    orbit = sampling if isinstance(sampling, OrbitSampling) else None
-    return DrawnControls(seed=cuts.seed, clips=clips, frames=sampling.frames, orbit=orbit, bounds=cuts.bounds)
-
-
-def _sampling(cuts: SceneCuts, *, orbits: bool) -> OrbitSampling | DrivingSampling:
-    """How goals, first frames and strides are drawn."""
-    usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
-    frames = FrameSampling(clip=cuts.frames, strides=usual.strides, latest_start=usual.latest_start)
-    move_time = None if cuts.gradual else 0
-    if not orbits:
-        return DrivingSampling(move_time=move_time, frames=frames)
-    azimuth_deg, elevation_deg = (180.0, 60.0) if cuts.far else (90.0, 30.0)
-    return OrbitSampling(
-        max_azimuth_deg=azimuth_deg,
-        max_elevation_deg=elevation_deg,
-        move_time=None if cuts.gradual else 0,
-        frames=frames,
+        listed = read_controls(options.controls)
+    elif options.protocol == "release":
+        listed = released_controls(scenes, orbit=orbits)
+    return SceneControls(
+        clips=options.trajectories or (4 if options.protocol == "paper" and orbits else 1),
+        sampling=sampling,
+        seed=options.seed,
+        listed=listed,
+        start=options.frame_start,
+        skip=options.frame_skip,
     )
 
 
-def _identity(folder: Path, scenes: Sequence[str], cuts: SceneCuts) -> str:
+def _sampling(options: ClipOptions, clip: int, *, orbits: bool, gradual: bool) -> OrbitSampling | DrivingSampling:
+    """How goals, first frames and strides are drawn. clip: T."""
+    usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
+    frames = FrameSampling(clip=clip, strides=usual.strides, latest_start=usual.latest_start)
+    move_time = None if gradual else 0
+    if not orbits:
+        return DrivingSampling(move_time=move_time, frames=frames)
+    azimuth_deg, elevation_deg = (180.0, 60.0) if options.angles == "max180" else (90.0, 30.0)
+    return OrbitSampling(
+        max_azimuth_deg=azimuth_deg, max_elevation_deg=elevation_deg, move_time=move_time, frames=frames
+    )
+
+
+def _identity(folder: Path, scenes: Sequence[str], cuts: Sequence[object], controls: Path | None) -> str:
     """Of the scenes by name and files, and how clips are cut."""
-    digest = hashlib.sha256(msgspec.json.encode(replace(cuts, controls=None), order="sorted"))
-    if cuts.controls is not None:
-        digest.update(read_small(cuts.controls, MOST_BYTES).encode())
+    digest = hashlib.sha256(repr(cuts).encode())
+    if controls is not None:
+        digest.update(read_small(controls, MOST_BYTES).encode())
     for scene in scenes:
         digest.update(scene.encode() + fingerprint(folder / scene))
     return digest.hexdigest()[:12]

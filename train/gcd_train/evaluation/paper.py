@@ -24,26 +24,14 @@ class Column:
     @property
     def of_classes(self) -> bool:
         """Whether it tells how good class maps are, not pictures."""
-        return self.figure in ("miou", "miou_full", "miou_common", "accuracy")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Gain:
-    """What the paper's text says of a table: how much better one half of the variants is than the other, in the mean.
-
-    better, worse: words that tell the two rows of a pair apart. printed: difference of the first column.
-    """
-
-    better: str
-    worse: str
-    printed: float
+        return self.figure in ("miou_full", "miou_common")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PaperTable:
     """One table of the paper. name: of its file. kind, modality: of the runs it is for. frames: that it is over.
 
-    rows: label, as it stands there, to the printed figures by column, None for none. gains: of its rows, in the text.
+    rows: label, as it stands there, to the printed figures by column, None for none.
     """
 
     name: str
@@ -53,7 +41,6 @@ class PaperTable:
     frames: Span
     columns: tuple[Column, ...]
     rows: Mapping[str, tuple[float | None, ...]]
-    gains: tuple[Gain, ...] = ()
 
 
 PICTURE_COLUMNS = (
@@ -87,11 +74,6 @@ PAPER_TABLES = (
             "GCD (gradual, max 90, finetuned)": (17.88, 0.521, 0.486, 17.33, 0.514),
             "GCD (gradual, max 180, finetuned)": (17.81, 0.521, 0.488, 17.20, 0.515),
         },
-        gains=(
-            Gain(better="gradual", worse="direct", printed=1.17),
-            Gain(better="max 90", worse="max 180", printed=0.55),
-            Gain(better="finetuned", worse="scratch", printed=1.34),
-        ),
     ),
     PaperTable(
         name="table2",

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gcd_train.errors import RenderError
-from gcd_train.evaluation.runs import Measured, Method
-from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval, Selection, bootstrap
+from gcd_train.evaluation.runs import EvaluatedSet, Method
+from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval, Selection
 from gcd_train.evaluation.store import ClipRecord, Region
 from gcd_train.evaluation.tables import Cell, csv_text
 from gcd_train.files import write_whole
@@ -95,24 +95,24 @@ class Plot:
     counted: bool = False
 
 
-def all_plots(measured: Measured) -> tuple[Plot, ...]:
+def all_plots(of: EvaluatedSet) -> tuple[Plot, ...]:
     """All that the records are enough for."""
-    made = (error_by_angle(measured), ssim_by_views(measured), psnr_by_frame(measured))
+    made = (error_by_angle(of), ssim_by_views(of), psnr_by_frame(of))
     return tuple(plot for plot in made if plot.curves)
 
 
-def error_by_angle(measured: Measured) -> Plot:
+def error_by_angle(of: EvaluatedSet) -> Plot:
     """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; no curve on one path for all.
 
     Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
     """
     curves, last = list[Curve](), Selection(frames="last")
-    for method in measured.of.methods:
+    for method in of.methods:
         turned = [(record, abs(record.change[0])) for record in method.records if record.change is not None]
         groups: dict[float, list[ClipRecord]] = {}
         for (record, _), place in zip(turned, angle_bins([angle for _, angle in turned]), strict=True):
             groups.setdefault(place, []).append(record)
-        sums = {place: bootstrap(groups[place], last, seed=measured.seed) for place in sorted(groups)}
+        sums = {place: of.sums(method, last, groups[place]) for place in sorted(groups)}
         points = [Point(x=x, y=each.interval("psnr_db"), clips=len(groups[x])) for x, each in sums.items()]
         curves.append(Curve.of(method.name, points))
     return Plot(
@@ -124,14 +124,14 @@ def error_by_angle(measured: Measured) -> Plot:
     )
 
 
-def psnr_by_frame(measured: Measured) -> Plot:
+def psnr_by_frame(of: EvaluatedSet) -> Plot:
     """PSNR of each frame from the second on, all pixels; mIoU where there are only class maps."""
-    pictures = [method for method in measured.of.methods if method.makes_pictures]
+    pictures = [method for method in of.methods if method.makes_pictures]
     name: FigureName = "psnr_db" if pictures else "miou_common"
-    frames = range(FIRST_MEASURED + 1, measured.of.note.frames + 1)
+    frames = range(FIRST_MEASURED + 1, of.note.frames + 1)
     curves = [
-        Curve.of(method.name, (_point(measured, method, Selection(frames=frame), name, frame) for frame in frames))
-        for method in pictures or measured.of.methods
+        Curve.of(method.name, (_point(of, method, Selection(frames=frame), name, frame) for frame in frames))
+        for method in pictures or of.methods
     ]
     return Plot(
         name="by_frame",
@@ -143,24 +143,24 @@ def psnr_by_frame(measured: Measured) -> Plot:
     )
 
 
-def ssim_by_views(measured: Measured) -> Plot:
+def ssim_by_views(of: EvaluatedSet) -> Plot:
     """SSIM over the number of views that HexPlane is given; every other method as a level. No curve without HexPlane.
 
     Source: GCD, section 5: how many input views a reconstruction needs to come near.
     """
-    found = {method.name: _HEXPLANE.search(method.name) for method in measured.of.methods}
+    found = {method.name: _HEXPLANE.search(method.name) for method in of.methods}
     views = sorted((int(match[1]), name) for name, match in found.items() if match)
     regions: tuple[Region, ...] = ("all", "occluded")
     curves = [
         Curve.of(
             f"HexPlane, {region}",
-            (_point(measured, measured.of.method(name), Selection(region=region), "ssim", x) for x, name in views),
+            (_point(of, of.method(name), Selection(region=region), "ssim", x) for x, name in views),
         )
         for region in regions
     ]
     levels = [
-        Curve(name=f"{method.name}, all", points=(_point(measured, method, Selection(), "ssim", 0.0),))
-        for method in measured.of.methods
+        Curve(name=f"{method.name}, all", points=(_point(of, method, Selection(), "ssim", 0.0),))
+        for method in of.methods
         if not found[method.name] and method.makes_pictures
     ]
     return Plot(
@@ -174,8 +174,8 @@ def ssim_by_views(measured: Measured) -> Plot:
     )
 
 
-def _point(measured: Measured, method: Method, selection: Selection, name: FigureName, x: float) -> Point:
-    return Point(x=x, y=measured.sums(method, selection).interval(name), clips=len(method.records))
+def _point(of: EvaluatedSet, method: Method, selection: Selection, name: FigureName, x: float) -> Point:
+    return Point(x=x, y=of.sums(method, selection).interval(name), clips=len(method.records))
 
 
 def curves_csv(plot: Plot) -> str:

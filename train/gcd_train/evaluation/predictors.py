@@ -1,10 +1,10 @@
-"""What is measured: a clip in, its target view out; and the predictors that copy, average or read saved frames."""
+"""What is measured: a clip in, its target view out; and the predictors that copy or read saved frames."""
 
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeAlias
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from gcd_model.colours import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
 from gcd_train.data.files import FileFault, read_colour
-from gcd_train.data.sample import Bytes, Clips, SceneView
+from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.errors import DataError
 from gcd_train.pointcloud.project import tangents
 
@@ -149,6 +149,19 @@ class Predictor(Protocol):
     def predict(self, clip: SourceClip) -> Prediction: ...
 
 
+Maker: TypeAlias = Callable[[], Predictor]
+"""Makes a method where it is to run. It is sent to other processes: a function of a module, or `partial` of one."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Method:
+    """One row of a table. make: the method itself, in any process. told: what it is, for `run.json`."""
+
+    name: str
+    make: Maker
+    told: dict[str, str]
+
+
 def to_pictures(frames: Bytes) -> Tensor:
     """uint8 [T, H, W, 3] -> float32 [T, 3, H, W] in [0, 1]."""
     return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255.0
@@ -157,43 +170,6 @@ def to_pictures(frames: Bytes) -> Tensor:
 def to_labels(classes: Bytes | None) -> Tensor | None:
     """A class map as a tensor, uint8 [T, H, W]; None for none."""
     return None if classes is None else torch.from_numpy(np.ascontiguousarray(classes))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class TargetStatistics:
-    """Means over training targets, by pixel and frame number.
-
-    mean: float32 [T, 3, H, W] in [0, 1]. majority: uint8 [T, H, W], the commonest class of each pixel; None where the
-    world has no ontology.
-    """
-
-    mean: Tensor
-    majority: Tensor | None = None
-
-
-def fit_statistics(clips: Clips, *, progress: Callable[[int, int], None] | None = None) -> TargetStatistics:
-    """Mean picture and majority class of training targets.
-
-    Args:
-        clips: of one size and length, at least one.
-        progress: called with (clips done, clips).
-    Raises:
-        DataError: there are no clips.
-    """
-    if len(clips) == 0:
-        raise DataError("mean target and majority map want training clips, got an empty folder; generate some first")
-    first = clips.sample(0).target
-    total = to_pictures(first).double().zero_()  # [T, 3, H, W]
-    votes = [np.zeros(first.shape[:3], dtype=np.int32) for _ in clips.classes]  # K times [T, H, W]
-    for index in range(len(clips)):
-        sample = clips.sample(index)
-        total += to_pictures(sample.target)
-        for label, count in enumerate(votes):
-            count += sample.target_classes == label
-        if progress is not None:
-            progress(index + 1, len(clips))
-    majority = torch.from_numpy(np.stack(votes).argmax(axis=0).astype(np.uint8)) if votes else None
-    return TargetStatistics(mean=(total / len(clips)).float(), majority=majority)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -206,20 +182,6 @@ class CopySource:
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. The class map is the source's exact one."""
         return Prediction(video=to_pictures(clip.source), classes=to_labels(clip.source_classes))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Fixed:
-    """The same of every clip: the mean training target, or the commonest class of each pixel."""
-
-    name: str
-    prediction: Prediction
-    privileged: bool = False
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor."""
-        del clip
-        return self.prediction
 
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp")

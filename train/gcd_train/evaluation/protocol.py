@@ -9,14 +9,14 @@ Release: the first clip of each scene's controls, or the script's own angles; fr
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from gcd_model.geometry import Spherical, SphericalDelta
 from gcd_train.data.dataset4d import Dataset4D
 from gcd_train.data.files import Skips
-from gcd_train.data.paths import FrameSampling, OrbitSampling, generator
+from gcd_train.data.paths import DrivingSampling, OrbitSampling, generator
 from gcd_train.data.splits import Control, Controls
 from gcd_train.errors import DataError
 from gcd_train.layouts import kubric4d, parallel_domain4d
@@ -33,111 +33,52 @@ SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2}
 """Draws of each clip of a scene; of pairs, which no protocol cuts, there is one."""
 
 
-class ClipControls(Protocol):
-    """Which clips are cut from each scene; the same for a scene whatever others there are."""
-
-    def names(self, scene: str, /) -> Sequence[str]:
-        """Of the clips of a scene, in order: `sample_00`."""
-        ...
-
-    def control(self, scene: str, name: str, frames: int, /) -> Control:
-        """One of them, for a scene of so many time steps. Raises DataError if the scene is too short."""
-        ...
-
-    def strides(self, scene: str, /) -> Sequence[int]:
-        """That clips of a scene may have."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
-class FrameBounds:
-    """First frame and stride of every clip, from the command line; None for those of the protocol."""
+class SceneControls:
+    """Which clips are cut from each scene; the same for a scene whatever others there are.
 
+    clips: of each scene, at most. sampling: how they are drawn, from the seed and the scene's number; those of an orbit
+    have one source and the same frames, and differ in the goal. listed: clips by scene, instead of drawn ones. start,
+    skip: first frame and stride of every clip, whatever is listed or drawn; None for those.
+    """
+
+    clips: int
+    sampling: OrbitSampling | DrivingSampling
+    seed: int = 0
+    listed: Controls | None = None
     start: int | None = None
     skip: int | None = None
 
-    def of(self, control: Control) -> Control:
-        """The control with these."""
-        return replace(
-            control,
-            frame_start=control.frame_start if self.start is None else self.start,
-            frame_skip=control.frame_skip if self.skip is None else self.skip,
-        )
-
-
-AS_PLANNED = FrameBounds()
-"""No bounds."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ListedControls:
-    """Clips that a control list names, the first so many of each scene. See ClipControls."""
-
-    controls: Controls
-    clips: int
-    bounds: FrameBounds
-
-    def names(self, scene: str, /) -> Sequence[str]:
-        """None for a scene that is not listed."""
-        return tuple(control.name for control in self.controls.get(scene, ())[: self.clips])
-
-    def control(self, scene: str, name: str, frames: int, /) -> Control:
-        """As listed. Raises DataError for a clip that is not."""
-        for control in self.controls.get(scene, ()):
-            if control.name == name:
-                return self.bounds.of(control)
-        raise DataError(f"{scene} has no control {name}; look at the control list")
-
-    def strides(self, scene: str, /) -> Sequence[int]:
-        """As listed, or as bound."""
-        return [self.bounds.of(each).frame_skip for each in self.controls.get(scene, ())[: self.clips]]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DrawnControls:
-    """Clips drawn from a seed and the scene's number, so that a scene has the same ones in any list.
-
-    clips: of each scene; orbits have one source and the same frames, and differ in the goal. orbit: bounds of source
-    and goals; None in driving, whose path is fixed. frames: how the first frame and the stride are drawn. bounds: win
-    over what is drawn.
-    """
-
-    seed: int
-    clips: int
-    frames: FrameSampling
-    orbit: OrbitSampling | None = None
-    bounds: FrameBounds = AS_PLANNED
-
-    def names(self, scene: str, /) -> Sequence[str]:
-        """As many for every scene."""
-        del scene
+    def names(self, scene: str) -> Sequence[str]:
+        """Of the clips of a scene, in order: `sample_00`; none for a scene that is not listed."""
+        if self.listed is not None:
+            return tuple(control.name for control in self.listed.get(scene, ())[: self.clips])
         return tuple(f"sample_{number:02d}" for number in range(self.clips))
 
-    def control(self, scene: str, name: str, frames: int, /) -> Control:
-        """The same whenever it is asked for. Raises DataError if the scene is too short."""
+    def control(self, scene: str, name: str, frames: int) -> Control:
+        """One of them, for a scene of so many time steps. Raises DataError if the scene is too short."""
+        if self.listed is not None:
+            found = next(each for each in self.listed[scene] if each.name == name)
+            start = found.frame_start if self.start is None else self.start
+            return replace(found, frame_start=start, frame_skip=found.frame_skip if self.skip is None else self.skip)
         seeds, clip = (self.seed, scene_number(scene)), self.names(scene).index(name)
-        if self.orbit is None:
+        if not isinstance(self.sampling, OrbitSampling):
             start, skip = self._frames(generator(*seeds, clip), frames)
             return Control(name=name, frame_start=start, frame_skip=skip)
         rng = generator(*seeds)
         start, skip = self._frames(rng, frames)
-        source = replace(self.orbit.source(rng), elevation_deg=PAPER_ELEVATION_DEG)
-        goal = source + self.orbit.change(generator(*seeds, 1 + clip), source)
+        source = replace(self.sampling.source(rng), elevation_deg=PAPER_ELEVATION_DEG)
+        goal = source + self.sampling.change(generator(*seeds, 1 + clip), source)
         return Control(name=name, frame_start=start, frame_skip=skip, start=source, goal=goal)
 
-    def strides(self, scene: str, /) -> Sequence[int]:
-        """Those that are drawn from, or the one that is bound."""
-        del scene
-        return self.frames.strides if self.bounds.skip is None else (self.bounds.skip,)
-
     def _frames(self, rng: np.random.Generator, frames: int) -> tuple[int, int]:
-        start, skip = self.bounds.start, self.bounds.skip
-        if start is not None and skip is not None:
-            return start, skip
-        strides = self.frames.strides if skip is None else (skip,)
-        chosen = FrameSampling(clip=self.frames.clip, strides=strides, latest_start=self.frames.latest_start)
-        numbers, stride = chosen.draw(rng, frames)
-        return numbers[0] if start is None else start, stride
+        """First frame and stride."""
+        if self.start is not None and self.skip is not None:
+            return self.start, self.skip
+        usual = self.sampling.frames
+        strides = usual.strides if self.skip is None else (self.skip,)
+        numbers, stride = replace(usual, strides=strides, reverse=0.0).draw(rng, frames)
+        return numbers[0] if self.start is None else self.start, stride
 
 
 def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
@@ -165,7 +106,7 @@ _NAMED = 4  # cameras in a message
 
 
 def controlled(
-    scenes: Sequence[str], controls: ClipControls, listed: Path | None, folder: Path, notes: Skips
+    scenes: Sequence[str], controls: SceneControls, listed: Path | None, folder: Path, notes: Skips
 ) -> tuple[str, ...]:
     """Scenes that have clips; the others are noted.
 
@@ -205,24 +146,12 @@ def require_cameras(data: Dataset4D) -> None:
         ) from fault
 
 
-def orbit_notes(controls: ListedControls, scenes: Sequence[str], listed: Path) -> tuple[str, ...]:
-    """What is odd in the cameras of an orbit's control list, in words.
-
-    Raises: DataError: a control has no cameras: the list is for driving.
-    """
-    chosen = [(scene, each) for scene in scenes for each in controls.controls[scene][: controls.clips]]
-    below: list[str] = []
-    for scene, control in chosen:
-        if control.start is None or control.goal is None:
-            raise DataError(
-                f"{listed}: {scene}, {control.name} has no spherical_start: it is a driving control, and these scenes "
-                "are seen along orbits; give Kubric-4D's controls"
-            )
-        if min(control.start.elevation_deg, control.goal.elevation_deg) < 0:
-            below.append(f"{scene}, {control.name}")
-    if not below:
-        return ()
-    return (
-        f"{listed}: {len(below)} of {len(chosen)} clips have a camera below the ground, first {below[0]}; see its "
-        "angles",
-    )
+def require_orbits(controls: Controls, scenes: Sequence[str], listed: Path) -> None:
+    """Raises DataError where a control of these scenes has no cameras: the list is for driving."""
+    for scene in scenes:
+        for control in controls[scene]:
+            if control.start is None or control.goal is None:
+                raise DataError(
+                    f"{listed}: {scene}, {control.name} has no spherical_start: it is a driving control, and these "
+                    "scenes are seen along orbits; give Kubric-4D's controls"
+                )

@@ -17,7 +17,6 @@ from gcd_train.evaluation.predictors import (
     CameraPair,
     Prediction,
     SourceClip,
-    TargetStatistics,
     own_views,
     pixel_rays,
     to_labels,
@@ -33,10 +32,9 @@ _NEAREST_SOURCE_M = 0.1  # in front of the source camera
 class GroundHomography:
     """The source picture and its class map as the target camera sees them if all of it lies on the ground.
 
-    fill: what is shown where the target camera looks above the horizon or the source camera does not see the ground.
+    Black, and of no class, where the target camera looks above the horizon or the source does not see the ground.
     """
 
-    fill: TargetStatistics
     name: str = "ground_homography"
     privileged: bool = False
 
@@ -44,16 +42,15 @@ class GroundHomography:
         """See Predictor. The class map is warped from the source's exact one."""
         grid, seen = ground_grid(clip.cameras)
         video = F.grid_sample(to_pictures(clip.source), grid, padding_mode="border", align_corners=False)
+        labels = to_labels(clip.source_classes)
         return Prediction(
-            video=torch.where(seen[:, None], video, self.fill.mean),
-            classes=self._classes(to_labels(clip.source_classes), grid, seen),
+            video=torch.where(seen[:, None], video, 0.0),
+            classes=None if labels is None else self._classes(labels, grid, seen),
         )
 
-    def _classes(self, labels: Tensor | None, grid: Tensor, seen: Tensor) -> Tensor | None:
-        if labels is None or self.fill.majority is None:
-            return None
+    def _classes(self, labels: Tensor, grid: Tensor, seen: Tensor) -> Tensor:
         moved = F.grid_sample(labels[:, None].float(), grid, mode="nearest", padding_mode="border", align_corners=False)
-        return torch.where(seen, moved[:, 0].to(torch.uint8), self.fill.majority)
+        return torch.where(seen, moved[:, 0].to(torch.uint8), NO_CLASS)
 
 
 def ground_grid(cameras: CameraPair) -> tuple[Tensor, Tensor]:

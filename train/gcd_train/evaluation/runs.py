@@ -12,19 +12,16 @@ from gcd_train.errors import RunError
 from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.statistics import (
     Array,
-    Bootstrap,
     ClassCounts,
     FigureName,
     Selection,
     Span,
-    bootstrap,
+    Sums,
     class_counts,
     clip_sums,
+    scene_sums,
 )
-from gcd_train.evaluation.store import FRAMES_IN, LPIPS, REGIONS, ClipRecord, Frames, Region, RunNote, read_run
-
-COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "fps", "classes")
-"""What the notes of two runs must have alike before any of their figures are compared."""
+from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, ClipRecord, Region, RunNote, read_run
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -89,14 +86,17 @@ class Method:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class EvaluatedSet:
-    """Methods that were measured on the same clips, by one run or by several.
+    """Methods that were measured on the same clips, by one run or by several; their sums are worked out once.
 
-    note: of the first run. runs: all of them. methods: in the order of the runs.
+    note: of the first run. runs: all of them. methods: in the order of the runs. rows: method to the row of the paper's
+    tables that a user says it belongs in.
     """
 
     note: RunNote
     runs: tuple[Run, ...]
     methods: tuple[Method, ...]
+    rows: Mapping[str, str] = field(default_factory=dict[str, str])
+    _known: dict[object, Any] = field(default_factory=dict[object, Any], init=False, repr=False, compare=False)
 
     @property
     def title(self) -> str:
@@ -105,47 +105,70 @@ class EvaluatedSet:
         return f"{_KINDS[self.note.kind]} ({names}), {_PROTOCOLS[self.note.protocol]}"
 
     @property
+    def clips(self) -> dict[str, ClipRecord]:
+        """All clips that any method was measured on, each with its first record."""
+        found: dict[str, ClipRecord] = {}
+        for record in (record for method in self.methods for record in method.records):
+            found.setdefault(record.key, record)
+        return found
+
+    @property
     def keys(self) -> tuple[str, ...]:
-        """Of all clips that any method was measured on."""
-        return tuple(dict.fromkeys(key for method in self.methods for key in method.keys))
+        """Of all clips."""
+        return tuple(self.clips)
 
     @property
     def scenes(self) -> int:
         """How many scenes these clips are of."""
-        return len({record.scene for method in self.methods for record in method.records})
+        return len({record.scene for record in self.clips.values()})
 
     @property
     def regions(self) -> tuple[Region, ...]:
         """All, and the others where somebody knows which they are."""
-        records = [record for method in self.methods for record in method.records]
-        return tuple(region for region in REGIONS if any(region in record.regions for record in records))
-
-    def fps(self, key: str) -> float:
-        """Frames per second of a clip."""
-        return next(record.fps for method in self.methods for record in method.records if record.key == key)
+        return tuple(region for region in REGIONS if any(region in each.regions for each in self.clips.values()))
 
     def method(self, name: str) -> Method:
         """The one of this name, which there must be."""
         return next(each for each in self.methods if each.name == name)
+
+    def sums(self, method: Method, selection: Selection, records: Sequence[ClipRecord] | None = None) -> Sums:
+        """A method's sums by scene for some frames and pixels; of some of its records, or of all."""
+        if records is not None and tuple(record.key for record in records) != method.keys:
+            return scene_sums(records, selection, class_counts(records, len(self.note.classes)))
+        at = (method.name, selection)
+        if at not in self._known:
+            self._known[at] = scene_sums(method.records, selection, self._counts(method))
+        return self._known[at]
+
+    def by_clip(self, method: Method, region: Region, name: FigureName) -> Array:
+        """A figure of each clip of a method, [n], in frames 2 to the last."""
+        return clip_sums(method.records, Selection(region=region), self._counts(method)).figure(name)
+
+    def _counts(self, method: Method) -> ClassCounts:
+        if method.name not in self._known:
+            self._known[method.name] = class_counts(method.records, len(self.note.classes))
+        return self._known[method.name]
 
 
 _KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits"}
 _PROTOCOLS = {"paper": "the paper's protocol", "release": "the released script's protocol", "pairs": "pairs of clips"}
 
 
-def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
+def gather(runs: Sequence[Run], rows: Mapping[str, str] | None = None) -> tuple[EvaluatedSet, ...]:
     """Sets of clips, in the order of the runs; runs on the same clips make one set.
 
+    Args:
+        rows: see EvaluatedSet.
     Raises:
         RunError: two runs on the same clips were made in other ways, or name two different methods alike.
     """
     groups: dict[str, list[Run]] = {}
     for run in runs:
         groups.setdefault(run.note.data_identity, []).append(run)
-    return tuple(_set(tuple(members)) for members in groups.values())
+    return tuple(_set(tuple(members), rows or {}) for members in groups.values())
 
 
-def _set(runs: tuple[Run, ...]) -> EvaluatedSet:
+def _set(runs: tuple[Run, ...], rows: Mapping[str, str]) -> EvaluatedSet:
     first = runs[0]
     for run, name in ((run, name) for run in runs[1:] for name in COMPARABLE):
         was, now = getattr(first.note, name), getattr(run.note, name)
@@ -167,7 +190,7 @@ def _set(runs: tuple[Run, ...]) -> EvaluatedSet:
                     f"{name} is another method in {other.folder} than in {run.folder}: {other.details} and "
                     f"{details}; measure it alike in both, give one another name, or report the runs apart"
                 )
-    return EvaluatedSet(note=first.note, runs=runs, methods=tuple(found.values()))
+    return EvaluatedSet(note=first.note, runs=runs, methods=tuple(found.values()), rows=rows)
 
 
 def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
@@ -177,77 +200,29 @@ def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
     return all(first.get(name) == other.get(name) for name in (first.keys() | other.keys()) - left_out)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Measured:
-    """A set of clips with the sums of its methods, each worked out once.
-
-    seed: of the bootstrap. rows: method to the row of the paper's tables that a user says it belongs in.
-    """
-
-    of: EvaluatedSet
-    seed: int = 0
-    rows: Mapping[str, str] = field(default_factory=dict[str, str])
-    _known: dict[object, Any] = field(default_factory=dict[object, Any], init=False, repr=False, compare=False)
-
-    def sums(self, method: Method, selection: Selection, records: Sequence[ClipRecord] | None = None) -> Bootstrap:
-        """A method's sums for some frames and pixels; of some of its records, or of all."""
-        if records is not None and tuple(record.key for record in records) != method.keys:
-            return bootstrap(records, selection, classes=len(self.of.note.classes), seed=self.seed)
-        at = (method.name, selection)
-        if at not in self._known:
-            self._known[at] = bootstrap(method.records, selection, seed=self.seed, counts=self._counts(method))
-        return self._known[at]
-
-    def by_clip(self, method: Method, region: Region, name: FigureName) -> Array:
-        """A figure of each clip of a method, [n], in frames 2 to the last."""
-        return clip_sums(method.records, Selection(region=region), counts=self._counts(method)).figure(name)
-
-    def _counts(self, method: Method) -> ClassCounts:
-        if method.name not in self._known:
-            self._known[method.name] = class_counts(method.records, len(self.of.note.classes))
-        return self._known[method.name]
-
-
 _SAME_CHANGE = 0.01  # degrees and metres
 _SAME_FIGURE = 1e-4  # of the larger one: two cameras at one goal see one picture, the next moment differs by 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Goal:
-    """Where a clip's camera goes, and what is known of the target's pictures, whatever the method.
+def targets_apart(one: ClipRecord, other: ClipRecord, frames: Span = "last") -> str:
+    """Why two clips of one name do not have the same target in these frames, in words; empty where they have.
 
-    change: azimuth, elevation, radius; None for the fixed path of driving. target: figures by name, frame by frame.
+    Told by where the camera goes and how sharp the target is, frame by frame.
     """
+    changes = [np.array(each.change if each.change is not None else (np.nan,) * 3) for each in (one, other)]
+    if not np.allclose(*changes, rtol=0.0, atol=_SAME_CHANGE, equal_nan=True):
+        return "the camera goes {} and {}".format(*(_told(each.change) for each in (one, other)))
+    chosen = Selection(frames=frames).frame_slice()
+    sharp = [np.array(each.regions["all"].gradient_target[chosen], np.float64) for each in (one, other)]
+    if sharp[0].shape != sharp[1].shape or not np.allclose(*sharp, rtol=_SAME_FIGURE, atol=1e-9, equal_nan=True):
+        return "the target's pictures differ: other moments, or another path"
+    return ""
 
-    change: tuple[float, float, float] | None
-    target: Mapping[str, Frames]
 
-    @classmethod
-    def of(cls, records: Sequence[ClipRecord]) -> "Goal":
-        """Of one clip, from the records of any methods on it."""
-        target: dict[str, Frames] = {}
-        for record in records:
-            target = {**_of_target(record), **target}
-        return cls(change=records[0].change, target=target)
-
-    def apart_from(self, other: "Goal", frames: Span = "last") -> str:
-        """Why the two targets are not the same in these frames, in words; empty where they are."""
-        both = (self.change, other.change)
-        near = self.change is not None and other.change is not None
-        near = near and bool(np.allclose(self.change or (), other.change or (), rtol=0.0, atol=_SAME_CHANGE))
-        if not near and both != (None, None):
-            return "the camera goes {} and {}".format(*map(_told, both))
-        chosen, known = Selection(frames=frames).frame_slice(), self.target.keys() & other.target.keys()
-        if not known and self.change is None:
-            return "nobody knows whether the targets are the same"
-        for name in known:
-            values = [np.array(each.target[name][chosen], np.float64) for each in (self, other)]  # NaN for None
-            if (
-                values[0].shape != values[1].shape
-                or not np.isclose(*values, rtol=_SAME_FIGURE, atol=1e-9, equal_nan=True).all()
-            ):
-                return "the target's pictures differ: other moments, or another path"
-        return ""
+def _told(change: tuple[float, float, float] | None) -> str:
+    if change is None:
+        return "its fixed path"
+    return "by azimuth {:+.1f}, elevation {:+.1f}, radius {:+.1f}".format(*change)
 
 
 def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> tuple[tuple[EvaluatedSet, ...], tuple[str, ...]]:
@@ -270,8 +245,8 @@ def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str
     for group in groups:
         if any(getattr(group[0].note, name) != getattr(each.note, name) for name in COMPARABLE):
             continue
-        ours, theirs = _goals(group[0]), _goals(each)
-        why = {key: goal.apart_from(theirs[key]) for key, goal in ours.items() if key in theirs}
+        ours, theirs = group[0].clips, each.clips
+        why = {key: targets_apart(record, theirs[key]) for key, record in ours.items() if key in theirs}
         apart = {key: reason for key, reason in why.items() if reason}
         if apart:
             first, other = (", ".join(dict.fromkeys(str(run.folder) for run in of.runs)) for of in (group[0], each))
@@ -288,10 +263,6 @@ def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str
     groups.append([each])
 
 
-def _goals(of: EvaluatedSet) -> dict[str, Goal]:
-    return {key: Goal.of([r for method in of.methods for r in method.records if r.key == key]) for key in of.keys}
-
-
 def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSet:
     """One set of all; methods that share a name and nothing else are noted, and only the first of each is kept."""
     methods: dict[str, Method] = {}
@@ -306,24 +277,5 @@ def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSe
         note=msgspec.structs.replace(sets[0].note, data=tuple(folder for each in sets for folder in each.note.data)),
         runs=tuple(run for each in sets for run in each.runs),
         methods=tuple(methods.values()),
+        rows=sets[0].rows,
     )
-
-
-def _of_target(record: ClipRecord) -> dict[str, Frames]:
-    """What a record tells of the target alone, by region: how much is of it, how sharp it is, its classes' mean id."""
-    found: dict[str, Frames] = {}
-    for name, region in record.regions.items():
-        if name != "all":
-            found[f"{name} share"] = region.pixels
-        if region.gradient_target is not None:
-            found[f"{name} gradient"] = region.gradient_target
-        if region.confusion is not None:
-            each = [np.array(counted).reshape(-1, 3) for counted in region.confusion]
-            found[f"{name} classes"] = tuple((t @ n) / n.sum() if n.size else None for t, _, n in (e.T for e in each))
-    return found
-
-
-def _told(change: tuple[float, float, float] | None) -> str:
-    if change is None:
-        return "its fixed path"
-    return "by azimuth {:+.1f}, elevation {:+.1f}, radius {:+.1f}".format(*change)

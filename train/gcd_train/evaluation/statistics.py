@@ -6,7 +6,7 @@ alike; the same seed draws the same scenes of every method, so that differences 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, TypeAlias, get_args
 
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.store import REGIONS, ClipRecord, Counted, Frames, Region
+from gcd_train.evaluation.store import REGIONS, ClipRecord, Counted, Frames, Region, RegionRecord
 
 FIRST_MEASURED = 1
 """Frames before this one, counted from 0, are left out: a gradual path begins where the source camera stands."""
 COMMON_CLASSES = 10
 """Classes that the paper's mIoU is a mean over: the commonest of the evaluated targets."""
-DRAWS, COVERAGE = 10_000, 0.95
+DRAWS, COVERAGE, SEED = 10_000, 0.95, 0
 FEW_SCENES = 10
 """Of fewer, no claim can rest on what was found: the bootstrap knows no more scenes than it is given."""
 
@@ -28,28 +28,17 @@ Span: TypeAlias = Literal["2-last", "last", "all"]
 """Which frames are measured."""
 
 FigureName: TypeAlias = Literal[
-    "psnr_db",
-    "last_psnr_db",
-    "ssim",
-    "lpips",
-    "diversity",
-    "gradient_energy",
-    "flicker",
-    "miou",
-    "miou_full",
-    "miou_common",
-    "accuracy",
+    "psnr_db", "ssim", "lpips", "diversity", "gradient_energy", "flicker", "miou_full", "miou_common"
 ]
 """One number of a set of clips.
 
-psnr_db, ssim, lpips: means over frames, draws and clips, each clip weighing the same. last_psnr_db: of the last frame.
-diversity: mean spread of a pixel over draws. gradient_energy, flicker: views over targets, 1 is ideal. miou, accuracy:
-at the class grid. miou_full: at picture size. miou_common: the same, mean over the ten commonest classes.
+psnr_db, ssim, lpips: means over frames, draws and clips, each clip weighing the same. diversity: mean spread of a pixel
+over draws. gradient_energy, flicker: views over targets, 1 is ideal. miou_full: mean over the classes. miou_common:
+the same, mean over the ten commonest classes.
 """
 
 FIGURE_NAMES: tuple[FigureName, ...] = get_args(FigureName)
-_MEANS: tuple[FigureName, ...] = ("psnr_db", "last_psnr_db", "ssim", "lpips", "diversity")
-_RATIOS: tuple[FigureName, ...] = ("gradient_energy", "flicker")
+_PARTS = FIGURE_NAMES[:6]
 
 Array = NDArray[np.float64]
 
@@ -59,8 +48,7 @@ class Selection:
     """Which frames and pixels figures are of.
 
     frames: "2-last" as the paper's main tables, "last" as its ablations, "all" as the released script, or one frame
-    counted from 1. region: which pixels of the target. LPIPS, flicker and figures at the class grid are of all pixels
-    only.
+    counted from 1. region: which pixels of the target. LPIPS and flicker are of all pixels only.
     """
 
     frames: Span | int = "2-last"
@@ -83,38 +71,30 @@ class Selection:
 class ClassCounts:
     """Pixels that are right, predicted and true by class, of n clips with T frames and K classes.
 
-    grid: [n, T, 3, K] at the class grid. regions: the same at picture size, of regions that any clip has.
-    common: ids of the commonest classes.
+    regions: [n, T, 3, K], of regions that any clip has. common: ids of the commonest classes.
     """
 
-    grid: Array
-    regions: Mapping[Region, Array] = field(default_factory=dict[Region, Array])
+    regions: Mapping[Region, Array]
     common: tuple[int, ...] = ()
 
 
 def class_counts(records: Sequence[ClipRecord], classes: int = 0) -> ClassCounts:
     """Counts of one method's clips. classes: how many there are at least; ids beyond make it more."""
-    confusions: dict[Region | None, list[Sequence[Counted]]] = {
-        None: [record.grid_confusion or () for record in records]
+    found: dict[Region, list[Sequence[Counted]]] = {
+        name: [(record.regions[name].confusion if name in record.regions else None) or () for record in records]
+        for name in REGIONS
+        if any(name in record.regions for record in records)
     }
-    for name in REGIONS:
-        found = [record.regions.get(name) for record in records]
-        if any(found):
-            confusions[name] = [(each and each.confusion) or () for each in found]
-    ids = (label for clips in confusions.values() for clip in clips for frame in clip for e in frame for label in e[:2])
-    count = max([classes, *(1 + label for label in set(ids) - {NO_CLASS})])
-    frames = records[0].frames if records else 0
-    counts: dict[Region | None, Array] = {
-        name: np.array([_counts(clip, frames, count) for clip in clips]).reshape(len(records), frames, 3, count)
-        for name, clips in confusions.items()
+    ids = {
+        label for clips in found.values() for clip in clips for frame in clip for each in frame for label in each[:2]
     }
-    true = counts.get("all", counts[None])[:, :, 2].sum(axis=(0, 1))
+    count = max([classes, *(1 + label for label in ids - {NO_CLASS})])
+    regions: dict[Region, Array] = {
+        name: np.array([_counts(clip, records[0].frames, count) for clip in clips]) for name, clips in found.items()
+    }
+    true = regions["all"][:, :, 2].sum(axis=(0, 1))
     commonest = np.argsort(-true, kind="stable")[:COMMON_CLASSES].tolist()
-    return ClassCounts(
-        grid=counts[None],
-        regions={name: each for name, each in counts.items() if name is not None},
-        common=tuple(sorted(label for label in commonest if true[label] > 0)),
-    )
+    return ClassCounts(regions=regions, common=tuple(sorted(label for label in commonest if true[label] > 0)))
 
 
 def _counts(clip: Sequence[Counted], frames: int, classes: int) -> Array:
@@ -131,42 +111,64 @@ def _counts(clip: Sequence[Counted], frames: int, classes: int) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Interval:
+    """A figure and where it lies in 95 of 100 draws of scenes. NaN bounds for a single scene."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def known(self) -> bool:
+        """Whether there was anything to measure."""
+        return not np.isnan(self.value)
+
+    @property
+    def off_zero(self) -> bool:
+        """Whether zero lies outside; never for unknown bounds."""
+        return self.low > 0.0 or self.high < 0.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Sums:
     """Sums of n rows, each a clip or a scene.
 
-    means: [n, 5, 2], sum of the clips' means and how many clips have one, see `_MEANS`. ratios: [n, 2, 2], of views and
-    of targets; gradient, change between frames. grid, full: [n, 3, K], pixels that are right, predicted and true by
-    class, at the class grid and at picture size. common: ids of the commonest classes.
+    parts: [n, 6, 2], of each figure that is no mIoU what is divided and by what: the clips' means by how many clips
+    have one, or views by targets. classes: [n, 3, K], pixels that are right, predicted and true by class. common: ids
+    of the commonest classes.
     """
 
-    means: Array
-    ratios: Array
-    grid: Array
-    full: Array
+    parts: Array
+    classes: Array
     common: tuple[int, ...] = ()
 
     def __len__(self) -> int:
-        return len(self.means)
+        return len(self.parts)
 
     def figure(self, name: FigureName, weights: Array | None = None) -> Array:
         """One figure of each row, or of the rows as often as each weighting [..., n] says; NaN for nothing."""
-        if name in ("accuracy", "miou"):
-            grid = _weighted(self.grid, weights)
-            right, true = grid[..., 0, :].sum(-1), grid[..., 2, :].sum(-1)
-            return _divided(right, true) if name == "accuracy" else _nanmean(class_iou(grid))
         if name in ("miou_full", "miou_common"):
-            iou = class_iou(_weighted(self.full, weights))
+            iou = class_iou(_weighted(self.classes, weights))
             return _nanmean(iou[..., list(self.common)] if name == "miou_common" else iou)
-        kept = self.means[:, _MEANS.index(name)] if name in _MEANS else self.ratios[:, _RATIOS.index(name)]
-        part = _weighted(kept, weights)
+        part = _weighted(self.parts[:, _PARTS.index(name)], weights)
         return _divided(part[..., 0], part[..., 1])
+
+    def value(self, name: FigureName) -> float:
+        """One figure of all rows."""
+        return float(self.figure(name, np.ones(len(self))))
+
+    def again(self, name: FigureName) -> Array:
+        """The figure of rows drawn with repetition, [DRAWS]; NaN for a single row."""
+        return np.full(DRAWS, np.nan) if len(self) < 2 else self.figure(name, scene_weights(len(self)))
+
+    def interval(self, name: FigureName) -> Interval:
+        """One figure with its bounds."""
+        return _interval(self.value(name), lambda: self.again(name))
 
     def grouped(self, groups: Sequence[str]) -> "Sums":
         """Sums of rows by group, in the order of each group's first row."""
-        order = list(dict.fromkeys(groups))
-        weights = np.array([[float(group == each) for group in groups] for each in order])
-        sums = {name: _weighted(getattr(self, name), weights) for name in ("means", "ratios", "grid", "full")}
-        return replace(self, **sums)
+        weights = np.array([[float(group == each) for group in groups] for each in dict.fromkeys(groups)])
+        return replace(self, parts=_weighted(self.parts, weights), classes=_weighted(self.classes, weights))
 
 
 def class_iou(counts: Array) -> Array:
@@ -175,49 +177,43 @@ def class_iou(counts: Array) -> Array:
     return _divided(right, predicted + true - right)
 
 
-def clip_sums(
-    records: Sequence[ClipRecord], selection: Selection, *, classes: int = 0, counts: ClassCounts | None = None
-) -> Sums:
-    """Sums of each clip of one method. classes: see `class_counts`. counts: of these records, where they are known."""
-    counts = counts or class_counts(records, classes)
-    frames, nothing = selection.frame_slice(), np.zeros_like(counts.grid)
+def clip_sums(records: Sequence[ClipRecord], selection: Selection, counts: ClassCounts | None = None) -> Sums:
+    """Sums of each clip of one method. counts: of these records, where they are known."""
+    counts = counts or class_counts(records)
+    of_region = counts.regions.get(selection.region, np.zeros_like(counts.regions["all"]))
     return Sums(
-        means=np.array([_means(record, selection) for record in records]).reshape(-1, len(_MEANS), 2),
-        ratios=np.array([_ratios(record, selection) for record in records]).reshape(-1, len(_RATIOS), 2),
-        grid=(counts.grid if selection.region == "all" else nothing)[:, frames].sum(axis=1),
-        full=counts.regions.get(selection.region, nothing)[:, frames].sum(axis=1),
+        parts=np.array([_parts(record, selection) for record in records]),
+        classes=of_region[:, selection.frame_slice()].sum(axis=1),
         common=counts.common,
     )
 
 
-def _means(record: ClipRecord, selection: Selection) -> list[tuple[float, float]]:
-    region, frames = record.regions.get(selection.region), selection.frame_slice()
-    spread = None if region is None or region.diversity is None else (region.diversity,)
-    found = [
-        _clip_mean(region and region.psnr_db, frames),
-        _clip_mean(region and region.psnr_db, slice(-1, None)),
-        _clip_mean(region and region.ssim, frames),
-        _clip_mean(record.lpips if selection.region == "all" else None, frames),
-        _clip_mean(spread, frames),
-    ]
-    return [(0.0, 0.0) if np.isnan(value) else (value, 1.0) for value in found]
+def scene_sums(records: Sequence[ClipRecord], selection: Selection, counts: ClassCounts | None = None) -> Sums:
+    """`clip_sums` of each scene, ready to be drawn from."""
+    return clip_sums(records, selection, counts).grouped([record.scene for record in records])
+
+
+def _parts(record: ClipRecord, selection: Selection) -> list[tuple[float, float]]:
+    """Of one clip, in the order of `_PARTS`. Gradients: each frame by the region's share of it, so that one without
+    such pixels adds nothing."""
+    frames, everywhere = selection.frame_slice(), selection.region == "all"
+    region = record.regions.get(selection.region, RegionRecord(pixels=(), gradient_target=()))
+    spread = None if region.diversity is None else (region.diversity,)
+    lpips = record.lpips if everywhere else None
+    means = [_clip_mean(values, frames) for values in (region.psnr_db, region.ssim, lpips, spread)]
+    gradients = flicker = (0.0, 0.0)
+    if region.gradient is not None:
+        share = _array(region.pixels)
+        views, targets = (np.nan_to_num(_array(each)) * share for each in (region.gradient, region.gradient_target))
+        gradients = _ratio(views, targets, frames)
+    if everywhere and record.step is not None:
+        flicker = _ratio(_array(record.step), _array(record.step_target), selection.step_slice())
+    return [*((0.0, 0.0) if np.isnan(value) else (value, 1.0) for value in means), gradients, flicker]
 
 
 def _clip_mean(values: Sequence[Frames] | None, frames: slice) -> float:
     """Mean over draws and frames of [S][T] values, of those that there are; NaN for none."""
     return float("nan") if values is None else float(_nanmean(_array(values)[:, frames].ravel()))
-
-
-def _ratios(record: ClipRecord, selection: Selection) -> list[tuple[float, float]]:
-    """Gradients, each frame by the region's share of it (without such pixels it adds nothing), and flicker."""
-    region, gradients, flicker = record.regions.get(selection.region), (0.0, 0.0), (0.0, 0.0)
-    if region is not None and region.gradient is not None and region.gradient_target is not None:
-        share = _array(region.pixels)
-        views, targets = (np.nan_to_num(_array(each)) * share for each in (region.gradient, region.gradient_target))
-        gradients = _ratio(views, targets, selection.frame_slice())
-    if selection.region == "all" and record.step is not None:
-        flicker = _ratio(_array(record.step), _array(record.step_target), selection.step_slice())
-    return [gradients, flicker]
 
 
 def _ratio(views: Array, targets: Array, chosen: slice) -> tuple[float, float]:
@@ -245,72 +241,14 @@ def _nanmean(values: Array) -> Array:
     return _divided(np.where(there, values, 0.0).sum(-1), there.sum(-1).astype(np.float64))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Interval:
-    """A figure and where it lies in 95 of 100 draws of scenes. NaN bounds for a single scene."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def known(self) -> bool:
-        """Whether there was anything to measure."""
-        return not np.isnan(self.value)
-
-    @property
-    def off_zero(self) -> bool:
-        """Whether zero lies outside; never for unknown bounds."""
-        return self.low > 0.0 or self.high < 0.0
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Bootstrap:
-    """A method's sums by scene, and the seed that scenes are drawn by."""
-
-    scenes: Sums
-    seed: int = 0
-
-    def value(self, name: FigureName) -> float:
-        """One figure of all scenes."""
-        return float(self.scenes.figure(name, np.ones(len(self.scenes))))
-
-    def again(self, name: FigureName) -> Array:
-        """The figure of scenes drawn with repetition, [DRAWS]; NaN for a single scene."""
-        weights = self.weights
-        return np.full(DRAWS, np.nan) if weights is None else self.scenes.figure(name, weights)
-
-    def interval(self, name: FigureName) -> Interval:
-        """One figure with its bounds."""
-        return _interval(self.value(name), lambda: self.again(name))
-
-    @property
-    def weights(self) -> Array | None:
-        """How often each scene is drawn, [DRAWS, n]; None for a single scene."""
-        return scene_weights(len(self.scenes), seed=self.seed) if len(self.scenes) > 1 else None
-
-
 @lru_cache(maxsize=4)
-def scene_weights(count: int, *, draws: int = DRAWS, seed: int = 0) -> Array:
-    """How often each of so many scenes is drawn: [draws, count], each row's sum is `count`."""
-    random = np.random.default_rng(seed)
-    return random.multinomial(count, np.full(count, 1.0 / count), size=draws).astype(np.float64)
+def scene_weights(count: int) -> Array:
+    """How often each of so many scenes is drawn: [DRAWS, count], each row's sum is `count`."""
+    random = np.random.default_rng(SEED)
+    return random.multinomial(count, np.full(count, 1.0 / count), size=DRAWS).astype(np.float64)
 
 
-def bootstrap(
-    records: Sequence[ClipRecord],
-    selection: Selection,
-    *,
-    classes: int = 0,
-    seed: int = 0,
-    counts: ClassCounts | None = None,
-) -> Bootstrap:
-    """Sums of one method, ready to be drawn from. classes, counts: see `clip_sums`."""
-    clips = clip_sums(records, selection, classes=classes, counts=counts)
-    return Bootstrap(scenes=clips.grouped([record.scene for record in records]), seed=seed)
-
-
-def difference(first: Bootstrap, other: Bootstrap, name: FigureName) -> Interval:
+def difference(first: Sums, other: Sums, name: FigureName) -> Interval:
     """How far `first` lies above `other`, both on the same clips: in each draw the same scenes of both."""
     return _interval(first.value(name) - other.value(name), lambda: first.again(name) - other.again(name))
 

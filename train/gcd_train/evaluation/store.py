@@ -44,7 +44,7 @@ class RegionRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     pixels: share of the frame that they are, T. psnr_db, ssim: [S][T]. diversity: T, None for fewer than two draws.
     gradient, gradient_target: [S][T] and T, mean length of the gradient. confusion: [T], summed over draws; None where
-    there are no classes.
+    there are no classes. What is of the method's pictures is None where it makes none.
     """
 
     pixels: tuple[float, ...]
@@ -52,7 +52,7 @@ class RegionRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     ssim: tuple[Frames, ...] | None = None
     diversity: Frames | None = None
     gradient: tuple[Frames, ...] | None = None
-    gradient_target: Frames | None = None
+    gradient_target: Frames
     confusion: tuple[Counted, ...] | None = None
 
 
@@ -64,7 +64,7 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     to goal; None for the fixed path of driving. fps: of the clip. seconds: that the method took. regions: by name;
     "visible" and "occluded" are missing where nobody knows what the source camera saw.
     lpips: [S][T], None where no weights were given. step, step_target: [S][T-1] and T-1, mean change from frame to
-    frame. grid_confusion: as in a region, at the class grid. Where the method makes no pictures all else is None.
+    frame; step is None where the method makes no pictures.
     """
 
     method: str
@@ -80,7 +80,6 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     lpips: tuple[Frames, ...] | None = None
     step: tuple[tuple[float, ...], ...] | None = None
     step_target: tuple[float, ...]
-    grid_confusion: tuple[Counted, ...] | None = None
 
 
 class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -88,9 +87,7 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     command: the line that began it. made: UTC, ISO 8601. versions: of gcd-node, torch, python. data: folders.
     data_identity: digest of the clips. kind: "kubric", "driving" or "orbit": which tables they belong to.
-    modality: of the target pictures. protocol: "paper", "release" or "pairs". fps: frames per second of the clips.
-    rates: empty where all have that one; else all that clips may have, of which `fps` is the highest, and each record
-    tells its clip's. classes: names, empty for none.
+    modality: of the target pictures. protocol: "paper", "release" or "pairs". classes: names, empty for none.
     methods: name to what it is: a weight file's digest, steps, guidance, draws, seed, views; all as text.
     """
 
@@ -105,8 +102,6 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     frames: int
     height: int
     width: int
-    fps: float
-    rates: tuple[float, ...] = ()
     seed: int
     classes: tuple[str, ...] = ()
     methods: dict[str, dict[str, str]] = {}
@@ -114,7 +109,8 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 RUN_FILE = "run.json"
 _MOST_RECORD = 1 << 24
-_SAME = ("data_identity", "kind", "modality", "protocol", "frames", "height", "width", "seed", "classes")
+COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "classes")
+"""What the notes of two runs must have alike before any of their figures are compared."""
 _PACKAGE = "gcd-node"
 _SHOWN = 48  # letters of a value in a message
 
@@ -132,37 +128,27 @@ class RunKeeper:
 
     @contextmanager
     def in_use(self, note: RunNote) -> Generator[None]:
-        """`begin`, one line at a time; lines that begin before the block is left keep its methods.
+        """`begin`, and its methods are measured by no other line until the block is left.
 
         Raises: RunError as `begin`, and where another line measures one of the methods now.
         """
         (self.folder / ".measuring").mkdir(parents=True, exist_ok=True)
         with ExitStack() as held:
-            measuring = held.enter_context((self.folder / ".in_use").open("a"))
-            for method in note.methods:
-                mine = held.enter_context((self.folder / ".measuring" / folder_name(method)).open("a"))
-                try:
-                    fcntl.flock(mine, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError as error:
-                    raise RunError(
-                        f"another line measures {method} in {self.folder} now; wait for it, or give another --out"
-                    ) from error
             with (self.folder / ".begin").open("a") as turn:
                 fcntl.flock(turn, fcntl.LOCK_EX)
-                try:
-                    fcntl.flock(measuring, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    alone = True
-                except BlockingIOError:
-                    alone = False
-                self.begin(note, alone=alone)
-                fcntl.flock(measuring, fcntl.LOCK_SH)
+                for method in note.methods:
+                    if not self._seized(method, held):
+                        raise RunError(
+                            f"another line measures {method} in {self.folder} now; wait for it, or give another --out"
+                        )
+                self.begin(note)
             yield
 
-    def begin(self, note: RunNote, *, alone: bool = True) -> RunNote:
+    def begin(self, note: RunNote) -> RunNote:
         """Write `run.json`, or add this note's methods to the one that is there, whose command and time stay.
 
-        What has no record binds nobody, if no other line measures now (alone): a note of which nothing was measured is
-        written anew, and a method without records is corrected, or dropped where this note does not name it.
+        A method without a record that no line measures now binds nobody: it is corrected, or dropped where this note
+        does not name it, and a note of which no method is left is written anew.
 
         Returns: what now stands there.
         Raises:
@@ -172,11 +158,8 @@ class RunKeeper:
         path = self.folder / RUN_FILE
         if path.exists():
             found = _read_note(path)
-            if alone:
-                places = {name: self.folder / "records" / folder_name(name) for name in found.methods}
-                kept = {name: found.methods[name] for name, place in places.items() if any(place.glob("*.json"))}
-                found = msgspec.structs.replace(found, methods=kept)
-            note = _joined(self.folder, found, note) if found.methods else note
+            kept = {name: told for name, told in found.methods.items() if self._binds(name, note)}
+            note = _joined(self.folder, msgspec.structs.replace(found, methods=kept), note) if kept else note
         owners: dict[str, str] = {}
         for method in note.methods:
             other = owners.setdefault(folder_name(method), method)
@@ -187,17 +170,26 @@ class RunKeeper:
         write_whole(path, msgspec.json.format(msgspec.json.encode(note), indent=1))
         return note
 
-    def sheet_rows(self, method: str, key: str) -> Path:
-        """Where the rows of a method on a clip of the contact sheet lie, without a suffix."""
-        return self.folder / ".sheet" / folder_name(method) / folder_name(key)
+    def _binds(self, method: str, note: RunNote) -> bool:
+        """Whether a method has a record, or another line measures it now."""
+        if any((self.folder / "records" / folder_name(method)).glob("*.json")):
+            return True
+        with ExitStack() as held:
+            return method not in note.methods and not self._seized(method, held)
+
+    def _seized(self, method: str, held: ExitStack) -> bool:
+        """Whether a method could be locked, until `held` is left."""
+        (self.folder / ".measuring").mkdir(parents=True, exist_ok=True)
+        file = held.enter_context((self.folder / ".measuring" / folder_name(method)).open("a"))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
 
     def has(self, method: str, key: str) -> bool:
         """Whether there is a record."""
         return self._record(method, key).exists()
-
-    def read(self, method: str, key: str) -> ClipRecord:
-        """A record that there is. Raises RunError if it is damaged."""
-        return _read_record(self._record(method, key))
 
     def keep(self, record: ClipRecord) -> None:
         """Write a record; one that is there is replaced. Raises RunError if it cannot be written."""
@@ -241,7 +233,8 @@ def _read_record(path: Path) -> ClipRecord:
 
 def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
     """The note that is there with the new methods. Raises RunError where records of both would not go together."""
-    differ = {name: (getattr(found, name), getattr(new, name)) for name in _SAME}
+    same = ("data_identity", *COMPARABLE, "seed")
+    differ = {name: (getattr(found, name), getattr(new, name)) for name in same}
     differ[_PACKAGE] = (found.versions.get(_PACKAGE), new.versions.get(_PACKAGE))
     for method in found.methods.keys() & new.methods.keys():
         was, now = found.methods[method], new.methods[method]
@@ -253,7 +246,7 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
         raise RunError(
             f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete it"
         )
-    return msgspec.structs.replace(found, fps=new.fps, rates=new.rates, methods={**found.methods, **new.methods})
+    return msgspec.structs.replace(found, methods={**found.methods, **new.methods})
 
 
 def _short(value: object) -> str:

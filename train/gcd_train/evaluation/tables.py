@@ -1,12 +1,11 @@
-"""Tables of a set of clips: the paper's, or the same columns for clips of our own; as Markdown and as CSV."""
+"""Tables of a set of clips: the paper's, or the same columns for clips of our own, and paired differences."""
 
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product, zip_longest
 from math import isnan, nan
-from statistics import fmean
 from typing import TypeAlias
 
 import numpy as np
@@ -15,20 +14,20 @@ from gcd_train.evaluation.paper import (
     CLASS_COLUMNS,
     PICTURE_COLUMNS,
     Column,
-    Gain,
     PaperTable,
     row_label,
     tables_for,
 )
-from gcd_train.evaluation.runs import EvaluatedSet, Measured, Method
+from gcd_train.evaluation.runs import EvaluatedSet, Method
 from gcd_train.evaluation.statistics import (
     FIGURE_NAMES,
-    FIRST_MEASURED,
     FigureName,
     Interval,
     Selection,
     Span,
     class_iou,
+    common_clips,
+    difference,
 )
 from gcd_train.evaluation.store import REGIONS, Region
 
@@ -150,42 +149,39 @@ def frames_told(of: EvaluatedSet, frames: Span) -> str:
     return {"2-last": f"frames 2-{of.note.frames}", "last": "last frame", "all": f"all {of.note.frames} frames"}[frames]
 
 
-def main_tables(measured: Measured, spans: Sequence[Span] = ("2-last", "last")) -> tuple[Table, ...]:
+def main_tables(of: EvaluatedSet, spans: Sequence[Span] = ("2-last", "last")) -> tuple[Table, ...]:
     """The paper's tables for clips of its sets, tables of the same columns under their own title for others.
 
     Args:
         spans: only tables over these frames. The paper has none over all frames, so that one is always our own.
     """
-    of, papers = measured.of, {each.frames: each for each in tables_for(measured.of.note)}
+    papers = {each.frames: each for each in tables_for(of.note)}
     pictures, classes = any(m.makes_pictures for m in of.methods), any(m.makes_classes for m in of.methods)
     every = (*(PICTURE_COLUMNS if pictures else ()), *(CLASS_COLUMNS if classes else ()))
     columns = tuple(column for column in every if column.region in of.regions)
     ours = tuple(
-        _own_table(measured, columns, frames, _OWN_NAMES[frames], f"{of.title}: {frames_told(of, frames)}")
+        _own_table(of, columns, frames, _OWN_NAMES[frames], f"{of.title}: {frames_told(of, frames)}")
         for frames in spans
         if frames not in papers
     )
-    return (*ours, *(_paper_table(measured, each) for frames, each in papers.items() if frames in spans))
+    return (*ours, *(_paper_table(of, each) for frames, each in papers.items() if frames in spans))
 
 
-def region_table(measured: Measured, frames: Span = "2-last") -> Table:
+def region_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
     """Every method on all, visible and occluded pixels side by side, with its diversity and sharpness on all."""
-    of = measured.of
-    columns = tuple(column for column in _REGION_COLUMNS if column.region in of.regions and _has(of, column))
     title = f"Visible and occluded pixels, diversity, sharpness: {frames_told(of, frames)}"
-    figures = {column.figure for column in columns}
-    notes = {
-        "diversity": "Diversity: standard deviation over the draws of one view; of two draws or more.",
-        "gradient_energy": "Gradient energy: view over target, 1 is as sharp as the target.",
-    }
-    extra = tuple(note for figure, note in notes.items() if figure in figures)
-    return _own_table(measured, columns, frames, "regions", title, extra)
+    notes = (
+        "Diversity: standard deviation over the draws of one view; of two draws or more.",
+        "Gradient energy: view over target, 1 is as sharp as the target.",
+    )
+    columns = tuple(column for column in _REGION_COLUMNS if column.region in of.regions)
+    return _own_table(of, columns, frames, "regions", title, notes)
 
 
-def class_table(measured: Measured, frames: Span = "2-last") -> Table:
+def class_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
     """Intersection over union of each class at picture size; what occurs nowhere is left out."""
-    of, methods = measured.of, [method for method in measured.of.methods if method.makes_classes]
-    iou = [class_iou(measured.sums(each, Selection(frames=frames)).scenes.full.sum(axis=0)) for each in methods]
+    methods = [method for method in of.methods if method.makes_classes]
+    iou = [class_iou(of.sums(each, Selection(frames=frames)).classes.sum(axis=0)) for each in methods]
     there = [place for place in range(len(of.note.classes)) if any(np.isfinite(each[place]) for each in iou)]
     rows = tuple(
         Row(
@@ -203,52 +199,43 @@ def class_table(measured: Measured, frames: Span = "2-last") -> Table:
 
 
 def _own_table(
-    measured: Measured, columns: Sequence[Column], frames: Span, name: str, title: str, notes: tuple[str, ...] = ()
+    of: EvaluatedSet, columns: Sequence[Column], frames: Span, name: str, title: str, notes: tuple[str, ...] = ()
 ) -> Table:
+    """Of the columns in which any method has a figure."""
+    rows = [_row(of, method, columns, frames) for method in of.methods]
+    there = [place for place, _ in enumerate(columns) if any(str(row.cells[place]) != NOTHING for row in rows)]
+    kept = [columns[place] for place in there]
     return Table(
         name=name,
         title=title,
-        headings=tuple(column.heading for column in columns),
-        rows=tuple(_row(measured, method, columns, frames) for method in measured.of.methods),
-        notes=(*_notes(measured.of, columns, frames), *notes),
+        headings=tuple(column.heading for column in kept),
+        rows=tuple(replace(row, cells=tuple(row.cells[place] for place in there)) for row in rows),
+        notes=(*_notes(of, kept, frames), *notes),
     )
 
 
-def _paper_table(measured: Measured, table: PaperTable) -> Table:
+def _paper_table(of: EvaluatedSet, table: PaperTable) -> Table:
     placed: dict[str, list[Method]] = {}
-    for method in measured.of.methods:
-        label = measured.rows.get(method.name) or row_label(method.name, method.details, table)
+    for method in of.methods:
+        label = of.rows.get(method.name) or row_label(method.name, method.details, table)
         placed.setdefault(label or "", []).append(method)
     rows, columns, frames = list[Row](), table.columns, table.frames
     for label, printed in table.rows.items():
         found = placed.pop(label, [])
-        rows += [_row(measured, each, columns, frames, label, printed) for each in found]
+        rows += [_row(of, each, columns, frames, label, printed) for each in found]
         rows += [] if found else [Row(label=label, cells=_not_run(printed, columns))]
     below = [  # label: of a row in another of the paper's tables, or empty
-        _row(measured, each, columns, frames, f"{label}, not in this table" if label else "not in the paper")
+        _row(of, each, columns, frames, f"{label}, not in this table" if label else "not in the paper")
         for label, methods in placed.items()
         for each in methods
     ]
     return Table(
         name=table.name,
-        title=f"{table.title} ({measured.of.title})",
+        title=f"{table.title} ({of.title})",
         headings=tuple(column.heading for column in table.columns),
-        rows=(*rows, *(_gain(rows, each, table.columns) for each in table.gains)),
+        rows=tuple(rows),
         below=tuple(below),
-        notes=_notes(measured.of, table.columns, table.frames),
-    )
-
-
-def _gain(rows: Sequence[Row], gain: Gain, columns: Sequence[Column]) -> Row:
-    """The mean difference of the first column, where every variant was measured; of several in a row the first."""
-    known = {row.label: row.cells[0].figure for row in reversed(rows)}
-    pairs = [(known[label], known[label.replace(gain.better, gain.worse)]) for label in known if gain.better in label]
-    apart = [one.value - other.value for one, other in pairs if one is not None and other is not None]
-    figure = Interval(value=fmean(apart), low=nan, high=nan) if len(apart) == len(pairs) else None
-    first = Cell(figure=figure, digits=columns[0].digits, note=NOT_RUN, paper=gain.printed)
-    return Row(
-        label=f"{gain.better} over {gain.worse}, mean of variants",
-        cells=(first, *(Cell(note=NOTHING) for _ in columns[1:])),
+        notes=_notes(of, table.columns, table.frames),
     )
 
 
@@ -256,7 +243,7 @@ Printed: TypeAlias = Sequence[float | None]
 
 
 def _row(
-    measured: Measured,
+    of: EvaluatedSet,
     method: Method,
     columns: Sequence[Column],
     frames: Span,
@@ -266,15 +253,15 @@ def _row(
     """A method's figures, beside what the paper prints in its row."""
     cells = tuple(
         Cell(
-            figure=measured.sums(method, Selection(frames=frames, region=column.region)).interval(column.figure),
+            figure=of.sums(method, Selection(frames=frames, region=column.region)).interval(column.figure),
             digits=column.digits,
-            note=_why_not(measured.of, method, column),
+            note=_why_not(of, method, column),
             paper=blank.paper,
             starred=method.copies_classes and column.of_classes,
         )
         for column, blank in zip(columns, _not_run(printed, columns), strict=True)
     )
-    clips = f"{len(method.records)} of {len(measured.of.keys)}"
+    clips = f"{len(method.records)} of {len(of.keys)}"
     return Row(label=label, method=method.starred, clips=clips, cells=cells)
 
 
@@ -318,61 +305,95 @@ _REGION_COLUMNS = (
 )
 
 
-def _has(of: EvaluatedSet, column: Column) -> bool:
-    """Whether any method can have such a figure."""
-    if column.of_classes:
-        return any(method.makes_classes for method in of.methods)
-    shown = [method for method in of.methods if method.makes_pictures]
-    return (column.figure != "diversity" and bool(shown)) or any(
-        r.draws > 1 for method in shown for r in method.records
-    )
-
-
-def all_figures(measured: Measured) -> str:
+def all_figures(of: EvaluatedSet) -> str:
     """Every figure of every method, frames and pixels with its interval, as CSV: one figure a line."""
     lines: list[list[str]] = []
-    for method, frames, region in product(measured.of.methods, _SPANS, measured.of.regions):
-        sums, clips = measured.sums(method, Selection(frames=frames, region=region)), str(len(method.records))
+    for method, frames, region in product(of.methods, _SPANS, of.regions):
+        sums, clips = of.sums(method, Selection(frames=frames, region=region)), str(len(method.records))
         cells = {name: Cell(figure=sums.interval(name)).numbers() for name in FIGURE_NAMES}
         lines += [[method.name, frames, region, name, *cell, clips] for name, cell in cells.items() if cell[0]]
     return csv_text(["method", "frames", "pixels", "figure", "value", "low", "high", "clips"], lines)
 
 
-_BY_FRAME: tuple[FigureName, ...] = (
-    "psnr_db",
-    "ssim",
-    "lpips",
-    "diversity",
-    "gradient_energy",
-    "flicker",
-    "miou_common",
-)
-
-
-def frames_csv(measured: Measured) -> str:
-    """Every figure of every method in each frame from the second on: one figure a line, without intervals."""
-    lines, every = list[list[str]](), range(FIRST_MEASURED + 1, measured.of.note.frames + 1)
-    for method, frame, region in product(measured.of.methods, every, measured.of.regions):
-        sums = measured.sums(method, Selection(frames=frame, region=region))
-        values = {name: f"{sums.value(name):.6g}" for name in _BY_FRAME}
-        lines += [[method.name, str(frame), region, name, text] for name, text in values.items() if text != "nan"]
-    return csv_text(["method", "frame", "pixels", "figure", "value"], lines)
-
-
-WORST_REGIONS: tuple[Region, ...] = ("all", "occluded")
-"""That clips are looked at in one by one."""
 _BY_CLIP: tuple[FigureName, ...] = ("psnr_db", "ssim", "miou_full")
 
 
-def clips_csv(measured: Measured) -> str:
+def clips_csv(of: EvaluatedSet) -> str:
     """Every method on every clip: one line each, frames 2 to the last."""
-    columns: list[tuple[FigureName, Region]] = [(name, region) for region in WORST_REGIONS for name in _BY_CLIP]
+    regions: tuple[Region, ...] = ("all", "occluded")
+    columns: list[tuple[FigureName, Region]] = [(name, region) for region in regions for name in _BY_CLIP]
     lines: list[list[str]] = []
-    for method in measured.of.methods:
-        by_clip = np.stack([measured.by_clip(method, region, name) for name, region in columns], axis=1)
+    for method in of.methods:
+        by_clip = np.stack([of.by_clip(method, region, name) for name, region in columns], axis=1)
         for record, values in zip(method.records, by_clip.tolist(), strict=True):
             change = ("", "", "") if record.change is None else tuple(f"{part:g}" for part in record.change)
             cells = ["" if np.isnan(value) else f"{value:.6g}" for value in values]
             lines.append([method.name, record.key, record.scene, *change, *cells, f"{record.seconds:.4g}"])
     named = [f"{name} {region}" for name, region in columns]
     return csv_text(["method", "clip", "scene", "azimuth", "elevation", "radius", *named, "seconds"], lines)
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How far one method lies above another in one figure. clips: that both have.
+
+    starred: one of them was given more for this figure than for its others, see `Method.copies_classes`.
+    """
+
+    first: str
+    other: str
+    column: Column
+    frames: Span
+    clips: int
+    apart: Interval
+    starred: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """ "better" or "worse" where zero lies outside the interval, "open" where it does not."""
+        if not self.apart.off_zero:
+            return "open"
+        return "better" if (self.apart.value > 0) != (self.column.figure == "lpips") else "worse"
+
+
+def differences(of: EvaluatedSet, first: Method, frames: Span = "2-last") -> tuple[Difference, ...]:
+    """A method against every other one, in all columns that both have figures in, on the clips that both have."""
+    found: list[Difference] = []
+    for other in of.methods:
+        ours, theirs = common_clips(first.records, other.records)
+        for column in (*PICTURE_COLUMNS, *CLASS_COLUMNS) if ours and other.name != first.name else ():
+            chosen = Selection(frames=frames, region=column.region)
+            apart = difference(of.sums(first, chosen, ours), of.sums(other, chosen, theirs), column.figure)
+            starred = (first.copies_classes or other.copies_classes) and column.of_classes
+            if apart.known:
+                found.append(Difference(first.name, other.name, column, frames, len(ours), apart, starred))
+    return tuple(found)
+
+
+def differences_csv(found: Sequence[Difference]) -> str:
+    """One difference a line."""
+    lines = [
+        [e.first, e.other, e.frames, e.column.heading, *Cell(figure=e.apart).numbers(), str(e.clips), e.verdict]
+        for e in found
+    ]
+    return csv_text(["first", "other", "frames", "figure", "first ahead", "low", "high", "clips", "verdict"], lines)
+
+
+def differences_markdown(found: Sequence[Difference], of: EvaluatedSet) -> str:
+    """A row for each other method, a column for each figure; bold where zero lies outside the interval."""
+    headings = list(dict.fromkeys(each.column.heading for each in found))
+    cells = {(each.other, each.column.heading): _difference_told(each) for each in found}
+    others = list(dict.fromkeys(each.other for each in found))
+    rows = [[of.method(name).starred, *(cells.get((name, head), NOTHING) for head in headings)] for name in others]
+    return "\n".join(markdown_rows(["", *headings], rows)) + "\n"
+
+
+def _difference_told(each: Difference) -> str:
+    value, low, high = (
+        f"{number:+.{each.column.digits}f}" for number in (each.apart.value, each.apart.low, each.apart.high)
+    )
+    star = " *" if each.starred else ""
+    if np.isnan(each.apart.low):  # one scene tells nothing of it
+        return value + star
+    text = f"{value} [{low}, {high}]"
+    return (text if each.verdict == "open" else f"**{text}** {each.verdict}") + star
