@@ -170,12 +170,13 @@ def main_tables(of: EvaluatedSet, spans: Sequence[Span] = ("2-last", "last")) ->
 def region_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
     """Every method on all, visible and occluded pixels side by side, with its diversity and sharpness on all."""
     title = f"Visible and occluded pixels, diversity, sharpness: {frames_told(of, frames)}"
-    notes = (
-        "Diversity: standard deviation over the draws of one view; of two draws or more.",
-        "Gradient energy: view over target, 1 is as sharp as the target.",
-    )
+    notes = {
+        "diversity": "Diversity: standard deviation over the draws of one view; of two draws or more.",
+        "gradient energy": "Gradient energy: view over target, 1 is as sharp as the target.",
+    }
     columns = tuple(column for column in _REGION_COLUMNS if column.region in of.regions)
-    return _own_table(of, columns, frames, "regions", title, notes)
+    table = _own_table(of, columns, frames, "regions", title)
+    return replace(table, notes=(*table.notes, *(notes[name] for name in table.headings if name in notes)))
 
 
 def class_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
@@ -198,9 +199,7 @@ def class_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
     return Table(name="classes", title=f"IoU of each class: {frames_told(of, frames)}", headings=names, rows=rows)
 
 
-def _own_table(
-    of: EvaluatedSet, columns: Sequence[Column], frames: Span, name: str, title: str, notes: tuple[str, ...] = ()
-) -> Table:
+def _own_table(of: EvaluatedSet, columns: Sequence[Column], frames: Span, name: str, title: str) -> Table:
     """Of the columns in which any method has a figure."""
     rows = [_row(of, method, columns, frames) for method in of.methods]
     there = [place for place, _ in enumerate(columns) if any(str(row.cells[place]) != NOTHING for row in rows)]
@@ -210,7 +209,7 @@ def _own_table(
         title=title,
         headings=tuple(column.heading for column in kept),
         rows=tuple(replace(row, cells=tuple(row.cells[place] for place in there)) for row in rows),
-        notes=(*_notes(of, kept, frames), *notes),
+        notes=_notes(of, kept, frames),
     )
 
 
