@@ -336,17 +336,8 @@ def lerobot_cameras(here: Path, plant: Plant) -> list[str]:
 def cache_index(here: Path, plant: Plant) -> list[str]:
     (here / "cache").mkdir()
     plant("cache/index.json")
-    start = [
-        "gcd-train",
-        "train",
-        "package:pardom-gradual-rgb",
-        "--small",
-        "--set",
-        "data.kind=cache",
-        "--set",
-        "unet.source=cache",
-    ]
-    return [*start, "--data", "cache", "--valid", "scenes", "--out", "out"]
+    options = ["--set", "data.kind=cache", "--set", "unet.source=cache", "--data", "cache", "--valid", "scenes"]
+    return ["gcd-train", "train", "package:pardom-gradual-rgb", *options, "--out", "out"]
 
 
 # --- the rest --------------------------------------------------------------------------------------------------------

@@ -57,7 +57,7 @@ _ANEW = "delete its folder and run `gcd-train train ... --stage latents`"
 def read_index(folder: Path, kind: type[Kind]) -> Kind | None:
     """The index of a folder, None where there is none yet. Raises RunError if it cannot be read."""
     path = folder / _INDEX
-    if not path.exists():
+    if not (path.exists() or path.is_symlink()):
         return None
     try:
         index = read_json(path, kind, _MOST_INDEX)
