@@ -338,3 +338,20 @@ def test_a_folder_without_a_cache_is_refused(tmp_path: Path) -> None:
     (tmp_path / "index.json").write_text("{}")
     with pytest.raises(RunError, match=r"index\.json cannot be used"):
         CachedLatents.open(tmp_path)
+
+
+def test_a_plan_leaves_out_clips_with_missing_frames() -> None:
+    there = set(range(50)) - {20}
+    clips = ClipPlan().clips(50, there)
+    assert clips
+    assert all(20 not in ClipPlan().times(place) for place in clips)
+    assert len(clips) < 59
+
+
+def test_on_the_direct_path_every_target_is_seen_from_the_goal(folder: Path) -> None:
+    cache = CachedLatents.open(folder)
+    direct, gradual = (cache.clip("scene_000000", ClipPlace(2, 1), path) for path in ("direct", "gradual"))  # pyright: ignore
+    assert torch.equal(direct.target[-1], gradual.target[-1])
+    assert not torch.equal(direct.target[0], gradual.target[0])
+    later = cache.clip("scene_000000", ClipPlace(0, 1), "direct")
+    assert torch.equal(direct.target[0], later.target[2])  # the same moment, whatever clip it is in

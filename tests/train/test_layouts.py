@@ -29,6 +29,7 @@ from gcd_train.layouts.kubric4d import (
     InstanceTracks,
     Kubric4DWriter,
     camera_metadata,
+    project,
     ray_lengths,
     segment_ids,
     view_metadata,
@@ -139,6 +140,12 @@ class TestCameraFacts:
         assert told["focal_length"] == pytest.approx(32)
         assert told["field_of_view"] == pytest.approx(0.9272952)
 
+    def test_the_stored_matrix_projects_as_the_lens_does(self) -> None:
+        pose = sphere_poses(torch.tensor([[40.0, 30.0, 12.0]], dtype=torch.float64)).numpy()
+        told = camera_metadata(pose, LENS)
+        at = np.array(told["K"]) @ (np.linalg.inv(np.array(told["R"])) @ [1.0, -2.0, 0.5, 1.0])[:3]
+        np.testing.assert_allclose(project(np.array([[1.0, -2.0, 0.5]]), pose, LENS)[0], at[:2] / at[2], atol=1e-12)
+
 
 class TestEncodings:
     def test_pillow_finds_the_ids(self, tmp_path: Path) -> None:
@@ -227,6 +234,12 @@ class TestKubric4D:
         with pytest.raises(DataError, match="distinct instance ids"):
             segment_ids(instances)
 
+    def test_segments_are_numbered_as_the_list_of_objects(self) -> None:
+        table = segment_ids((4, 9))
+        assert table[[0, 4, 9, 1, 2, 3, 5, 10]].tolist() == [0, 1, 2, 3, 4, 5, 6, 10]
+        assert sorted(table.tolist()) == list(range(256))
+        np.testing.assert_array_equal(segment_ids(()), np.arange(256))
+
 
 class TestParallelDomain4D:
     @pytest.mark.parametrize("compact", [False, True])
@@ -285,3 +298,20 @@ class TestParallelDomain4D:
         assert items[5]["color"] == {"r": 0, "g": 0, "b": 142}
         assert items[255]["name"] == "Void"
         assert len(items) == len(ONTOLOGY) + 1
+
+
+def test_counts_and_boxes_are_those_of_a_plain_loop() -> None:
+    random = np.random.default_rng(0)
+    pictures = random.integers(0, 256, (3, 20, 30)).astype(np.uint8)
+    pictures[0][pictures[0] == 200] = 0
+    pictures[1] %= 5
+    pictures[2] = 0
+    tracks = InstanceTracks(3)
+    for time, ids in enumerate(pictures):
+        tracks.add(time, ids)
+    for time, ids in enumerate(pictures):
+        for number in range(256):
+            rows, columns = np.nonzero(ids == number)
+            box = [rows.min(), columns.min(), rows.max() + 1, columns.max() + 1] if len(rows) else [0] * 4
+            assert tracks.boxes[time, number].tolist() == box
+            assert tracks.pixels[time, number] == len(rows)

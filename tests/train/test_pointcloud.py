@@ -154,3 +154,33 @@ def _seen_by_rays(source: SceneView, target: SceneView) -> np.ndarray:
     u, v = source.lens.fx * x / z + source.lens.cx, source.lens.fy * y / z + source.lens.cy
     inside = (z > 0.1) & (u >= 0) & (u < source.lens.width) & (v >= 0) & (v < source.lens.height)
     return inside & (meet(eye, points - eye)[0] > 0.98)
+
+
+def test_points_of_whole_pixel_numbers_lie_half_a_pixel_up_and_left(room: list[SceneView]) -> None:
+    view = replace(room[0], world_from_camera=np.eye(4))
+    step = (unproject(view) - unproject(view, published=True)) * [LENS.fx, LENS.fy, 1.0] / view.depth[..., None]
+    np.testing.assert_allclose(step, np.broadcast_to([0.5, 0.5, 0.0], step.shape), atol=1e-4)
+
+
+def test_holes_are_filled_from_what_is_around_them() -> None:
+    colour = torch.full((40, 50, 3), 0.4)
+    covered = torch.ones(40, 50, dtype=torch.bool)
+    covered[10:14, 20:25] = False
+    filled = fill_holes(torch.where(covered[..., None], colour, 0.0), covered)
+    np.testing.assert_allclose(filled.numpy(), 0.4, atol=1e-6)
+
+
+def test_a_target_of_the_usual_size_is_drawn_at_420_by_280() -> None:
+    assert render_lens(LENS, round(384 * 1.09375), round(256 * 1.09375)) == LENS.resized(420, 280)
+
+
+def test_digits_are_cut_off_in_published_pictures_only() -> None:
+    rgb = np.full((48, 72, 3), 100, np.uint8)
+    rgb[::2] = 101
+    depth = np.full((48, 72), 5.0, np.float32)
+    view = SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=np.eye(4), lens=LENS)
+    for published in (False, True):
+        options = SplatOptions(published=published)
+        exact = published_tensor([view], np.eye(4), LENS, width=64, height=43, options=options).numpy() * 255
+        made = published_picture([view], np.eye(4), LENS, width=64, height=43, options=options)
+        np.testing.assert_array_equal(made, np.floor(exact + (0.0 if published else 0.5)).astype(np.uint8))

@@ -248,3 +248,14 @@ def test_a_gpu_draws_the_same(room: list[SceneView]) -> None:
     made, wanted = (splat(room, pose, TARGET, device=device) for device in ("cuda", "cpu"))
     assert psnr_db(replace(made, colour=made.colour.cpu()), wanted.colour.double().numpy()) >= 50.0
     assert (made.covered.cpu() == wanted.covered).float().mean() > 0.999
+
+
+def test_points_at_one_depth_are_averaged() -> None:
+    made = splat([wall(5.0, 200), wall(5.0, 50)], HERE, SOURCE, options=SplatOptions(radius=0))
+    np.testing.assert_allclose(made.colour.numpy(), 125 / 255, atol=1e-5)
+
+
+def test_sizes_may_differ_from_view_to_view(room: list[SceneView]) -> None:
+    other = photograph(room[0].world_from_camera, Intrinsics.from_hfov(60.0, 45, 33))
+    made = splat([room[0], other], room[0].world_from_camera, TARGET)
+    assert bool(made.covered.any())

@@ -185,3 +185,8 @@ def test_bounds_that_mean_nothing_are_refused(options: dict[str, object]) -> Non
 def test_clips_that_mean_nothing_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(RecipeError):
         FrameSampling(**options)  # pyright: ignore[reportArgumentType]
+
+
+def test_short_scenes_take_the_strides_that_fit() -> None:
+    strides = {KUBRIC_FRAMES.draw(generator(0, index), 30)[1] for index in range(60)}
+    assert strides == {1, 2}
