@@ -685,7 +685,8 @@ def test_a_hostile_text_ends_in_one_line_that_names_it(
         return name
 
     argv = prepare(here, plant)
-    require_one_line(commands, argv, here, Path(planted[0]).name)
+    told = "model" if door == "diffusers_config" and kind in (dots, escapes) else Path(planted[0]).name
+    require_one_line(commands, argv, here, told)  # diffusers' own files have many more keys than are read
 
 
 @pytest.mark.parametrize("name", CASES)

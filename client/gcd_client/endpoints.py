@@ -77,19 +77,19 @@ def fingerprint(public: str) -> str:
 
 def read_key_pair(folder: Path) -> KeyPair:
     """Read a key folder. Raises SetupError: no key in a file, or others than its owner may read the secret."""
-    path = folder / SECRET_FILE
-    secret = _read_key(path)
+    path, public = folder / SECRET_FILE, folder / PUBLIC_FILE
+    secret, text = _read_key(path), _read_key(public)
     if os.name == "posix" and path.stat().st_mode & 0o077:
         raise SetupError(f"{path} must be readable by its owner alone; run chmod 600 on it")
-    return KeyPair(public=_read_key(folder / PUBLIC_FILE), secret=secret)
+    check_key(text, f"the key in {public}")
+    return KeyPair(public=text, secret=secret)
 
 
 def read_public_key(text: str) -> str:
     """A public key given as itself, as its file, or as a key folder. Raises SetupError."""
     if not _Z85.fullmatch(text):
         path = Path(text) / PUBLIC_FILE if Path(text).is_dir() else Path(text)
-        text = _read_key(path)
-        check_key(text, f"the key in {path}")
+        check_key(text := _read_key(path), f"the key in {path}")
     return text
 
 

@@ -196,7 +196,7 @@ class _ImageFacts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Index(msgspec.Struct, frozen=True, kw_only=True):
-    weight_map: dict[str, str] = {}
+    weight_map: dict[str, str]
 
 
 def _read_folder(path: Path) -> WeightsFile:
@@ -269,6 +269,6 @@ def _folder_hints(path: Path) -> Hints:
 def _facts(file: Path, kind: type[Facts]) -> Facts:
     """What a small file tells; nothing where it is absent."""
     try:
-        return decode_json(read_small(file), kind) if file.exists() else kind()
+        return decode_json(read_small(file), kind) if file.exists() or file.is_symlink() else kind()
     except FileError as error:
         raise CheckpointError(f"its file {file.parent.name}/{file.name} {error}") from error

@@ -1,5 +1,6 @@
 """From a path to the clip that is shown: of a scene in one of the published layouts, or of pair shards."""
 
+import os
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,7 +73,7 @@ def _data_set(path: Path) -> Dataset4D:
     """Of one scene, with the cameras that are there: to look at it not all are needed. Raises DataError, FileFault."""
     if kubric4d.scene_number(path.name) is not None:
         every = enumerate(kubric4d.CAMERAS)
-        views = [camera for view, camera in every if kubric4d.metadata_path(path, view).exists()]
+        views = [camera for view, camera in every if os.path.lexists(kubric4d.metadata_path(path, view))]
         return Kubric4D(path.parent, [path.name], cameras=views or kubric4d.CAMERAS, instances=True)
     if parallel_domain4d.scene_number(path.name) is not None:
         cameras = [camera for camera in parallel_domain4d.CAMERAS if (path / "rgb" / camera).is_dir()]
