@@ -256,12 +256,11 @@ def _labels(
     except FileError:
         assets = ()  # names are decoration; the reader has checked what matters in this file
     names = {i: f"{asset.asset_id} ({i})" for i, asset in enumerate(assets, 1) if asset.asset_id}
-    return labels, "instance", _instances(labels, names)
+    return labels, "instance", _instances(labels, {0: "background"} | names)
 
 
 def _instances(labels: NDArray[Any], names: dict[int, str]) -> tuple[OntologyItem, ...]:
     """Those that are seen; 0 is the background."""
-    names = {0: "background"} | names
     return tuple(
         OntologyItem(id=i, name=names.get(i, f"instance {i}"), colour=instance_colour(i))
         for i in np.unique(labels).tolist()
@@ -309,7 +308,7 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
         visible=_visible(views, clip.target_depth, targets, lens),
         labels=labels,
         kind="class" if clips.classes else "instance",
-        names=tuple(classes) or _instances(labels, {}),
+        names=tuple(classes) or _instances(labels, {0: "background"}),
         depth=clip.source_depth,
         world_from_source=sources,
         world_from_target=targets,
