@@ -23,7 +23,6 @@ Clock: TypeAlias = Literal["realtime", "replay"]
 """Domain of a stamp. "realtime": a live source; its stamps are on this host's monotonic clock, and are converted to
 UTC when they are published. "replay": of a recording, from its start or from its own clock."""
 
-
 MAX_FPS = 1000.0
 """Frame rates above this are taken for a mistake."""
 

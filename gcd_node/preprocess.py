@@ -116,13 +116,7 @@ class Rectifier:
     resize: Literal["remap2x_area"] = "remap2x_area"
     """Published as `src.resize`."""
 
-    def __init__(
-        self,
-        lens: LensModel,
-        camera: Intrinsics,
-        *,
-        allow_upscale: bool = False,
-    ) -> None:
+    def __init__(self, lens: LensModel, camera: Intrinsics, *, allow_upscale: bool = False) -> None:
         """Make the maps for pictures of the size the lens is calibrated for.
 
         Args:
@@ -151,9 +145,7 @@ class Rectifier:
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """The same of a depth picture, [H, W]; no depth between two surfaces is made up. Raises as `image`."""
         self._prepare(depth.shape[1], depth.shape[0])
-        if (
-            self._depth_maps is None
-        ):  # straight: nearest neighbours of fixed-point maps would be those to the upper left
+        if self._depth_maps is None:  # of floats: the nearest of fixed-point maps would be those to the upper left
             self._depth_maps = self._maps_to(self.camera, cv2.CV_32FC1)
         small = cv2.resize(depth, self._shrunk, interpolation=cv2.INTER_NEAREST_EXACT)
         return np.asarray(cv2.remap(small, *self._depth_maps, cv2.INTER_NEAREST), np.float32)  # 0, a hole, beyond it

@@ -68,6 +68,7 @@ class McapFile:
         self._writer.start(profile="ros2", library=f"gcd-node; mcap-python/{version('mcap')}")
         self._ids: dict[str, int] = {}  # of a type its schema's, of a topic its channel's
         self.size = self.messages = 0
+        self._has_end = False
         self._flushed = (0, 0)  # size and messages that are on the disk for certain
 
     def describe(self, name: str, facts: Mapping[str, str]) -> None:
@@ -104,11 +105,14 @@ class McapFile:
     def close(self, *, is_broken: bool = False) -> bool:
         """Write index and end. is_broken: a write has failed; then it ends behind what was flushed, without an index.
         Returns whether it has an end."""
+        if self._file.closed:  # before, and the next one could not be opened
+            return self._has_end
         try:
             if not is_broken:
                 self._writer.finish()
                 self.flush()
                 self._file.close()
+                self._has_end = True
                 return True
         except OSError as error:
             _LOG.warning("%s: %s", self.path, error)

@@ -52,10 +52,13 @@ class ReplayedRun:
 
         path = self._config.rootpath / golden
         if self._config.getoption(_UPDATE):
+            former = path.with_name(f".{path.name}.former")  # which goes once the next is whole
             if (path / MANIFEST).is_file():
-                shutil.rmtree(path)
+                shutil.rmtree(former, ignore_errors=True)
+                path.replace(former)
             with new_folder(path) as folder:
                 shutil.copytree(self.folder, folder, dirs_exist_ok=True)
+            shutil.rmtree(former, ignore_errors=True)
             return
         if not path.exists():
             raise AssertionError(

@@ -242,9 +242,8 @@ class WindowBuilder:
         return [self._window()] if len(self._placed) == self.frames else []
 
     def _window(self) -> FrameWindow:
-        thin = [
-            frame.image.reshape(len(frame.image), -1)[::16, ::8] for frame in self._placed
-        ]  # of all colours in turn
+        # of all colours in turn
+        thin = [frame.image.reshape(len(frame.image), -1)[::16, ::8] for frame in self._placed]
         before, self._thin = self._thin if self.frames == 1 else thin[0], thin[-1]
         window = FrameWindow(
             frames=tuple(self._placed),

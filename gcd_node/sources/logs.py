@@ -30,7 +30,7 @@ _LISTED, _SHOWN = 8, 100
 _LATEST_NS = 2**63 - 1  # in the year 2262
 _HEADER_UNCERTAINTY_US = 10_000  # drivers stamp anything from the begin of the exposure to the picture's arrival
 _DELAY = 5  # pictures that are recorded before one goes without what belongs to it
-_MOST_DEPTH, _MOST_ODOMETRY = 32, 2048  # messages that are kept for the pictures that wait
+_MOST_DEPTH, _MOST_ODOMETRY, _MOST_STAMPS = 32, 2048, 500  # kept for pictures that wait; and to tell the rate
 _LOWEST_FPS = 0.05
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -164,7 +164,8 @@ class _Survey:
                     stamp_ns, frame_id = head_of(fields)
                     if topic not in self._first and (found := decoders[topic].decode(message.kind, fields)):
                         self._first[topic] = frame_id, *found
-                    self._stamps_ns[topic].append((stamp_ns, message.sent_ns))
+                    if len(self._stamps_ns[topic]) < _MOST_STAMPS:
+                        self._stamps_ns[topic].append((stamp_ns, message.sent_ns))
                 else:
                     self.cameras.add(message)
             except Exception as error:  # of a library, or SourceError

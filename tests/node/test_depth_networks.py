@@ -90,11 +90,7 @@ def test_without_ground_that_gives_a_scale_there_is_no_depth(tmp_path: Path, til
 
 @pytest.mark.parametrize(
     "other",
-    [
-        {"takes": (1, 1, "high", "wide")},
-        {"gives": (1, 3, 1, "wide"), "channels": (2,)},
-        {"outputs": 2},
-    ],
+    [{"takes": (1, 1, "high", "wide")}, {"gives": (1, 3, 1, "wide"), "channels": (2,)}, {"outputs": 2}],
     ids=["grey", "colours out", "two outputs"],
 )
 def test_a_network_of_another_signature_is_refused_by_what_it_has(tmp_path: Path, other: dict[str, Any]) -> None:

@@ -215,7 +215,8 @@ def test_a_file_on_a_broken_disk_is_whole_up_to_its_last_flush(tmp_path: Path, m
     def broken(*_: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    file = McapFile(tmp_path / "a.mcap")
+    whole, file = McapFile(tmp_path / "b.mcap"), McapFile(tmp_path / "a.mcap")
+    assert (whole.close(), whole.close(is_broken=True)) == (True, True)  # its end is written
     for number in range(100):
         file.write(note_messages("event", origin(), {"code": "E" * 3000, "number": number}, number))
     file.flush()
