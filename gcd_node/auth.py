@@ -264,9 +264,13 @@ class SocketGuard:
         self._reported_s: dict[tuple[str | None, str], float] = {}
         self._suppressed = 0
         self._authenticator: _Authenticator | None = None
+        self.threads: list[threading.Thread] = []
+        """What lets clients in; nobody comes in without them."""
         if security is not None:
             self._authenticator = _Authenticator(self, security)
             self._authenticator.start()
+            self._authenticator.thread.name = "authentication"
+            self.threads = [self._authenticator.thread]
 
     def bind(self, unbound: Socket, endpoint: str, channel: Channel) -> str:
         """Bind a socket: tcp with keys if there are any, ipc for this user, and his group if the umask lets it. Gives
@@ -331,6 +335,9 @@ class SocketGuard:
             monitor.close(0)
         self._monitors.clear()
         if self._authenticator is not None:
+            if self._authenticator.pipe and not self._authenticator.is_alive():  # stop() would wait for it for ever
+                self._authenticator.pipe.close(0)
+                self._authenticator.pipe = None  # pyright: ignore[reportAttributeAccessIssue]  as pyzmq itself does
             self._authenticator.stop()
         self.context.destroy()
 
@@ -345,7 +352,10 @@ class SocketGuard:
             self._reported_s[key, domain] = now_s
             suppressed, self._suppressed = self._suppressed, 0
         who = {"fingerprint": None if key is None else fingerprint(key), "domain": domain, "address": address}
-        self._on_event("AUTH_DENIED", Level.WARN, {**who, "suppressed": suppressed})
+        try:
+            self._on_event("AUTH_DENIED", Level.WARN, {**who, "suppressed": suppressed})
+        except Exception as error:  # of who hears of it, such as a publisher that is closing: no thread ends by that
+            _LOG.warning("a refused client cannot be reported: %s", error)
 
 
 class _Authenticator(ThreadAuthenticator):

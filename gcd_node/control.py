@@ -71,17 +71,17 @@ class ControlServer:
             "viewer": ReplyCache(_KEEP_S, most_bytes=4 * 1024 * 1024),
         }
         self._closing = threading.Event()
-        self._guard = SocketGuard(security, on_event)
+        self.guard = SocketGuard(security, on_event)
         try:
-            self._socket = self._guard.context.socket(zmq.ROUTER)
+            self._socket = self.guard.context.socket(zmq.ROUTER)
             self._socket.set(zmq.ROUTER_HANDOVER, 0)
             self._socket.set(zmq.MAXMSGSIZE, _LARGEST_READ)  # of each part; who sends more is disconnected
             for limit in (zmq.RCVHWM, zmq.SNDHWM):
                 self._socket.set(limit, _QUEUED)
             self._socket.set(zmq.LINGER, 0)
-            self.endpoint = self._guard.bind(self._socket, endpoint, "control")
+            self.endpoint = self.guard.bind(self._socket, endpoint, "control")
         except BaseException:
-            self._guard.close()
+            self.guard.close()
             raise
         self._security = security if self.endpoint.startswith("tcp://") else None
         self.thread = threading.Thread(target=self._serve, name="control", daemon=True)
@@ -92,9 +92,9 @@ class ControlServer:
         if self._closing.is_set():
             return
         self._closing.set()
-        self._guard.wake()
+        self.guard.wake()
         self.thread.join()
-        self._guard.close()
+        self.guard.close()
 
     def __enter__(self) -> "ControlServer":
         return self
@@ -107,7 +107,7 @@ class ControlServer:
     def _serve(self) -> None:
         try:
             while not self._closing.is_set():
-                self._guard.wait()
+                self.guard.wait()
                 if self._socket.poll(0) and not self._closing.is_set():
                     try:
                         self._receive()

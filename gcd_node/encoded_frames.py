@@ -13,14 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gcd_model import (
-    Augmentation,
-    Clip,
-    PoseError,
-    SourceFeatures,
-    ViewSynthesizer,
-    require_motion,
-)
+from gcd_model import Augmentation, Clip, PoseError, SourceFeatures, ViewSynthesizer, require_motion
 from gcd_node.errors import DepthError
 from gcd_node.preprocess import to_clip_tensor
 from gcd_node.sources.depth import DepthSource

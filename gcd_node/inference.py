@@ -26,16 +26,7 @@ from gcd_model import (
 from gcd_node.encoded_frames import EncodedFrames, window_seed
 from gcd_node.errors import DepthError
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
-from gcd_node.model import (
-    Failure,
-    FailureCounter,
-    ModelSlot,
-    Pulse,
-    model_errors,
-    oom_levels,
-    render_grey,
-    tried,
-)
+from gcd_node.model import Failure, FailureCounter, ModelSlot, Pulse, model_errors, oom_levels, render_grey, tried
 from gcd_node.status import Announcer, Condition
 from gcd_node.stream_context import StreamContext, drawing_options, sampler_in_use
 from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualView, VirtualViews

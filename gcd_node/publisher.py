@@ -53,6 +53,7 @@ class Publisher:
     linger_ms: how long an orderly close waits for readers to take the end and leave; drain_ms: the same in lockstep,
         and there also how long a queued message may wait for a reader.
     queue_size: messages between the callers and the thread.
+    guard: of its sockets.
     endpoint, status_endpoint: where data and status were bound, with the port that was chosen if 0 was asked for.
 
     Raises:
@@ -86,14 +87,14 @@ class Publisher:
         self._last_notes: dict[bytes, bytes] = {}
         self._topics: Counter[bytes] = Counter()  # subscriptions on the data socket; of the publisher's thread alone
         self._readers = (0, 0, 0)  # all, of views, of previews; never changed, only replaced
-        self._guard = SocketGuard(security, on_event)
+        self.guard = SocketGuard(security, on_event)
         try:
-            self._data = _xpub(self._guard.context, _DATA_HWM, no_drop=lockstep)
-            self.endpoint = self._guard.bind(self._data, config.data, "data")
-            self._status = _xpub(self._guard.context, _STATUS_HWM, no_drop=False)
-            self.status_endpoint = self._guard.bind(self._status, config.status, "status")
+            self._data = _xpub(self.guard.context, _DATA_HWM, no_drop=lockstep)
+            self.endpoint = self.guard.bind(self._data, config.data, "data")
+            self._status = _xpub(self.guard.context, _STATUS_HWM, no_drop=False)
+            self.status_endpoint = self.guard.bind(self._status, config.status, "status")
         except BaseException:
-            self._guard.close()
+            self.guard.close()
             raise
         self._thread = threading.Thread(target=self._serve, name="publisher", daemon=True)
         self._thread.start()
@@ -124,7 +125,7 @@ class Publisher:
         """
         self.check()
         self._preview = made
-        self._guard.wake()
+        self.guard.wake()
 
     def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None:
         """Queue an end-of-stream message, to leave `delay_ms` (else end_delay_ms) after the last window; never dropped.
@@ -144,7 +145,7 @@ class Publisher:
         with self._note_order:
             self.check()
             self._notes.put(self._encoded(StatusMessage(topic=topic, header=header, fields=fields)))
-        self._guard.wake()
+        self.guard.wake()
 
     def stop_waiting(self) -> None:
         """Stop waiting for readers, for a node that is stopping: what does not leave in `linger_ms` is lost."""
@@ -183,11 +184,11 @@ class Publisher:
         self._is_abandoned |= not orderly
         if is_first:
             self._closing_s = time.monotonic()
-        self._guard.wake()
+        self.guard.wake()
         if not is_first:
             return
         self._thread.join()
-        self._guard.close()
+        self.guard.close()
         if self._failure is not None:
             self.check()
 
@@ -218,7 +219,7 @@ class Publisher:
             except queue.Full:
                 self.check()
             else:
-                self._guard.wake()
+                self.guard.wake()
                 return
         if follow_s is not None:
             self._queue.maxsize += 1  # room of its own: an end is never lost to a full queue
@@ -226,7 +227,7 @@ class Publisher:
             self._queue.put_nowait((part, follow_s))
         except queue.Full:
             self._dropped += 1
-        self._guard.wake()
+        self.guard.wake()
 
     # What follows runs in the publisher thread alone.
 
@@ -255,7 +256,7 @@ class Publisher:
             if queued is None:
                 if closing:
                     return
-                self._guard.wait(None)
+                self.guard.wait(None)
                 progress = time.monotonic()
             elif self._send(*queued):
                 queued, progress = None, time.monotonic()
@@ -269,7 +270,7 @@ class Publisher:
                 )
             else:
                 progress = progress if closing else time.monotonic()
-                self._guard.wait(_RETRY_MS)
+                self.guard.wait(_RETRY_MS)
 
     def _send(self, part: bytes, follow_s: float | None) -> bool:
         """Whether it left; if not, try again later."""
@@ -305,7 +306,7 @@ class Publisher:
         until += self._left_s(until)
         while self._ends and self._readers[0] and time.monotonic() < until:
             self._serve_sockets()
-            self._guard.wait(_REPEAT_MS)
+            self.guard.wait(_REPEAT_MS)
             self._try_send(next(ends))
             if self._is_abandoned:
                 return

@@ -80,7 +80,6 @@ def open_session(
         node, cameras and commands go on.
     viewer: start `gcd-node viewer` beside the node, if its launch file has a [viewer]; else that is only checked.
     show_page: let it open its page in a browser. parts: others than those that the launch file names.
-
     Raises:
         EndpointError, ConfigError: see Publisher, ControlServer, metrics_server(), Recorder, ViewerConfig. Nothing
             stays open.
@@ -103,6 +102,7 @@ def open_session(
             on_window=on_window,
             service=service,
         )
+        node.needed += publisher.guard.threads
         control: ControlServer | None = None
         if config.control.endpoint is not None:
             control = ControlServer(
@@ -114,7 +114,7 @@ def open_session(
                 security=security,
             )
             stack.enter_context(control)
-            node.needed.append(control.thread)
+            node.needed += [control.thread, *control.guard.threads]
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))
         if config.viewer.http is not None:

@@ -73,16 +73,12 @@ def launch(changes: Sequence[str] = ()) -> NodeConfig:
 def parts(model: FakeSynthesizer | None = None, source: FakeSource | None = None) -> Parts:
     chosen = LevelModel(traits()) if model is None else model
     return Parts(
-        open_source=lambda _: FakeSource(WINDOWS * FRAMES) if source is None else source,
-        load_model=lambda _: chosen,
+        open_source=lambda _: FakeSource(WINDOWS * FRAMES) if source is None else source, load_model=lambda _: chosen
     )
 
 
 def made_run(
-    folder: Path,
-    model: FakeSynthesizer | None = None,
-    source: FakeSource | None = None,
-    changes: Sequence[str] = (),
+    folder: Path, model: FakeSynthesizer | None = None, source: FakeSource | None = None, changes: Sequence[str] = ()
 ) -> RunFolder:
     return replay(launch(changes), folder, parts=parts(model, source))
 

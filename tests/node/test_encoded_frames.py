@@ -218,10 +218,7 @@ def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> No
 
 @pytest.mark.parametrize(
     "other",
-    [
-        changed(CONTEXT, config=config("strict = true", stride=5)),
-        changed(CONTEXT, mount=CameraMount(height_m=2.0)),
-    ],
+    [changed(CONTEXT, config=config("strict = true", stride=5)), changed(CONTEXT, mount=CameraMount(height_m=2.0))],
 )
 def test_what_was_encoded_on_other_terms_is_encoded_anew(other: StreamContext) -> None:
     (window,) = placed(ten_fps(T))

@@ -304,8 +304,8 @@ def test_a_control_thread_that_died_is_an_error_and_the_watchdog_is_not_fed(
     service, heard = watchdog
     with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, service=service) as rig:
         rig.await_status(lambda status: status["ready"])
-        monkeypatch.setattr(rig.control._guard, "wait", lambda: 1 / 0)
-        rig.control._guard.wake()
+        monkeypatch.setattr(rig.control.guard, "wait", lambda: 1 / 0)
+        rig.control.guard.wake()
         assert rig.await_event("THREAD_DIED")["thread"] == "control"
         status = rig.await_status(lambda status: "THREAD_DIED" in status["reasons"])
         assert_not_fed(rig, heard, status)

@@ -219,7 +219,7 @@ def test_a_reader_that_was_busy_at_the_end_is_told_of_every_end(tmp_path, contex
 def test_what_stops_the_thread_reaches_the_caller(tmp_path, monkeypatch) -> None:
     publisher = opened(tmp_path)
     monkeypatch.setattr(publisher, "_serve_sockets", lambda: 1 / 0)
-    publisher._guard.wake()
+    publisher.guard.wake()
     publisher._thread.join(5)
     for call in (publisher.check, lambda: publisher.send(window()), publisher.close):
         with pytest.raises(NodeError):

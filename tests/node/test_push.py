@@ -154,10 +154,7 @@ def test_the_example_for_opencv_pushes_a_file(endpoint: str, tmp_path: Path) -> 
     video = write_video(tmp_path / "clip.mkv", [RED] * 200, fps=25.0)
     script = Path(__file__).parents[2] / "launch" / "clients" / "push_opencv.py"
     command = [sys.executable, script, video, "--endpoint", endpoint]
-    with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, env=environment()) as process,
-        opened(endpoint) as source,
-    ):
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment()) as process, opened(endpoint) as source:
         frames = [taken(source) for _ in range(5)]
         process.kill()
     assert np.abs(frames[0].image.astype(int) - (250, 10, 20)).max() <= 10

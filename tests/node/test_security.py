@@ -16,7 +16,7 @@ from gcd_client.subscriber import ReceivedView, ViewSubscriber
 from gcd_node.auth import AllowList, Client, ServerSecurity, load_server_security, new_key_pair, write_key_pair
 from gcd_node.config import PublishConfig, SecurityConfig
 from gcd_node.control import ControlServer
-from gcd_node.errors import ConfigError, OutputError
+from gcd_node.errors import ConfigError, NodeError, OutputError
 from gcd_node.publisher import Publisher
 
 pytestmark = pytest.mark.timeout(90)
@@ -125,6 +125,24 @@ def test_a_list_that_breaks_lets_nobody_in_and_goes_on() -> None:
             until(lambda: publisher.stats.subscribers == 1)
             publisher.send(window())
             assert reader.receive(20_000) is not None
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("dies", [False, True])
+def test_a_refusal_that_cannot_be_told_holds_up_no_end(dies: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[object] = []
+
+    def closing(*event: object) -> bool:
+        told.append(event)
+        raise NodeError("the publisher is closed; make a new one")
+
+    publisher = Publisher(PublishConfig(data=LOOPBACK, status=LOOPBACK), closing, security=SECURITY)
+    (thread,) = publisher.guard.threads
+    if dies:
+        monkeypatch.setattr(publisher.guard._authenticator, "callback", closing)
+    with ViewSubscriber(publisher.endpoint, "top", keys=keys(STRANGER)):
+        until(lambda: bool(told) and thread.is_alive() is not dies)
+    publisher.close()
 
 
 def test_keys_for_a_node_that_uses_none_are_refused_with_a_reason(node: FakeNode) -> None:

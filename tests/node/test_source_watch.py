@@ -36,12 +36,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 class Reader:
     """Iterates a watch in a thread, as the node does, and writes down what it is told."""
 
-    def __init__(
-        self,
-        first: FrameSource,
-        reopen: Callable[[SourceInfo], FrameSource],
-        **patience: Any,
-    ) -> None:
+    def __init__(self, first: FrameSource, reopen: Callable[[SourceInfo], FrameSource], **patience: Any) -> None:
         self.told: list[str] = []
         self.details: list[str] = []
         self.infos: list[SourceInfo] = []
@@ -80,9 +75,7 @@ class Reader:
 
 @contextmanager
 def watching(
-    first: FrameSource,
-    bench: Bench | Callable[[SourceInfo], FrameSource] | None = None,
-    **patience: Any,
+    first: FrameSource, bench: Bench | Callable[[SourceInfo], FrameSource] | None = None, **patience: Any
 ) -> Iterator[Reader]:
     """A reader, until the block is left; bench: what it is opened from again."""
     plugged = bench or Bench()

@@ -16,14 +16,7 @@ from media import HEIGHT, WIDTH, environment, flat, ramp, write_pictures, write_
 
 from gcd_node.errors import SourceError
 from gcd_node.sources import resolve_path
-from gcd_node.sources.files import (
-    ImageFolder,
-    MovingPattern,
-    VideoFile,
-    list_pictures,
-    read_picture,
-    rising_stamp_ns,
-)
+from gcd_node.sources.files import ImageFolder, MovingPattern, VideoFile, list_pictures, read_picture, rising_stamp_ns
 from gcd_node.window import WindowBuilder
 
 COUNT = 12

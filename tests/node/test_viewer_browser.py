@@ -211,10 +211,7 @@ def test_a_hung_node_is_shown_as_dead_and_as_alive_once_it_goes_on_and_a_killed_
 
 def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Page, tmp_path: Path) -> None:
     camera, model = Camera(fps=10.0), FakeSynthesizer(painting_traits())
-    with (
-        Rig(tmp_path, Bench(camera), model, views="[view.main]", watched=False) as rig,
-        viewer_of(tmp_path) as viewer,
-    ):
+    with Rig(tmp_path, Bench(camera), model, views="[view.main]", watched=False) as rig, viewer_of(tmp_path) as viewer:
         rig.await_state("active")
         page.open(viewer.operator_url)
         until(lambda: rig.publisher.stats.subscribers == 6)
