@@ -105,8 +105,8 @@ class LiveCamera:
             SourceAbsentError: no such camera, or no picture in time. SourceError: it is there, but cannot be used.
         """
         with self._changed:
-            left_s = max(0.0, self._until_s - time.monotonic())
-            self._changed.wait_for(lambda: self._described or self._over or self._closed, left_s)
+            while not (self._described or self._over or self._closed or time.monotonic() >= self._until_s):
+                self._changed.wait(max(0.0, self._until_s - time.monotonic()))
             if self._described is not None:
                 return self._described
             self._closed = True
@@ -155,6 +155,7 @@ class LiveCamera:
         try:
             if not self._alone.acquire(timeout=self._open_timeout_s):
                 raise SourceAbsentError(f"the attempt before is still busy with {self._name}; {self._hint}")
+            self._until_s = time.monotonic() + self._open_timeout_s  # its own time, whatever the one before took
             try:
                 if not self._closed:
                     with closing(self._open_driver()) as driver:

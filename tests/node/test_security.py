@@ -137,11 +137,10 @@ def test_a_refusal_that_cannot_be_told_holds_up_no_end(dies: bool, monkeypatch: 
         raise NodeError("the publisher is closed; make a new one")
 
     publisher = Publisher(PublishConfig(data=LOOPBACK, status=LOOPBACK), closing, security=SECURITY)
-    (thread,) = publisher.guard.threads
     if dies:
         monkeypatch.setattr(publisher.guard._authenticator, "callback", closing)
     with ViewSubscriber(publisher.endpoint, "top", keys=keys(STRANGER)):
-        until(lambda: bool(told) and thread.is_alive() is not dies)
+        until(lambda: bool(told) and publisher.guard.threads[0].is_alive() is not dies)
     publisher.close()
 
 

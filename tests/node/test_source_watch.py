@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 from unittest.mock import create_autospec
 
 import pytest
@@ -12,7 +12,7 @@ from cameras import FPS, Bench, Camera, until
 from fake_camera import FakeVideoCapture
 from media import flat
 
-from gcd_node.errors import SourceError, SourceLostError
+from gcd_node.errors import SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import SourceState
 from gcd_node.sources import V4l2Source
@@ -215,3 +215,16 @@ def test_patience_follows_the_rate_and_two_seconds() -> None:
     assert patience_s(V4l2Source(), 5.0) == pytest.approx((0.6, 1.8))
     assert patience_s(V4l2Source(), 1.0) == pytest.approx((3.0, 6.0))
     assert patience_s(V4l2Source(stall_ms=500.0), FPS) == (0.5, 1.8)
+
+
+def test_an_opening_that_waits_for_the_one_before_has_its_own_time_afterwards() -> None:
+    alone = threading.Lock()
+
+    def absent() -> NoReturn:
+        time.sleep(0.6)
+        raise SourceAbsentError("it opened too late to be there")
+
+    assert alone.acquire()
+    threading.Timer(0.7, alone.release).start()
+    with pytest.raises(SourceAbsentError, match="too late"):
+        assert LiveCamera("slow", absent, open_timeout_s=1.0, hint="wait", alone=alone).info
