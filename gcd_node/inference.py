@@ -376,6 +376,6 @@ class Renderer:
         self.counts.render_s.append(seconds)
         self.counts.age_ms.append(age_ms)
         if self._model.traits.device.startswith("cuda"):
-            self._health.gpu_mem_mb = torch.cuda.memory_allocated() / 1e6
+            self._health.gpu_mem_mb = torch.cuda.memory_reserved() / 1e6
         if self._on_window is not None:
             self._on_window(WindowReport(window=job.window, render_s=seconds, age_ms=age_ms))

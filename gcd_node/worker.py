@@ -10,7 +10,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TypeVar
 
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError
@@ -48,7 +48,8 @@ class ModelWorker:
         """
         self._threads.add(threading.get_ident())
         try:
-            with interruptible(self._renderer.cancel, self._threads):
+            on_cpu = self._model.traits.device == "cpu"  # elsewhere a step is short, and compiled code knows no hooks
+            with interruptible(self._renderer.cancel, self._threads) if on_cpu else nullcontext():
                 self._work(newest)
         except Cancelled:
             _LOG.info("the window in work was abandoned")

@@ -187,7 +187,7 @@ def own_memory(options: argparse.Namespace, name: str) -> MemoryFigures:
     return MemoryFigures(
         resident_gb=peak["resident"] / _GIGABYTE,
         private_gb=peak["private"] / _GIGABYTE,
-        device_gb=torch.cuda.max_memory_allocated() / _GIGABYTE if on_gpu else None,
+        device_gb=torch.cuda.max_memory_reserved() / _GIGABYTE if on_gpu else None,
     )
 
 
@@ -224,9 +224,12 @@ def markdown(record: dict) -> str:
         parts += ["**Most memory of a fresh process that does one such window, GB; mapped files count as resident**"]
         parts += [_table(("", "resident", "private", "on the GPU"), rows)]
     if report.differences:
-        rows = [(each.name, _figure(each.latents), _figure(each.pictures)) for each in report.differences]
-        parts += ["**Largest difference of a window from the first row's, of its largest value**"]
-        parts += [_table(("", "latents", "pictures"), rows)]
+        rows = [
+            (each.name, _figure(each.latents), _figure(each.pictures), _figure(each.psnr_db))
+            for each in report.differences
+        ]
+        parts += ["**Largest difference of a window from the first row's, of its largest value; PSNR of its pictures**"]
+        parts += [_table(("", "latents", "pictures", "dB"), rows)]
     return "\n\n".join(parts) + "\n"
 
 

@@ -288,7 +288,11 @@ class _Network:
 
 
 def compile_modules(modules: DiffusersModules) -> DiffusersModules:
-    """Put every network behind torch.compile, in place; the first windows then compile."""
+    """Put every network behind torch.compile, in place; the first windows then compile. On a GPU as one tunes it there:
+    channels last, and every kernel the fastest that is found."""
     for module in (modules.unet, modules.vae.encoder, modules.vae.decoder, modules.tower):
-        module.compile()
+        if next(module.parameters()).is_cuda:
+            module.to(memory_format=torch.channels_last).compile(mode="max-autotune")
+        else:
+            module.compile()
     return modules

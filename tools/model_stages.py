@@ -23,6 +23,7 @@ from gcd_model.clip import Clip, RenderOptions, View
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.diffusion import Schedule, unit_noise
+from gcd_model.engines.cuda import psnr_db
 from gcd_model.engines.torch import Engine, TorchEngine, arrange
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
@@ -92,11 +93,13 @@ class Implementation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class Difference(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Of another implementation's window from ours: largest difference over our largest value."""
+    """Of another implementation's window from ours: largest difference over our largest value; PSNR of the pictures,
+    which in half precision says more."""
 
     name: str
     latents: float
     pictures: float | None
+    psnr_db: float | None = None
 
 
 class ModelBench(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="model", tag_field="kind"):
@@ -429,6 +432,7 @@ class _Rounds:
                 name=name,
                 latents=_relative_difference(ours.latents, self._views[name].latents),
                 pictures=_relative_difference(ours.samples, self._views[name].samples) if decoded else None,
+                psnr_db=psnr_db(self._views[name].samples, ours.samples) if decoded else None,
             )
             for name in others
         )

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from cameras import Bench, until
 from fakes import FakeSource, FakeSynthesizer, traits
 from rig import LOCKSTEP, Rig
 from torch import nn
+from torch.nn.modules import module
 
 from gcd_client.control import Code
 from gcd_model import Augmentation, Cancelled, Clip, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
@@ -145,3 +147,14 @@ def test_a_node_that_is_told_to_stop_interrupts_nobody_elses_network() -> None:
         other.join(30)
     assert len(done) == 1
     Pause()(x)  # and not here any more
+
+
+@pytest.mark.parametrize(("device", "watched"), [("cpu", 1), ("cuda:0", 0)])
+def test_compiled_work_of_a_gpu_meets_no_hook(tmp_path: Path, device: str, watched: int) -> None:
+    hooks: list[int] = []
+    model = FakeSynthesizer(
+        replace(traits(), device=device), lambda _: hooks.append(len(module._global_forward_pre_hooks))
+    )
+    with Rig(tmp_path, lambda _: FakeSource(10_000), model, config=LOCKSTEP) as rig:
+        rig.await_views(1)
+    assert set(hooks) == {watched}
