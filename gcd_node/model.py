@@ -169,9 +169,9 @@ class Pulse:
         """This thread begins a step."""
         self._begin(time.monotonic(), "degraded" if self._given_up else "busy")
 
-    def load(self) -> None:
-        """This thread begins to load a model, which takes as long as it takes."""
-        self._begin(math.inf, "loading")
+    def load(self, state: ModelState = "loading") -> None:
+        """This thread begins to load a model or to warm it up, which takes as long as it takes."""
+        self._begin(math.inf, state)
 
     def rest(self) -> None:
         """This thread waits for work."""

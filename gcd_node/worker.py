@@ -153,8 +153,7 @@ class ModelWorker:
 
     def _warm_up(self) -> None:
         """Render a grey clip in one step, so that the first window does not pay for what happens only once."""
-        self._pulse.beat()
-        self._health.model = "warming"
+        self._pulse.load("warming")  # code may be compiled: minutes, in which the engine beats
         try:
             with model_errors():
                 self._renderer.warm_up()

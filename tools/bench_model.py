@@ -37,6 +37,7 @@ from gcd_model import ModelError, OptionError
 ENGINES = {
     "torch": "ours",
     "cuda": "ours on cuda",
+    "cuda-tuned": "ours on cuda, tuned",
     "cuda-float32-decoder": "ours on cuda, float32 decoder",
     "compiled": "ours, compiled alone",
     "graphs": "ours, graphs alone",

@@ -48,6 +48,7 @@ STAGES: tuple[StageName, ...] = get_args(StageName)
 
 VARIANTS = {
     "ours on cuda": {},
+    "ours on cuda, tuned": {"tuned": True},
     "ours on cuda, float32 decoder": {"decoder": "float32"},
     "ours, compiled alone": {"graphs": False},
     "ours, graphs alone": {"backend": None, "channels_last": False, "decoder": "float32"},

@@ -63,7 +63,7 @@ def test_a_second_process_compiles_nothing_anew(tmp_path: Path) -> None:
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
 def test_compiled_blocks_are_plain_torch(backend: str) -> None:
     plain = tiny_synthesizer()
-    options = CudaOptions(backend=backend, channels_last=backend == "aot_eager", decoder="float32")
+    options = CudaOptions(backend=backend, channels_last=backend == "eager", decoder="float32")
     engine = Synthesizer(plain.networks, plain.traits, CudaEngine(twin(plain.networks), options))
     path = plain.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
     asked = RenderOptions(steps=3, guidance=(1.0, 2.5))

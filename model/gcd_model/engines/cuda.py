@@ -8,11 +8,12 @@ import logging
 import math
 import os
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from itertools import chain
 from pathlib import Path
-from typing import Concatenate, Literal, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeAlias, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -52,16 +53,18 @@ Made = TypeVar("Made")
 class CudaOptions:
     """What the engine does to be fast.
 
-    backend: of torch.compile; None runs the blocks as they are. graphs: record steps, encoders and decoder as CUDA
+    backend: of torch.compile; None runs the blocks as they are. tuned: inductor tries kernels for each shape, which
+        takes many times as long to compile. graphs: record steps, encoders and decoder as CUDA
         graphs. channels_last: lay convolutions out as tensor cores read them.
-    decoder: its precision; "checked" means bfloat16 where its pictures reach 50 dB against float32, see
-        `checked_decoder`.
+    decoder: its precision; "checked" means float16, else bfloat16, where its pictures reach 50 dB against float32,
+        see `checked_decoder`.
     """
 
     backend: str | None = "inductor"
+    tuned: bool = False
     graphs: bool = True
     channels_last: bool = True
-    decoder: Literal["checked", "float32", "bfloat16"] = "checked"
+    decoder: Literal["checked", "float32", "float16", "bfloat16"] = "checked"
 
     @classmethod
     def of_device(cls, device: torch.device) -> Self:
@@ -72,18 +75,24 @@ class CudaOptions:
 def _forgetful(
     method: Callable[Concatenate["CudaEngine", Given], Made],
 ) -> Callable[Concatenate["CudaEngine", Given], Made]:
-    """The method; when the device is full, what was recorded is dropped, so that its memory is free again."""
+    """The method, on the engine's own device; when that is full, what was recorded is dropped, so that its memory is
+    free again."""
 
     @wraps(method)
     def guarded(engine: "CudaEngine", *args: Given.args, **kwargs: Given.kwargs) -> Made:
         try:
-            with torch.inference_mode():
+            with torch.inference_mode(), _on(engine.like.device):
                 return method(engine, *args, **kwargs)
         except torch.OutOfMemoryError:
             engine.forget()
             raise
 
     return guarded
+
+
+def _on(device: torch.device) -> AbstractContextManager[object]:
+    """Streams, events and graphs are of the current device."""
+    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
 class CudaEngine:
@@ -103,11 +112,12 @@ class CudaEngine:
         if options.channels_last:
             channels_last(networks)
         prepare(networks)
-        update = _compiled(networks, options)
-        self._networks, self._update = networks, update
+        self._beat: Callable[[], object] = lambda: None  # called before each piece of code is compiled
+        self._networks, self._update = networks, _compiled(networks, options, lambda: self._beat())
         self._plain = TorchEngine(networks)
         on_gpu = options.graphs and self.like.device.type == "cuda"
-        self._recorder = recorder or (CudaGraphs() if on_gpu else Unrecorded())
+        with _on(self.like.device):
+            self._recorder = recorder or (CudaGraphs() if on_gpu else Unrecorded())
         self._memories: Recent[StepMemory] = Recent()
         self._tower = RecordedCall(self._tokens_of, self._recorder)
         self._encoder = RecordedCall(lambda frames: networks.condition_encoder(frames).mean, self._recorder)
@@ -141,9 +151,12 @@ class CudaEngine:
 
     @_forgetful
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        """See Engine. With somebody to tell or to ask, each step is waited for before the next is queued."""
+        """See Engine. With somebody to tell or to ask, each step is waited for before the next is queued; while code
+        is compiled, progress is told of, as none."""
         start = start.to(self.like.device)
         widths = [2 if guided else 1 for guided in schedule.guided]
+        if options.progress is not None:
+            self._beat = partial(options.progress, 0, len(widths))
         memory = self._memories.get(
             (start.shape, given.latents.shape, given.tokens is None),
             lambda: StepMemory(self._plain, self._update, start, given, schedule),
@@ -174,29 +187,32 @@ class CudaEngine:
 
 
 def _settle_decoder(networks: Networks, precision: str) -> None:
-    if precision == "bfloat16":
-        networks.decoder = copy.deepcopy(networks.decoder).to(torch.bfloat16)  # others may share its weights
+    if precision in ("float16", "bfloat16"):
+        networks.decoder = copy.deepcopy(networks.decoder).to(getattr(torch, precision))  # others may share its weights
     elif precision == "checked":
         networks.decoder, psnr = checked_decoder(networks)
-        _LOG.info("decoder in %s: %.1f dB from float32 in bfloat16", networks.decoder.stem.weight.dtype, psnr)
+        _LOG.info("decoder in %s: %.1f dB from float32", networks.decoder.stem.weight.dtype, psnr)
 
 
-def _compiled(networks: Networks, options: CudaOptions) -> Update:
+def _compiled(networks: Networks, options: CudaOptions, beat: Callable[[], object]) -> Update:
     if options.backend is None:
         return solved
     if options.backend == "inductor":
         keep_compiled(cache_folder())
-    compile_regions(networks, options.backend)
-    return torch.compile(solved, backend=options.backend, fullgraph=True, dynamic=False)
+    backend = _heard(options.backend, beat, tuned=options.tuned)
+    compile_regions(networks, backend)
+    return torch.compile(solved, backend=backend, fullgraph=True, dynamic=False)
 
 
 # --- compiling networks region by region -----------------------------------------------------------------------------
 
 
 Model = TypeVar("Model", bound=nn.Module)
+Backend: TypeAlias = Callable[[Any, Any], Any]
 
 _REGIONS = (Stage, VideoResBlock, ResBlock, PixelAttention, ImageTransformerLayer, Downsample, Upsample)
 _SHAPES = 256  # of one kind of region: the U-Net has about 20, with and without the unconditional branch
+_ALL_SHAPES = 4096  # of all kinds together, as torch counts them by the code that every module's call begins with
 
 
 def twin(model: Model) -> Model:
@@ -217,7 +233,7 @@ def regions(model: nn.Module) -> Iterator[nn.Module]:
         yield from regions(child)
 
 
-def compile_regions(model: nn.Module, backend: str) -> int:
+def compile_regions(model: nn.Module, backend: str | Backend) -> int:
     """Compile every region, in place, when it is first called; how many there are. backend: of torch.compile."""
     _allow_shapes()
     found = list(regions(model))
@@ -226,12 +242,28 @@ def compile_regions(model: nn.Module, backend: str) -> int:
     return len(found)
 
 
+def _heard(name: str, beat: Callable[[], object], *, tuned: bool = False) -> Backend:
+    """A backend of torch.compile that says when it begins to compile something. tuned: see CudaOptions."""
+    from torch._dynamo import lookup_backend  # takes seconds
+    from torch._inductor import list_mode_options
+
+    compiler = lookup_backend(name)
+    how = {"config_patches": list_mode_options("max-autotune-no-cudagraphs")} if tuned and name == "inductor" else {}
+
+    def compiled(graph: Any, inputs: Any) -> Any:
+        beat()
+        return compiler(graph, inputs, **how)
+
+    return compiled
+
+
 def _allow_shapes() -> None:
     """All blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise."""
     from torch._dynamo import config  # takes seconds
 
     name = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before torch 2.7
-    setattr(config, name, max(_SHAPES, getattr(config, name)))
+    for each, least in ((name, _SHAPES), (f"accumulated_{name}", _ALL_SHAPES)):
+        setattr(config, each, max(least, getattr(config, each)))
 
 
 def channels_last(model: nn.Module) -> None:
@@ -264,11 +296,11 @@ def keep_compiled(folder: Path) -> None:
     os.environ.setdefault("TRITON_CACHE_DIR", str(folder / "triton"))
 
 
-# --- whether the decoder may compute in bfloat16 ---------------------------------------------------------------------
+# --- whether the decoder may compute in half precision ---------------------------------------------------------------
 
 
 WANTED_DB = 50.0
-"""PSNR against float32 from which bfloat16 is used: less than one level of 8 bits, on average."""
+"""PSNR against float32 from which half precision is used: less than one level of 8 bits, on average."""
 
 _COARSE = 16
 _SEED = 11
@@ -277,14 +309,18 @@ _FRAMES = 4  # decoding all of a clip in float32 without graphs takes more memor
 
 @torch.inference_mode()
 def checked_decoder(networks: Networks) -> tuple[TemporalDecoder, float]:
-    """The decoder, in bfloat16 if its pictures of a test clip are good enough for that; and their PSNR."""
+    """The decoder in float16, which has three bits more, or else in bfloat16, which no activation is too large for, if
+    its pictures of a test clip are good enough for that; and their PSNR, infinite for float32."""
     config, full = networks.config, networks.decoder
     frames = drifting_clip(min(config.frames, _FRAMES), config.height, config.width)
     encoder = networks.condition_encoder
     latents = torch.cat([encoder(each[None].to(encoder.stem.weight)).mean for each in frames]).float()
-    half = copy.deepcopy(full).to(torch.bfloat16)
-    psnr = psnr_db(*(to_pixels(each(latents.to(each.stem.weight), len(latents))) for each in (half, full)))
-    return half if psnr > WANTED_DB else full, psnr
+    truth = to_pixels(full(latents.to(full.stem.weight), len(latents)))
+    for precision in (torch.float16, torch.bfloat16):
+        half = copy.deepcopy(full).to(precision)
+        if (psnr := psnr_db(to_pixels(half(latents.to(precision), len(latents))), truth)) > WANTED_DB:
+            return half, psnr
+    return full, math.inf
 
 
 def drifting_clip(frames: int, height: int, width: int) -> Tensor:

@@ -59,11 +59,14 @@ class CudaGraphs:
         self._pool = torch.cuda.graph_pool_handle()
 
     def record(self, work: Replay) -> Replay:
-        graph = torch.cuda.CUDAGraph()
+        graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
         with _choosing_convolutions():
-            _warm(work)
+            _warm(work, side)
             try:
-                with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+                with (
+                    torch.compiler.set_stance("fail_on_recompile"),  # a compiler at work would be recorded, too
+                    torch.cuda.graph(graph, pool=self._pool, stream=side, capture_error_mode="thread_local"),
+                ):
                     work()
             except RuntimeError as error:  # ending a broken capture raises, too, and hides why it broke
                 if isinstance(error.__context__, torch.OutOfMemoryError):
@@ -78,18 +81,19 @@ class CudaGraphs:
 
 @contextmanager
 def _choosing_convolutions() -> Generator[None]:
-    """cuDNN tries its ways of convolving and takes the fastest: worth it for what is done again and again."""
+    """cuDNN tries its ways of convolving and takes the fastest: worth it for what is done again and again. Not where
+    results must be the same in every run."""
     before = torch.backends.cudnn.benchmark
-    torch.backends.cudnn.benchmark = True
+    torch.backends.cudnn.benchmark = not torch.backends.cudnn.deterministic
     try:
         yield
     finally:
         torch.backends.cudnn.benchmark = before
 
 
-def _warm(work: Replay) -> None:
-    """On a stream of its own, as captures demand."""
-    side, main = torch.cuda.Stream(), torch.cuda.current_stream()
+def _warm(work: Replay, side: torch.cuda.Stream) -> None:
+    """On the stream of the capture that follows: compiled code may ask which one it is on."""
+    main = torch.cuda.current_stream()
     side.wait_stream(main)
     with torch.cuda.stream(side):
         for _ in range(_WARM_RUNS):
