@@ -19,10 +19,10 @@ from msgspec.structs import replace
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.clip import Clip, View
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
-from gcd_model.diffusion import Schedule, unit_noise
+from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
 from gcd_model.engines.torch import Engine, TorchEngine, arrange
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
@@ -292,7 +292,7 @@ class Probe:
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         if "step" not in self._wanted:
-            return start / schedule.sigmas[0].item()
+            return start / schedule.steps[0].sigma
         if not self._watched:
             return self._engine.sample(start, given, schedule, options)
         self._watch.lap()

@@ -12,9 +12,9 @@ from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_d
 from tape import TapeRecorder
 from torch import nn
 
-from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.clip import Clip, View
 from gcd_model.config import ModelConfig
-from gcd_model.diffusion import Schedule
+from gcd_model.diffusion import RenderOptions, Schedule
 from gcd_model.engines.cuda import CudaEngine, CudaOptions, cache_folder, checked_decoder, keep_compiled, regions, twin
 from gcd_model.engines.graphs import CudaGraphs, Recent, Recorder, Replay, Unrecorded
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
@@ -92,6 +92,7 @@ def test_what_was_recorded_serves_other_clips_paths_steps_solvers_and_guidance(p
     others = (
         RenderOptions(steps=1, seed=3, guidance=(1.0, 4.0), motion_bucket=17.0),
         RenderOptions(steps=3, seed=4, solver="dpmpp_2m", guidance=(2.0, 1.0)),
+        RenderOptions(steps=2, seed=5, solver="heun"),
     )
     for seed, options in enumerate(others, start=1):
         clip = Clip(video=random_clip(seed=seed).video, fps=7.0)

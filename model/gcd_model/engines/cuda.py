@@ -18,9 +18,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.clip import RenderOptions
-from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, unit_noise
+from gcd_model.conditioning import Conditioning, ImageTransformerLayer, clip_pixels
+from gcd_model.diffusion import RenderOptions, Schedule, unit_noise, watched
 from gcd_model.engines.graphs import (
     CudaGraphs,
     Pace,
@@ -33,12 +32,9 @@ from gcd_model.engines.graphs import (
     solved,
 )
 from gcd_model.engines.torch import TorchEngine
-from gcd_model.errors import Cancelled
 from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import ImageTransformerLayer, clip_pixels
-from gcd_model.layers import Downsample, ResBlock, Upsample, prepare
+from gcd_model.layers import Downsample, ResBlock, Upsample, VideoResBlock, prepare
 from gcd_model.networks import Networks
-from gcd_model.temporal import VideoResBlock
 from gcd_model.unet import Stage
 from gcd_model.vae import PixelAttention, TemporalDecoder, to_pixels
 
@@ -152,15 +148,11 @@ class CudaEngine:
         if memory.record(set(widths), self._recorder):
             memory.begin(start, given, schedule)
         pace = Pace(self.like.device)
-        for i, branches in enumerate(widths):
-            if options.cancel is not None and options.cancel.is_set():
-                raise Cancelled(f"stopped before step {i + 1} of {len(widths)}")
+        for i in watched(len(widths), options):
             memory.seek(i)
-            memory.advance(branches)
+            memory.advance(widths[i])
             if options.cancel is not None or options.progress is not None:
                 pace.wait()
-            if options.progress is not None:
-                options.progress(i + 1, len(widths))
         return memory.result()
 
     @_forgetful

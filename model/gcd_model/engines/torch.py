@@ -9,14 +9,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.clip import RenderOptions
-from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, planned_denoiser, sample
+from gcd_model.conditioning import Conditioning, clip_pixels
+from gcd_model.diffusion import Backbone, GuidedDenoiser, RenderOptions, Schedule, sample
 from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample
 from gcd_model.networks import Networks
-from gcd_model.unet import StageInputs, UNetPlan, VideoUNet
+from gcd_model.unet import UNetPlan, VideoUNet
 
 
 class Engine(Protocol):
@@ -54,6 +52,13 @@ class Engine(Protocol):
         ...
 
 
+def sample_with(
+    backbone: Backbone, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions
+) -> Tensor:
+    """`Engine.sample` with whatever evaluates the U-Net."""
+    return sample(GuidedDenoiser(backbone, given, schedule, start), start, schedule.steps, options)
+
+
 class TorchEngine:
     """The networks as torch runs them. Implements Engine, and Backbone with the U-Net in its own precision."""
 
@@ -78,16 +83,13 @@ class TorchEngine:
         return None if embedder is None else embedder(path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = planned_denoiser(self, given, schedule)
-        start = start.to(self.like.device)
-        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
+        return sample_with(self, start.to(self.like.device), given, schedule, options)
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
-        unet, on_device = self._networks.unet, labels.to(self.like.device)
-        return unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
+        return self._networks.unet.plan(labels.to(self.like.device), given.vector, given.camera, given.tokens)
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
-        return self._networks.unet(rows.to(self.like), condition, inputs).float()
+    def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
+        return self._networks.unet(rows.to(self.like), condition, embeddings, crosses).float()
 
     def decode(self, latents: Tensor) -> Tensor:
         decoder = self._networks.decoder
@@ -217,10 +219,13 @@ def _laid_out(_module: nn.Module, _given: object, x: Tensor) -> Tensor:
     return x.contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)
 
 
-def _clip_by_clip(unet: VideoUNet, latents: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+def _clip_by_clip(
+    unet: VideoUNet, latents: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None = None
+) -> Tensor:
     """Clips that are large together go through it one after the other: nothing of one is held for the next."""
     clips, widest = len(latents) // unet.frames, unet.stem.out_channels * latents.shape[-2:].numel()
     if clips == 1 or _rows_at_once(widest) >= len(latents):
-        return VideoUNet.forward(unet, latents, condition, inputs).contiguous()
-    parts = zip(latents.chunk(clips), condition.chunk(clips), inputs.chunk(clips), strict=True)
+        return VideoUNet.forward(unet, latents, condition, embeddings, crosses).contiguous()
+    inputs = [[None] * clips if each is None else each.chunk(clips) for each in (embeddings, crosses)]
+    parts = zip(latents.chunk(clips), condition.chunk(clips), *inputs, strict=True)
     return torch.cat([VideoUNet.forward(unet, *part).contiguous() for part in parts])
