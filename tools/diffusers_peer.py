@@ -18,8 +18,7 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from gcd_model.conditioning import Conditioning, clip_pixels
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
-from gcd_model.diffusion import RenderOptions, Schedule
-from gcd_model.engines.torch import sample_with
+from gcd_model.engines.torch import Engine
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks, empty_networks
@@ -230,8 +229,8 @@ def _move_dormant(unet: nn.Module, like: Tensor) -> None:
                 setattr(module, name, nn.Parameter(parameter.to(like.device, like.dtype), requires_grad=False))
 
 
-class DiffusersEngine:
-    """Implements Engine. One token per clip is all that diffusers knows: it takes that of the first frame for all."""
+class DiffusersEngine(Engine):
+    """One token per clip is all that diffusers knows: it takes that of the first frame for all."""
 
     def __init__(self, modules: DiffusersModules) -> None:
         self._modules = modules
@@ -250,9 +249,6 @@ class DiffusersEngine:
 
     def camera(self, path: Trajectory) -> Tensor | None:
         return None
-
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        return sample_with(self, start.to(self.like.device), given, schedule, options)
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         """The noise level before the conditioning vector: diffusers embeds them itself, in every step."""

@@ -7,41 +7,28 @@ import copy
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Concatenate, Literal, ParamSpec, Self, TypeVar
+from typing import Literal, Self, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.conditioning import Conditioning, ImageTransformerLayer, clip_pixels
+from gcd_model.conditioning import Conditioning, ImageTransformerLayer
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise, watched
-from gcd_model.engines.graphs import (
-    CudaGraphs,
-    Pace,
-    Recent,
-    RecordedCall,
-    Recorder,
-    StepMemory,
-    Unrecorded,
-    Update,
-    solved,
-)
-from gcd_model.engines.torch import TorchEngine
-from gcd_model.geometry import Trajectory
+from gcd_model.engines.graphs import CudaGraphs, Recent, RecordedCall, Recorder, StepMemory, Update, solved
+from gcd_model.engines.torch import NetworkName, TorchEngine
 from gcd_model.layers import Downsample, ResBlock, Upsample, VideoResBlock, prepare
 from gcd_model.networks import Networks
 from gcd_model.unet import Stage
 from gcd_model.vae import PixelAttention, TemporalDecoder, to_pixels
 
 _LOG = logging.getLogger(__name__)
-
-Given = ParamSpec("Given")
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,24 +52,7 @@ class CudaOptions:
         return cls() if device.type == "cuda" else cls(backend=None, channels_last=False, decoder="float32")
 
 
-def _forgetful(
-    method: Callable[Concatenate["CudaEngine", Given], Made],
-) -> Callable[Concatenate["CudaEngine", Given], Made]:
-    """The method; when the device is full, what was recorded is dropped, so that its memory is free again."""
-
-    @wraps(method)
-    def guarded(engine: "CudaEngine", *args: Given.args, **kwargs: Given.kwargs) -> Made:
-        try:
-            with torch.inference_mode():
-                return method(engine, *args, **kwargs)
-        except torch.OutOfMemoryError:
-            engine.forget()
-            raise
-
-    return guarded
-
-
-class CudaEngine:
+class CudaEngine(TorchEngine):
     """Implements Engine. Not for several threads at once."""
 
     def __init__(
@@ -99,70 +69,54 @@ class CudaEngine:
         if options.channels_last:
             channels_last(networks)
         prepare(networks)
-        update = _compiled(networks, options)
-        self._networks, self._update = networks, update
-        self._plain = TorchEngine(networks)
+        super().__init__(networks)
+        self._update = _compiled(networks, options)
         on_gpu = options.graphs and self.like.device.type == "cuda"
-        self._recorder = recorder or (CudaGraphs() if on_gpu else Unrecorded())
+        self._recorder = recorder or (CudaGraphs() if on_gpu else Recorder())
         self._memories: Recent[StepMemory] = Recent()
-        self._tower = RecordedCall(self._tokens_of, self._recorder)
-        self._encoder = RecordedCall(lambda frames: networks.condition_encoder(frames).mean, self._recorder)
-        self._decoder = RecordedCall(lambda latents: networks.decoder(latents, len(latents)), self._recorder)
+        self._calls: Recent[RecordedCall] = Recent()
 
     def forget(self) -> None:
         """Drop what was recorded, and with it the memory it holds."""
         self._memories.clear()
-        for call in (self._tower, self._encoder, self._decoder):
-            call.forget()
+        self._calls.clear()
         self._recorder.forget()
 
-    @property
-    def like(self) -> Tensor:
-        return self._networks.unet.stem.weight
+    @contextmanager
+    def _forgetful(self) -> Generator[None]:
+        """When the device is full, what was recorded is dropped, so that its memory is free again."""
+        try:
+            with torch.inference_mode():
+                yield
+        except torch.OutOfMemoryError:
+            self.forget()
+            raise
 
-    @_forgetful
-    def tokens(self, frames: Tensor) -> Tensor | None:
-        tower = self._networks.image_encoder
-        if tower is None:
-            return None
-        return self._tower(clip_pixels(frames.to(self.like.device), tower.config.image_size).to(self.like))
+    def compute(self, name: NetworkName, given: Tensor) -> Tensor:
+        with self._forgetful():
+            work = partial(super().compute, name)
+            key = name, given.shape, given.dtype
+            return self._calls.get(key, lambda: RecordedCall(work, given, self._recorder))(given)
 
-    @_forgetful
-    def condition_mean(self, frames: Tensor) -> Tensor:
-        return self._encoder(frames.to(self.like))
-
-    @_forgetful
-    def camera(self, path: Trajectory) -> Tensor | None:
-        return self._plain.camera(path)
-
-    @_forgetful
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine. With somebody to tell or to ask, each step is waited for before the next is queued."""
-        start = start.to(self.like.device)
-        widths = [2 if guided else 1 for guided in schedule.guided]
-        memory = self._memories.get(
-            (start.shape, given.latents.shape, given.tokens is None),
-            lambda: StepMemory(self._plain, self._update, start, given, schedule),
-        )
-        memory.begin(start, given, schedule)
-        if memory.record(set(widths), self._recorder):
+        start, widths = start.to(self.like.device), [1 + guided for guided in schedule.guided]
+        done = torch.cuda.Event(blocking=True) if start.is_cuda and (options.cancel or options.progress) else None
+        with self._forgetful():
+            memory = self._memories.get(
+                (start.shape, given.latents.shape, given.tokens is None),
+                lambda: StepMemory(self, self._update, start, given, schedule),
+            )
             memory.begin(start, given, schedule)
-        pace = Pace(self.like.device)
-        for i in watched(len(widths), options):
-            memory.seek(i)
-            memory.advance(widths[i])
-            if options.cancel is not None or options.progress is not None:
-                pace.wait()
-        return memory.result()
-
-    @_forgetful
-    def decode(self, latents: Tensor) -> Tensor:
-        return self._decoder(latents.to(self._networks.decoder.stem.weight)).float()
-
-    def _tokens_of(self, pixels: Tensor) -> Tensor:
-        tower = self._networks.image_encoder
-        assert tower is not None, "only models with an image tower have tokens"
-        return tower(pixels)
+            if memory.record(set(widths), self._recorder):
+                memory.begin(start, given, schedule)
+            for i in watched(len(widths), options):
+                memory.seek(i)
+                memory.advance(widths[i])
+                if done is not None:
+                    done.record()
+                    done.synchronize()  # of the event alone: the device does not notice
+            return memory.result()
 
 
 def _settle_decoder(networks: Networks, precision: str) -> None:
@@ -209,34 +163,24 @@ def regions(model: nn.Module) -> Iterator[nn.Module]:
         yield from regions(child)
 
 
-def compile_regions(model: nn.Module, backend: str) -> int:
-    """Compile every region, in place, when it is first called; how many there are. backend: of torch.compile."""
-    _allow_shapes()
-    found = list(regions(model))
-    for region in found:
-        region.compile(backend=backend, fullgraph=True, dynamic=False)
-    return len(found)
-
-
-def _allow_shapes() -> None:
-    """All blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise."""
+def compile_regions(model: nn.Module, backend: str) -> None:
+    """Compile every region, in place, when it is first called. backend: of torch.compile."""
     from torch._dynamo import config  # takes seconds
 
+    # all blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise
     name = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before torch 2.7
     setattr(config, name, max(_SHAPES, getattr(config, name)))
+    for region in regions(model):
+        region.compile(backend=backend, fullgraph=True, dynamic=False)
 
 
 def channels_last(model: nn.Module) -> None:
     """Lay convolution weights out as tensor cores read them; what they make is then laid out so, too."""
+    orders = {4: torch.channels_last, 5: torch.channels_last_3d}
     for module in model.modules():
-        if isinstance(module, nn.Conv2d):
-            module.weight = _laid_out(module.weight, torch.channels_last)
-        elif isinstance(module, nn.Conv3d):
-            module.weight = _laid_out(module.weight, torch.channels_last_3d)
-
-
-def _laid_out(weight: Tensor, order: torch.memory_format) -> nn.Parameter:
-    return nn.Parameter(weight.contiguous(memory_format=order), requires_grad=False)
+        if isinstance(module, nn.Conv2d | nn.Conv3d):
+            weight = module.weight.contiguous(memory_format=orders[module.weight.ndim])
+            module.weight = nn.Parameter(weight, requires_grad=False)
 
 
 def cache_folder() -> Path:

@@ -3,8 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Hashable
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,42 +12,30 @@ from gcd_model.conditioning import Conditioning
 from gcd_model.diffusion import Backbone, GuidedDenoiser, Schedule, StepInputs, advanced, denoised, evaluated
 
 Kept = TypeVar("Kept")
-Replay = Callable[[], None]
+Replay = Callable[[], object]
 """Does the recorded work again, on the same memory."""
 
 _WARM_RUNS = 2  # the first compiles and lets cuDNN choose, the second shows that neither is left to do
-_SHAPES = 4
+_SHAPES = 16  # of all kinds of work together: a step guided or not, encoders, decoder
 
 
-class Recorder(Protocol):
-    """Whatever can turn work into a replay.
+class Recorder:
+    """What turns work into a replay: this one does the work anew each time, for a CPU and where graphs are not wanted.
 
-    The work reads and writes memory that stays where it is, and never asks what a tensor holds. Recording runs it at
-    least once.
+    The work reads and writes memory that stays where it is, and never asks what a tensor holds.
     """
 
     def record(self, work: Replay) -> Replay:
-        """The work, ready to be done again and again. Raises torch.OutOfMemoryError."""
-        ...
-
-    def forget(self) -> None:
-        """What was recorded is used no more."""
-        ...
-
-
-class Unrecorded:
-    """Implements Recorder: does the work anew each time. On a CPU, and where graphs are not wanted."""
-
-    def record(self, work: Replay) -> Replay:
+        """The work, done at least once, ready to be done again and again. Raises torch.OutOfMemoryError."""
         work()
         return work
 
     def forget(self) -> None:
-        """See Recorder."""
+        """What was recorded is used no more."""
 
 
-class CudaGraphs:
-    """Implements Recorder by CUDA graphs.
+class CudaGraphs(Recorder):
+    """Records CUDA graphs.
 
     All share one pool of memory, so that together they take as much as the largest: what a graph leaves in the pool
     must be copied out before another is replayed. Other threads may use the device meanwhile.
@@ -71,7 +58,7 @@ class CudaGraphs:
         return graph.replay
 
     def forget(self) -> None:
-        """See Recorder. A pool without graphs gives its memory back."""
+        """A pool without graphs gives its memory back."""
         self._pool = torch.cuda.graph_pool_handle()
 
 
@@ -116,59 +103,20 @@ class Recent(Generic[Kept]):
         """Keep nothing."""
         self._kept.clear()
 
-    def __len__(self) -> int:
-        return len(self._kept)
-
-
-@dataclass(frozen=True, slots=True)
-class _Recording:
-    given: Tensor
-    made: Tensor
-    replay: Replay
-
 
 class RecordedCall:
-    """A function of one tensor, recorded for every shape it is given. What it returns is the caller's own."""
+    """A function of one tensor, recorded for the shape of `given`. What it returns is the caller's own."""
 
-    def __init__(self, work: Callable[[Tensor], Tensor], recorder: Recorder) -> None:
-        self._work, self._recorder = work, recorder
-        self._recordings: Recent[_Recording] = Recent()
+    def __init__(self, work: Callable[[Tensor], Tensor], given: Tensor, recorder: Recorder) -> None:
+        self._given = given.clone()
+        self._made = torch.empty_like(work(self._given))  # lies outside the pool of the graphs
+        self._replay = recorder.record(lambda: self._made.copy_(work(self._given)))
 
     def __call__(self, given: Tensor) -> Tensor:
         """The function of `given`, on its device and in its precision."""
-        recording = self._recordings.get(tuple(given.shape), lambda: self._record(given))
-        recording.given.copy_(given)
-        recording.replay()
-        return recording.made.clone()
-
-    def forget(self) -> None:
-        """Drop what was recorded."""
-        self._recordings.clear()
-
-    def _record(self, given: Tensor) -> _Recording:
-        steady = given.clone()
-        made = torch.empty_like(self._work(steady))  # lies outside the pool of the graphs
-
-        def run() -> None:
-            made.copy_(self._work(steady))
-
-        return _Recording(given=steady, made=made, replay=self._recorder.record(run))
-
-
-class Pace:
-    """Lets the host wait for a step, so that it neither runs ahead of a wish to stop nor reports what is not done.
-
-    Waits for an event, which the device does not notice; on a CPU work is done when the call returns.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self._done = torch.cuda.Event(blocking=True) if device.type == "cuda" else None
-
-    def wait(self) -> None:
-        """Until all that was queued is done."""
-        if self._done is not None:
-            self._done.record()
-            self._done.synchronize()
+        self._given.copy_(given)
+        self._replay()
+        return self._made.clone()
 
 
 # --- a whole denoising step, in memory that stays where it is --------------------------------------------------------

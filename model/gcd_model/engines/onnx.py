@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from gcd_model.conditioning import Conditioning, camera_features, clip_pixels
 from gcd_model.config import ModelConfig
-from gcd_model.diffusion import RenderOptions, Schedule
 from gcd_model.engines.onnx_export import MANIFEST, read_manifest
-from gcd_model.engines.torch import sample_with
+from gcd_model.engines.torch import Engine
 from gcd_model.errors import CheckpointError, DeviceMemoryError, ModelError, OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import empty_networks
@@ -75,14 +74,16 @@ def provider_options(device: str, names: Sequence[str], cache: Path, *, half: bo
     return [*((name, options.get(name, {})) for name in names if name != CPU_PROVIDER), (CPU_PROVIDER, {})]
 
 
-class OnnxEngine:
-    """The networks of an export, clip by clip. Implements Engine, and Backbone with graphs for the U-Net."""
+class OnnxEngine(Engine):
+    """The networks of an export, clip by clip."""
 
     def __init__(self, graphs: "Sessions", config: ModelConfig) -> None:
         self._graphs, self._config = graphs, config
         self._frames = config.frames
-        self.like = torch.zeros(())
-        """See Engine: float32 on the CPU; onnxruntime copies to its own device."""
+
+    @property
+    def like(self) -> Tensor:
+        return torch.zeros(())  # float32 on the CPU; onnxruntime copies to its own device
 
     def tokens(self, frames: Tensor) -> Tensor | None:
         tower = self._config.image_encoder
@@ -105,9 +106,6 @@ class OnnxEngine:
         """See Engine; the features themselves, as the linear map that follows is part of a graph."""
         control = self._config.camera
         return None if control == "none" else camera_features(control, path)
-
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        return sample_with(self, start, given, schedule, options)
 
     def decode(self, latents: Tensor) -> Tensor:
         return self._graphs.run("decoder", latents)[0]

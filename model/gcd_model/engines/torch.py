@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from itertools import repeat
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +17,7 @@ from gcd_model.networks import Networks
 from gcd_model.unet import UNetPlan, VideoUNet
 
 
-class Engine(Protocol):
+class Engine(Backbone, Protocol):
     """Computes networks; what they are given and what becomes of it is the synthesizer's.
 
     Tensors may come from any device and are float32 unless `like` says otherwise; results lie where `like` does.
@@ -45,22 +45,19 @@ class Engine(Protocol):
 
         Raises Cancelled.
         """
-        ...
+        start = start.to(self.like.device)
+        return sample(GuidedDenoiser(self, given, schedule, start), start, schedule.steps, options)
 
     def decode(self, latents: Tensor) -> Tensor:
         """Unscaled latents of one clip [T, C, h, w] -> pictures float32 [T, 3, H, W], about [-1, 1]."""
         ...
 
 
-def sample_with(
-    backbone: Backbone, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions
-) -> Tensor:
-    """`Engine.sample` with whatever evaluates the U-Net."""
-    return sample(GuidedDenoiser(backbone, given, schedule, start), start, schedule.steps, options)
+NetworkName = Literal["image_encoder", "condition_encoder", "decoder"]
 
 
-class TorchEngine:
-    """The networks as torch runs them. Implements Engine, and Backbone with the U-Net in its own precision."""
+class TorchEngine(Engine):
+    """The networks as torch runs them, the U-Net in its own precision."""
 
     def __init__(self, networks: Networks) -> None:
         self._networks = networks
@@ -70,30 +67,35 @@ class TorchEngine:
         return self._networks.unet.stem.weight
 
     def tokens(self, frames: Tensor) -> Tensor | None:
-        tower = self._networks.image_encoder
+        tower = self._networks.config.image_encoder
         if tower is None:
             return None
-        return tower(clip_pixels(frames.to(self.like.device), tower.config.image_size).to(self.like))
+        return self.compute("image_encoder", clip_pixels(frames.to(self.like.device), tower.image_size).to(self.like))
 
     def condition_mean(self, frames: Tensor) -> Tensor:
-        return self._networks.condition_encoder(frames.to(self.like)).mean
+        return self.compute("condition_encoder", frames.to(self.like))
 
     def camera(self, path: Trajectory) -> Tensor | None:
         embedder = self._networks.camera
         return None if embedder is None else embedder(path)
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        return sample_with(self, start.to(self.like.device), given, schedule, options)
+    def decode(self, latents: Tensor) -> Tensor:
+        return self.compute("decoder", latents.to(self._networks.decoder.stem.weight)).float()
+
+    def compute(self, name: NetworkName, given: Tensor) -> Tensor:
+        """A network but for the U-Net, on its device and in its precision: token, mean of latents, or pictures."""
+        if name == "decoder":
+            return self._networks.decoder(given, len(given))
+        if name == "condition_encoder":
+            return self._networks.condition_encoder(given).mean
+        assert self._networks.image_encoder is not None, "only models with an image tower have tokens"
+        return self._networks.image_encoder(given)
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         return self._networks.unet.plan(labels.to(self.like.device), given.vector, given.camera, given.tokens)
 
     def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
         return self._networks.unet(rows.to(self.like), condition, embeddings, crosses).float()
-
-    def decode(self, latents: Tensor) -> Tensor:
-        decoder = self._networks.decoder
-        return decoder(latents.to(decoder.stem.weight), len(latents))
 
 
 # --- a CPU: working sets that fit its caches and the memory it has at hand -------------------------------------------
