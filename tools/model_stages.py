@@ -28,7 +28,7 @@ from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.loading import load_synthesizer, placed_synthesizer, random_weights
+from gcd_model.loading import device_named, load_synthesizer, placed_synthesizer, random_weights
 from gcd_model.networks import LoadedWeights, Networks, empty_networks, random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
@@ -138,7 +138,7 @@ def load_measured(
 ) -> Synthesizer:
     """What `load_synthesizer` loads, or FULL. stages: of FULL, networks of stages not asked for are small ones."""
     if weights == FULL:
-        return placed_synthesizer(_full_size(stages), device=device, dtype=dtype)
+        return placed_synthesizer(_full_size(stages), device_named(device), dtype=dtype)
     made = load_synthesizer(weights, device=device, dtype=dtype)
     if isinstance(made, LiveSynthesizer):
         raise OptionError(f"{made.traits.name} {NO_DIFFUSION}")
