@@ -65,7 +65,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     threads: Count | None = None
     quality: Literal["exact", "fast", "fastest"] = "exact"
     steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
-    solver: Literal["euler", "dpmpp_2m"] | None = None
+    solver: Literal["euler", "dpmpp_2m", "heun"] | None = None
     guidance: tuple[float, float] | None = None
     guidance_interval: tuple[NotNegative, NotNegative] | None = None
     samples: Count = 1

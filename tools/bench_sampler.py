@@ -13,7 +13,7 @@ from pathlib import Path
 from statistics import mean
 
 from gcd_model import RenderOptions, Sampler, Schedule, load_synthesizer, sampler_of
-from gcd_model.clip import SOLVERS
+from gcd_model.diffusion import SOLVERS
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr

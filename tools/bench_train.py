@@ -169,7 +169,7 @@ def kept_by_update(config):
         flops = FlopCounterMode(display=False, custom_mapping=attention)
         with flops, live, watched(unet, live, blocks):
             plan = unet.plan(torch.zeros(1, frames), vector, camera, tokens)
-            made = unet(rows, condition, plan.step(0))
+            made = unet(rows, condition, *plan.step(0))
             held = live.live
         del made, plan
     return Kept(

@@ -16,14 +16,13 @@ from msgspec.structs import replace
 from torch import Tensor, nn
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from gcd_model.clip import RenderOptions
-from gcd_model.conditioning import Conditioning
+from gcd_model.conditioning import Conditioning, clip_pixels
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
-from gcd_model.diffusion import GuidedDenoiser, Schedule, preconditioning, sample
+from gcd_model.engines.torch import Engine
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks, empty_networks
+from gcd_model.unet import UNetPlan
 from gcd_model.weights.names import Form, Levels, diffusers_source
 
 _DEFAULT_GROUPS = 32
@@ -230,8 +229,8 @@ def _move_dormant(unet: nn.Module, like: Tensor) -> None:
                 setattr(module, name, nn.Parameter(parameter.to(like.device, like.dtype), requires_grad=False))
 
 
-class DiffusersEngine:
-    """Implements Engine. One token per clip is all that diffusers knows: it takes that of the first frame for all."""
+class DiffusersEngine(Engine):
+    """One token per clip is all that diffusers knows: it takes that of the first frame for all."""
 
     def __init__(self, modules: DiffusersModules) -> None:
         self._modules = modules
@@ -251,40 +250,30 @@ class DiffusersEngine:
     def camera(self, path: Trajectory) -> Tensor | None:
         return None
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        start = start.to(self.like.device)
-        denoiser = GuidedDenoiser(_Network(self._modules.unet, given, schedule), schedule, start.device)
-        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
+    def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
+        """The noise level before the conditioning vector: diffusers embeds them itself, in every step."""
+        vector = given.vector.float().expand(len(labels), -1, -1)  # [S, K*T, V]
+        level = labels.to(vector.device)[:, None, None].expand(-1, vector.shape[1], 1)
+        return UNetPlan(torch.cat([level, vector], dim=2), given.tokens)
+
+    def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
+        frames = self._modules.unet.config["num_frames"]
+        assert crosses is not None  # `require_published` looked
+        clips, source = (each.to(self.like).unflatten(0, (-1, frames)) for each in (rows, condition))
+        first = embeddings[::frames]  # [R*K, 1 + V], of every clip's first frame
+        (raw,) = self._modules.unet(
+            torch.cat([clips, source], dim=2),
+            first[0, 0],
+            crosses[::frames, None],
+            first[:, 1:].to(self.like),
+            return_dict=False,
+        )
+        return raw.float().flatten(0, 1)
 
     def decode(self, latents: Tensor) -> Tensor:
         vae, frames = self._modules.vae, len(latents)
         (decoded,) = vae.decode(latents.to(vae.decoder.conv_in.weight), num_frames=frames, return_dict=False)
         return decoded
-
-
-class _Network:
-    """The U-Net as diffusers' pipeline calls it: both branches in one batch."""
-
-    def __init__(self, unet: UNetSpatioTemporalConditionModel, given: Conditioning, schedule: Schedule) -> None:
-        self._unet, self._frames = unet, len(schedule.guidance)
-        labels = preconditioning(schedule.sigmas[:-1]).c_noise
-        self._labels = labels.float().to(given.latents.device)
-        self._latents = given.latents.unflatten(0, (-1, self._frames))  # [R*K, T, C', h, w]
-        assert given.tokens is not None  # `require_published` looked
-        self._tokens = given.tokens[:: self._frames, None]  # [R*K, 1, D]
-        self._vectors = given.vector[:: self._frames].repeat(given.branches, 1)  # [R*K, V]
-
-    def __call__(self, rows: Tensor, step: int, _branches: int) -> Tensor:
-        clips = rows.to(self._latents).unflatten(0, (-1, self._frames))
-        kept = slice(-len(clips), None)  # the conditional ones come last
-        (raw,) = self._unet(
-            torch.cat([clips, self._latents[kept]], dim=2),
-            self._labels[step],
-            self._tokens[kept],
-            self._vectors[kept],
-            return_dict=False,
-        )
-        return raw.float().flatten(0, 1)
 
 
 def compile_modules(modules: DiffusersModules) -> DiffusersModules:

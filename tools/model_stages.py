@@ -19,17 +19,17 @@ from msgspec.structs import replace
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.clip import Clip, View
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
-from gcd_model.diffusion import Schedule, unit_noise
+from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
 from gcd_model.engines.cuda import psnr_db
 from gcd_model.engines.torch import Engine, TorchEngine, arrange
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_model.loading import load_synthesizer, placed_synthesizer, random_weights
+from gcd_model.loading import device_named, load_synthesizer, placed_synthesizer, random_weights
 from gcd_model.networks import LoadedWeights, Networks, empty_networks, random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
@@ -142,7 +142,7 @@ def load_measured(
 ) -> Synthesizer:
     """What `load_synthesizer` loads, or FULL. stages: of FULL, networks of stages not asked for are small ones."""
     if weights == FULL:
-        return placed_synthesizer(_full_size(stages), device=device, dtype=dtype)
+        return placed_synthesizer(_full_size(stages), device_named(device), dtype=dtype)
     made = load_synthesizer(weights, device=device, dtype=dtype)
     if isinstance(made, LiveSynthesizer):
         raise OptionError(f"{made.traits.name} {NO_DIFFUSION}")
@@ -296,7 +296,7 @@ class Probe:
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         if "step" not in self._wanted:
-            return start / schedule.sigmas[0].item()
+            return start / schedule.steps[0].sigma
         if not self._watched:
             return self._engine.sample(start, given, schedule, options)
         self._watch.lap()

@@ -7,11 +7,10 @@
 The node imports from here only. Source: Van Hoorick et al., "Generative Camera Dolly", ECCV 2024.
 """
 
-from gcd_model.clip import Augmentation, Clip, Quality, RenderOptions, SolverName, View
-from gcd_model.colours import hatched
+from gcd_model.clip import Augmentation, Clip, View, hatched
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import ModelConfig
-from gcd_model.diffusion import Sampler, Schedule, sampler_of
+from gcd_model.diffusion import Quality, RenderOptions, Sampler, Schedule, SolverName, sampler_of
 from gcd_model.engines.onnx_export import ExportPrecision, is_export
 from gcd_model.errors import (
     Cancelled,

@@ -1,29 +1,17 @@
 """The types that cross the door: a Clip goes in, a View comes out."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from gcd_model.config import SemanticClass
 from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.geometry.pose import require_rigid
-
-SolverName = Literal["euler", "dpmpp_2m"]
-"""How the probability-flow ODE is followed: one network evaluation a step, of first or of second order."""
-SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
-
-Quality = Literal["exact", "fast", "fastest"]
-"""How much of a checkpoint's own sampling is kept, see `sampler_of`."""
-QUALITIES: tuple[Quality, ...] = get_args(Quality)
-
-Guidance: TypeAlias = tuple[float, float]
-"""Scale of the first and of the last frame, linear between."""
-NoiseInterval: TypeAlias = tuple[float, float]
-"""A lowest and a highest noise level, both within."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -158,53 +146,37 @@ class Augmentation:
             raise OptionError(f"the augmentation strength must be 0 or more, got {self.strength}")
 
 
-class CancelSignal(Protocol):
-    """Whatever can be asked to stop: a threading.Event."""
-
-    def is_set(self) -> bool:
-        """True once the work should stop."""
-        ...
+# --- what stands where, in colour: class maps, and pixels that nobody saw ---------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RenderOptions:
-    """How to sample. None means: as `quality` has it, which by default is what the checkpoint was made for.
+_PERIOD, _WIDTH, _AMBER = 6, 2, (245, 158, 11)
 
-    steps: network evaluations. guidance: scale of the first and the last frame, linear between.
-    guidance_interval: lowest and highest noise level at which guidance applies; elsewhere the conditional branch counts
-        alone and is computed alone (Kynkäänniemi et al. 2024). None: everywhere, unless the quality has an interval.
-    solver: "euler" as published, or "dpmpp_2m", of second order, which needs fewer steps for the same error.
-    quality: what is left open here is the checkpoint's own ("exact"), or cheaper; see `sampler_of`.
-    samples: draws per view. seed: sample s draws from (seed, s), whatever else is rendered with it.
-    initial_noise: float32 [T, C, h, w] or [S, T, C, h, w], unit variance, used instead of a draw.
-    motion_bucket: the motion number, instead of the formula's.
-    whole_levels: pictures as uint8, which is what a GPU hands over fastest.
-    progress: called with (steps done, steps). cancel: asked between steps.
+
+def palette(classes: tuple[SemanticClass, ...]) -> Tensor:
+    """Colours by class id: uint8 [K, 3], RGB; `palette(classes)[class_map.long()]` paints a map."""
+    return torch.tensor([entry.colour for entry in classes], dtype=torch.uint8)
+
+
+def nearest_classes(pixels: Tensor, classes: tuple[SemanticClass, ...]) -> Tensor:
+    """The class whose colour is nearest to each pixel; of equally near ones the first.
+
+    Args:
+        pixels: [T, 3, H, W], RGB in [0, 1].
+    Returns:
+        uint8 [T, H, W].
     """
+    colours = palette(classes).to(pixels) / 255  # [K, 3]
+    half_square = (colours**2).sum(dim=1) / 2
+    # |p - c|^2 = |p|^2 - 2 (p . c - |c|^2 / 2): one product a pixel; frame by frame, to stay small
+    frames = [torch.addmm(-half_square[:, None], colours, frame.flatten(1)) for frame in pixels]  # [K, H*W] each
+    return torch.stack([frame.max(dim=0).indices for frame in frames]).to(torch.uint8).view(-1, *pixels.shape[-2:])
 
-    steps: int | None = None
-    guidance: Guidance | None = None
-    guidance_interval: NoiseInterval | None = None
-    solver: SolverName | None = None
-    quality: Quality = "exact"
-    samples: int = 1
-    seed: int = 0
-    initial_noise: Tensor | None = None
-    motion_bucket: float | None = None
-    whole_levels: bool = False
-    progress: Callable[[int, int], None] | None = None
-    cancel: CancelSignal | None = None
 
-    def __post_init__(self) -> None:
-        if self.samples < 1 or (self.steps is not None and self.steps < 1):
-            raise OptionError(f"samples and steps must be at least 1, got {self.samples} and {self.steps}")
-        numbers = (*(self.guidance or ()), 0.0 if self.motion_bucket is None else self.motion_bucket)
-        if not all(map(math.isfinite, numbers)):
-            raise OptionError(f"guidance and motion bucket must be finite, got {self.guidance}, {self.motion_bucket}")
-        low, high = self.guidance_interval or (0.0, math.inf)
-        if not 0.0 <= low <= high:
-            raise OptionError(f"guidance_interval goes from a noise level up to another, got {low:g} to {high:g}")
-        if self.solver not in (None, *SOLVERS):
-            raise OptionError(f"the solver must be one of {', '.join(SOLVERS)}, got {self.solver!r}")
-        if self.quality not in QUALITIES:
-            raise OptionError(f"the quality must be one of {', '.join(QUALITIES)}, got {self.quality!r}")
+def hatched(pictures: NDArray[np.uint8], visibility: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pictures [..., H, W, 3] with thin amber diagonals over painted pixels; what was seen stays as it is.
+
+    visibility: [..., H, W], 0 for painted.
+    """
+    rows, columns = np.indices(visibility.shape[-2:])
+    lines = ((rows + columns) % _PERIOD < _WIDTH) & (visibility == 0)
+    return np.where(lines[..., None], pictures // 2 + np.array(_AMBER, np.uint8) // 2, pictures)

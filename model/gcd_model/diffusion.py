@@ -1,19 +1,87 @@
 """The paper's letters: noise levels, preconditioning, solvers, guidance, presets, and the network they drive."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol, Self
+from typing import Literal, NamedTuple, Protocol, Self, TypeAlias, get_args
 
 import torch
 from torch import Tensor
 
-from gcd_model.clip import CancelSignal, Guidance, NoiseInterval, Quality, RenderOptions, SolverName
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import ModelConfig, Prediction, SamplingConfig
-from gcd_model.errors import Cancelled
-from gcd_model.unet import StageInputs, UNetPlan
+from gcd_model.errors import Cancelled, OptionError
+from gcd_model.unet import UNetPlan
+
+SolverName = Literal["euler", "dpmpp_2m", "heun"]
+"""How the probability-flow ODE is followed, see `solver_steps`."""
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+
+Quality = Literal["exact", "fast", "fastest"]
+"""How much of a checkpoint's own sampling is kept, see `sampler_of`."""
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
+
+Guidance: TypeAlias = tuple[float, float]
+"""Scale of the first and of the last frame, linear between."""
+NoiseInterval: TypeAlias = tuple[float, float]
+"""A lowest and a highest noise level, both within."""
+
+
+class CancelSignal(Protocol):
+    """Whatever can be asked to stop: a threading.Event."""
+
+    def is_set(self) -> bool:
+        """True once the work should stop."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RenderOptions:
+    """How to sample. None means: as `quality` has it, which by default is what the checkpoint was made for.
+
+    steps: from one noise level to the next, each one network evaluation (with "heun" two, but for the last).
+    guidance: scale of the first and the last frame, linear between.
+    guidance_interval: lowest and highest noise level at which guidance applies; elsewhere the conditional branch counts
+        alone and is computed alone (Kynkäänniemi et al. 2024). None: everywhere, unless the quality has an interval.
+    solver: "euler" as published; "dpmpp_2m" or "heun", of second order, which need fewer steps for the same error.
+    quality: what is left open here is the checkpoint's own ("exact"), or cheaper; see `sampler_of`.
+    samples: draws per view. seed: sample s draws from (seed, s), whatever else is rendered with it.
+    initial_noise: float32 [T, C, h, w] or [S, T, C, h, w], unit variance, used instead of a draw.
+    motion_bucket: the motion number, instead of the formula's.
+    whole_levels: pictures as uint8, which is what a GPU hands over fastest.
+    progress: called with (network evaluations done, all of them). cancel: asked before each.
+    """
+
+    steps: int | None = None
+    guidance: Guidance | None = None
+    guidance_interval: NoiseInterval | None = None
+    solver: SolverName | None = None
+    quality: Quality = "exact"
+    samples: int = 1
+    seed: int = 0
+    initial_noise: Tensor | None = None
+    motion_bucket: float | None = None
+    whole_levels: bool = False
+    progress: Callable[[int, int], None] | None = None
+    cancel: CancelSignal | None = None
+
+    def __post_init__(self) -> None:
+        if self.samples < 1 or (self.steps is not None and self.steps < 1):
+            raise OptionError(f"samples and steps must be at least 1, got {self.samples} and {self.steps}")
+        numbers = (*(self.guidance or ()), 0.0 if self.motion_bucket is None else self.motion_bucket)
+        if not all(map(math.isfinite, numbers)):
+            raise OptionError(f"guidance and motion bucket must be finite, got {self.guidance}, {self.motion_bucket}")
+        low, high = self.guidance_interval or (0.0, math.inf)
+        if not 0.0 <= low <= high:
+            raise OptionError(f"guidance_interval goes from a noise level up to another, got {low:g} to {high:g}")
+        if self.solver not in (None, *SOLVERS):
+            raise OptionError(f"the solver must be one of {', '.join(SOLVERS)}, got {self.solver!r}")
+        if self.quality not in QUALITIES:
+            raise OptionError(f"the quality must be one of {', '.join(QUALITIES)}, got {self.quality!r}")
+
+
+# --- noise levels and preconditioning ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,83 +137,103 @@ def unit_noise(shape: tuple[int, ...], seed: int, stream: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(mixed))
 
 
-# --- the denoising loop, and the solver as a table of coefficients ---------------------------------------------------
+# --- solvers as tables of coefficients, and the loop that follows them ----------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class SolverStep:
-    """One step as a sum: x <- keep * x + new * D(x) + before * (D of the step before)."""
+class SolverStep(NamedTuple):
+    """One network evaluation and what follows it: x <- D + keep * (x - D) + gain * (D - D of the evaluation before).
 
+    Its weights add up to 1, as those of every consistent solver do. What can be written so runs in every engine.
+    """
+
+    sigma: float
     keep: float
-    new: float
-    before: float = 0.0
+    gain: float = 0.0
 
 
 def solver_steps(solver: SolverName, sigmas: Tensor) -> tuple[SolverStep, ...]:
     """The whole schedule. sigmas: [S + 1], falling; the last may be 0."""
-    levels: list[float] = sigmas.tolist()
-    return euler_steps(levels) if solver == "euler" else multistep_steps(levels)
+    tables = {"euler": euler_steps, "dpmpp_2m": multistep_steps, "heun": heun_steps}
+    return tuple(tables[solver](sigmas.tolist()))
 
 
-def euler_steps(levels: list[float]) -> tuple[SolverStep, ...]:
+def euler_steps(levels: list[float]) -> list[SolverStep]:
     """Euler: x <- x + (sigma[i+1] - sigma[i]) * (x - D) / sigma[i].
 
     Source: Karras et al. 2022, Algorithm 1 without the correction and without added noise.
     """
-    return tuple(SolverStep(after / now, 1 - after / now) for now, after in pairwise(levels))
+    return [SolverStep(now, after / now) for now, after in pairwise(levels)]
 
 
-def multistep_steps(levels: list[float]) -> tuple[SolverStep, ...]:
+def heun_steps(levels: list[float]) -> list[SolverStep]:
+    """Heun: an Euler step to x', then a correction by the slope there; a step that ends without noise has none.
+
+    The mean of both slopes leads to x' + (sigma[i] / sigma[i+1] - 1) / 2 * (D(x') - D(x)).
+    Source: Karras et al. 2022, Algorithm 1 without added noise.
+    """
+    steps = list[SolverStep]()
+    for now, after in pairwise(levels):
+        steps.append(SolverStep(now, after / now))
+        if after > 0:
+            steps.append(SolverStep(after, 1.0, (now / after - 1) / 2))
+    return steps
+
+
+def multistep_steps(levels: list[float]) -> list[SolverStep]:
     """DPM-Solver++ (2M): D along the logarithm of the noise level, drawn through this step and the one before.
 
     The first step and one that ends without noise are of first order: nothing lies before the one, and in the other the
     logarithm has no end. Source: Lu et al. 2022 (DPM-Solver++), Algorithm 2, for data without scaling (alpha 1).
     """
-    first = euler_steps(levels)
-    made = list(first[:1])
-    for (earlier, now, after), plain in zip(zip(levels, levels[1:], levels[2:], strict=False), first[1:], strict=True):
-        if after <= 0:
-            made.append(plain)
-            continue
-        ahead = math.log(now / after) / (2 * math.log(earlier / now))
-        made.append(SolverStep(plain.keep, plain.new * (1 + ahead), -plain.new * ahead))
-    return tuple(made)
+    steps = euler_steps(levels)
+    for i, (earlier, now, after) in enumerate(zip(levels, levels[1:], levels[2:], strict=False), start=1):
+        if after > 0:
+            ahead = math.log(now / after) / (2 * math.log(earlier / now))
+            steps[i] = SolverStep(now, after / now, (1 - after / now) * ahead)
+    return steps
 
 
 def sample(
     denoise: Callable[[Tensor, int], Tensor],
     start: Tensor,
-    steps: tuple[SolverStep, ...],
-    *,
-    progress: Callable[[int, int], None] | None = None,
-    cancel: CancelSignal | None = None,
+    steps: Sequence[SolverStep],
+    options: RenderOptions | None = None,
 ) -> Tensor:
     """From noise to a clean sample.
 
     Args:
-        denoise: (x, i) -> D(x, sigma[i]), same shape as x.
-        start: any shape, noise at sigma[0]. steps: see `solver_steps`.
-        progress: called with (steps done, S). cancel: asked before every step.
+        denoise: (x, i) -> D(x, steps[i].sigma), same shape as x.
+        start: any shape, noise at the first level. steps: see `solver_steps`.
+        options: whom to tell of progress, and who may cancel.
     Raises:
-        Cancelled: `cancel` was set.
+        Cancelled: `options.cancel` was set.
     """
     x, before = start, start
-    for i, step in enumerate(steps):
-        if cancel is not None and cancel.is_set():
-            raise Cancelled(f"stopped before step {i + 1} of {len(steps)}")
+    for i in watched(len(steps), options or RenderOptions()):
         denoised = denoise(x, i)
-        x = advanced(x, denoised, before, step)
-        before = denoised
-        if progress is not None:
-            progress(i + 1, len(steps))
+        x, before = advanced(x, denoised, before, *steps[i][1:]), denoised
     return x
 
 
-def advanced(x: Tensor, denoised: Tensor, before: Tensor, step: SolverStep) -> Tensor:
-    """One step on. before: what the denoiser gave a step earlier; anything where the step does not count it."""
-    if step.before == 0.0:
-        return torch.lerp(denoised, x, step.keep)
-    return (x * step.keep).add_(denoised, alpha=step.new).add_(before, alpha=step.before)
+def watched(count: int, options: RenderOptions) -> Iterator[int]:
+    """0 to count - 1; before each one `options.cancel` is asked, and after it `options.progress` is told.
+
+    Raises: Cancelled.
+    """
+    for i in range(count):
+        if options.cancel is not None and options.cancel.is_set():
+            raise Cancelled(f"stopped before step {i + 1} of {count}")
+        yield i
+        if options.progress is not None:
+            options.progress(i + 1, count)
+
+
+Number: TypeAlias = Tensor | float
+
+
+def advanced(x: Tensor, denoised: Tensor, before: Tensor, keep: Number, gain: Number) -> Tensor:
+    """One step on, see `SolverStep`."""
+    return torch.lerp(denoised, x, keep) + gain * (denoised - before)
 
 
 def guided(unconditional: Tensor, conditional: Tensor, scale: Tensor) -> Tensor:
@@ -201,18 +289,17 @@ def sampler_of(sampling: SamplingConfig, options: RenderOptions) -> Sampler:
     )
 
 
-# --- one run of the sampler ------------------------------------------------------------------------------------------
+# --- one run of the sampler, and the network as it calls it -----------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Schedule:
     """One run of the sampler, all of it known before it starts.
 
-    sigmas: float64 [S + 1], falling to 0. steps: what the solver does with each D, one per noise level above 0.
-    guidance: float64 [T], scale per frame. guided: per step, whether the unconditional branch counts, too.
+    steps: one per network evaluation. guidance: float64 [T], scale per frame. guided: per evaluation, whether the
+    unconditional branch counts, too.
     """
 
-    sigmas: Tensor
     steps: tuple[SolverStep, ...]
     guidance: Tensor
     guided: tuple[bool, ...]
@@ -222,84 +309,91 @@ class Schedule:
     def of(cls, config: ModelConfig, options: RenderOptions | None = None) -> Self:
         """What `sampler_of` makes of the options."""
         sampler = sampler_of(config.sampling, RenderOptions() if options is None else options)
-        sigmas = edm_sigmas(config.sampling, sampler.steps)
-        first, last = sampler.guidance
-        guides = (first, last) != (1.0, 1.0)
-        low, high = sampler.guidance_interval or (0.0, float("inf"))
+        steps = solver_steps(sampler.solver, edm_sigmas(config.sampling, sampler.steps))
+        guides = sampler.guidance != (1.0, 1.0)
+        low, high = sampler.guidance_interval or (0.0, math.inf)
         return cls(
-            sigmas=sigmas,
-            steps=solver_steps(sampler.solver, sigmas),
-            guidance=guidance_scale(first, last, config.frames),
-            guided=tuple(guides and low <= sigma <= high for sigma in sigmas[:-1].tolist()),
+            steps=steps,
+            guidance=guidance_scale(*sampler.guidance, config.frames),
+            guided=tuple(guides and low <= step.sigma <= high for step in steps),
             prediction=config.prediction,
         )
 
     @property
     def branches(self) -> int:
-        """Rows the network is told of per view: 2 where any step is guided."""
+        """Rows the network is told of per view: 2 where any evaluation is guided."""
         return 2 if any(self.guided) else 1
 
     @property
     def evaluations(self) -> int:
-        """How often the network sees a view: guided steps count twice."""
+        """How often the network sees a view: guided evaluations count twice."""
         return len(self.steps) + sum(self.guided)
 
     def start(self, noise: Tensor, views: int) -> Tensor:
         """Unit noise [S, T, C, h, w] -> [views * S, T, C, h, w], as strong as the first level asks."""
-        return noise.repeat(views, 1, 1, 1, 1) * torch.sqrt(self.sigmas[0] ** 2 + 1).item()
+        return noise.repeat(views, 1, 1, 1, 1) * math.sqrt(self.steps[0].sigma ** 2 + 1)
 
 
-# --- the network as the sampler calls it: preconditioned and guided --------------------------------------------------
+class StepInputs(NamedTuple):
+    """What one evaluation and its step take besides x; rows of both branches, the conditional ones last.
+
+    numbers: [5], c_in, c_out, c_skip, keep, gain. guidance: [T]. condition: [R*K*T, C', h, w].
+    embeddings: [K*T, E], the same for both branches. crosses: [R*K*T, X] or None.
+    """
+
+    numbers: Tensor
+    guidance: Tensor
+    condition: Tensor
+    embeddings: Tensor
+    crosses: Tensor | None
 
 
 class Backbone(Protocol):
     """Whatever evaluates the network F."""
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
-        """All that does not depend on the pixels. labels: float32 [S], c_noise of every step, anywhere."""
+        """All that does not depend on the pixels. labels: float32 [S], c_noise of every evaluation, anywhere."""
         ...
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+    def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
         """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
         ...
-
-
-Network = Callable[[Tensor, int, int], Tensor]
-"""F by rows, step and branches: rows float32 [R*K*T, C, h, w], scaled by c_in -> float32, the same shape."""
 
 
 class GuidedDenoiser:
     """D(x, sigma_i) with guidance, for one batch of views, whatever computes the network."""
 
-    def __init__(self, network: Network, schedule: Schedule, device: torch.device) -> None:
-        self._network, self._schedule = network, schedule
-        levels = preconditioning(schedule.sigmas[:-1], schedule.prediction)
-        self._c_in, self._c_out, self._c_skip = (c.tolist() for c in (levels.c_in, levels.c_out, levels.c_skip))
-        self._guidance = schedule.guidance.to(device)
+    def __init__(self, backbone: Backbone, given: Conditioning, schedule: Schedule, like: Tensor) -> None:
+        """like: what the sampler works on. Plans what does not depend on it, for all evaluations."""
+        self._backbone, self._guided, self._condition = backbone, schedule.guided, given.latents
+        sigmas = torch.tensor([step.sigma for step in schedule.steps], dtype=torch.float64)
+        solver = torch.tensor([step[1:] for step in schedule.steps], dtype=torch.float64)
+        levels = preconditioning(sigmas, schedule.prediction)
+        scales = torch.stack([levels.c_in, levels.c_out, levels.c_skip], dim=1)
+        self._numbers, self._guidance = torch.cat([scales, solver], dim=1).to(like), schedule.guidance.to(like)
+        self._plan = backbone.plan(levels.c_noise.float(), given)
+
+    def inputs(self, step: int) -> StepInputs:
+        """Of this evaluation."""
+        embeddings, crosses = self._plan
+        return StepInputs(self._numbers[step], self._guidance, self._condition, embeddings[step], crosses)
 
     def __call__(self, x: Tensor, step: int) -> Tensor:
         """x: [K, T, C, h, w] float32 -> the same shape."""
-        branches = 2 if self._schedule.guided[step] else 1
-        rows = (x * self._c_in[step]).flatten(0, 1).repeat(branches, 1, 1, 1)
-        raw = self._network(rows, step, branches).unflatten(0, (branches, *x.shape[:2]))
-        return denoised(x, raw, self._c_skip[step], self._c_out[step], self._guidance)
+        inputs = self.inputs(step)
+        return denoised(x, evaluated(self._backbone, x, inputs, 1 + self._guided[step]), inputs)
 
 
-def denoised(x: Tensor, raw: Tensor, c_skip: Tensor | float, c_out: Tensor | float, guidance: Tensor) -> Tensor:
-    """D of what the network said, guided where it said it for both branches. raw: [R, K, T, C, h, w]. guidance: [T]."""
+def evaluated(backbone: Backbone, x: Tensor, inputs: StepInputs, branches: int) -> Tensor:
+    """What the network says of x [K, T, C, h, w]: [R, K, T, C, h, w]. branches: R, 1 for the conditional one alone."""
+    rows = (x * inputs.numbers[0]).flatten(0, 1).repeat(branches, 1, 1, 1)
+    condition, crosses = (each if each is None else each[-len(rows) :] for each in (inputs.condition, inputs.crosses))
+    raw = backbone.predict(rows, condition, inputs.embeddings.repeat(branches, 1), crosses)
+    return raw.unflatten(0, (branches, *x.shape[:2]))
+
+
+def denoised(x: Tensor, raw: Tensor, inputs: StepInputs) -> Tensor:
+    """D of what the network said, guided where it said it for both branches. raw: [R, K, T, C, h, w]."""
+    _, c_out, c_skip, *_ = inputs.numbers.unbind()
     both = c_skip * x + c_out * raw
-    return guided(both[0], both[1], guidance) if len(both) == 2 else both[0]
-
-
-def planned_denoiser(backbone: Backbone, given: Conditioning, schedule: Schedule) -> GuidedDenoiser:
-    """A denoiser whose network computes once what does not depend on the pixels."""
-    plan = backbone.plan(preconditioning(schedule.sigmas[:-1]).c_noise.float(), given)
-
-    def network(rows: Tensor, step: int, branches: int) -> Tensor:
-        condition, inputs = given.latents, plan.step(step)
-        if branches < given.branches:
-            condition = condition.chunk(given.branches)[-1]
-            inputs = inputs.chunk(given.branches)[-1]  # the conditional rows come last
-        return backbone.predict(rows, condition, inputs)
-
-    return GuidedDenoiser(network, schedule, given.latents.device)
+    return guided(both[0], both[1], inputs.guidance) if len(both) == 2 else both[0]

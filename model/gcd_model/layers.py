@@ -272,3 +272,71 @@ def phase_kernels(weight: Tensor) -> Tensor:
     """
     fold = weight.new_tensor([[[1, 0, 0], [0, 1, 1]], [[1, 1, 0], [0, 0, 1]]])  # [phase, row, tap]
     return torch.einsum("ayk,bxl,oikl->aboiyx", fold, fold, weight).contiguous()
+
+
+# --- space and time: frames are flattened into the batch, time fastest: row b*T + t is frame t of clip b --------------
+
+
+class TemporalShare(Derived[Tensor]):
+    """How much the temporal branch counts, a learned scalar in (0, 1).
+
+    of_sigmoid: "space" (U-Net: the sigmoid weighs the spatial branch) or "time" (VAE decoder: the temporal one).
+    Since both branches share the spatial result x, `(1-s)*x + s*(x+h)` is `x + s*h`: one pass, no folded copies.
+    """
+
+    def __init__(self, *, of_sigmoid: str, initial: float) -> None:
+        super().__init__()
+        self.of_space = of_sigmoid == "space"
+        self.mix = nn.Parameter(torch.full((1,), initial))
+
+    def derive(self) -> Tensor:
+        """The share, [1]."""
+        return (-self.mix if self.of_space else self.mix).sigmoid()
+
+    def add(self, x: Tensor, h: Tensor) -> Tensor:
+        """x + share * h."""
+        return torch.addcmul(x, h, self.derived().to(x.dtype))
+
+    def blend(self, space: Tensor, time: Tensor) -> Tensor:
+        """space + share * (time - space)."""
+        return torch.lerp(space, time, self.derived().to(space.dtype))
+
+
+class VideoResBlock(nn.Module):
+    """A spatial residual block, then one over frames, blended by a learned share."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        *,
+        groups: int,
+        embedding_width: int | None,
+        eps: float,
+        share: TemporalShare,
+    ) -> None:
+        super().__init__()
+        self.spatial = ResBlock(in_channels, out_channels, groups=groups, eps=eps, embedding_width=embedding_width)
+        self.temporal = ResBlock(
+            out_channels, out_channels, groups=groups, eps=1e-5, embedding_width=embedding_width, temporal=True
+        )
+        self.share = share
+
+    def project(self, embedding: Tensor) -> Tensor:
+        """[..., E] -> [..., 2C']: what `forward` adds over space and over frames."""
+        return torch.cat([self.spatial.project(embedding), self.temporal.project(embedding)], dim=-1)
+
+    def forward(self, x: Tensor, frames: int | None, embedding: Tensor | None = None) -> Tensor:
+        """x: [B*T, C, H, W] -> [B*T, C', H, W]. embedding: [B*T, 2C'], already projected.
+
+        frames: T; None for unrelated frames, which stay apart.
+        """
+        within, between = (None, None) if embedding is None else embedding[..., None, None].chunk(2, dim=1)
+        x = self.spatial(x, within)
+        if frames is None:
+            return x
+        if between is not None:
+            between = between.unflatten(0, (-1, frames)).transpose(1, 2)
+        video = x.unflatten(0, (-1, frames))  # [B, T, C', H, W]
+        change = self.temporal.residual(video.transpose(1, 2), between)
+        return self.share.add(video, change.transpose(1, 2)).flatten(0, 1)

@@ -1,7 +1,6 @@
 """From the name of a checkpoint to a synthesizer on a device."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Unpack, get_args
 
@@ -61,14 +60,25 @@ def load_synthesizer(
         OptionError: an option is unknown or contradicts the checkpoint.
     """
     if is_export(source):
-        _require_export_options(source, engine, (*told.values(), dtype, adapter))
+        if engine not in (None, "onnxruntime"):
+            raise OptionError(
+                f"{source} is an export, which the engine onnxruntime runs; for {engine} give the weights it was "
+                "made from"
+            )
+        if any(option is not None for option in (*told.values(), dtype, adapter)):
+            raise OptionError(
+                f"{source} is an export and says all of itself; leave out family, dtype, head width, image heads, "
+                "frames and adapter, or export the weights again with them"
+            )
         return load_export(source, device=device, providers=providers)
-    _require_no_export_options(source, engine, providers)
-    place = _place(device, dtype, engine or "torch")
-    loaded = loaded_weights(source, adapter=adapter, **told)
-    if isinstance(loaded.networks, LiveNetworks):
-        return _live_synthesizer(loaded, loaded.networks, place, asked=dtype)
-    return _synthesizer(loaded, place)
+    if engine == "onnxruntime" or providers:
+        raise OptionError(
+            f"the engine onnxruntime runs exports, and {source} is none; "
+            f"make one: gcd-node export --weights {source} --onnx FOLDER"
+        )
+    place = device_named(device, engine)
+    precision(dtype or "float32")  # before anything is loaded
+    return placed_synthesizer(loaded_weights(source, adapter=adapter, **told), place, dtype=dtype, engine=engine)
 
 
 def loaded_weights(source: str | Path, *, adapter: str | Path | None = None, **told: Unpack[Told]) -> LoadedWeights:
@@ -104,9 +114,32 @@ def export_weights(
     )
 
 
-def placed_synthesizer(loaded: LoadedWeights, *, device: str = "auto", dtype: str | None = None) -> Synthesizer:
-    """Weights that were loaded or made elsewhere, ready to run. Raises OptionError as `load_synthesizer`."""
-    return _synthesizer(loaded, _place(device, dtype))
+def placed_synthesizer(
+    loaded: LoadedWeights, device: torch.device, *, dtype: str | None = None, engine: EngineName | None = None
+) -> Synthesizer | LiveSynthesizer:
+    """Weights that were loaded or made elsewhere, ready to run; what has device and precision stays in its file.
+
+    Raises OptionError as `load_synthesizer`.
+    """
+    networks, live = loaded.networks, isinstance(loaded.networks, LiveNetworks)
+    name = dtype or default_precision(device, live=live)
+    traits = Traits.of(loaded.card, sha256_12=loaded.sha256_12, precision=name, device=str(device))
+    if isinstance(networks, LiveNetworks):
+        if dtype == "float16":
+            raise OptionError(
+                f"{loaded.name} is the live model, which was not trained for float16; take bfloat16 or float32"
+            )
+        if engine not in (None, "torch"):
+            raise OptionError(f"{loaded.name} is the live model, which torch runs as it is; leave engine {engine} out")
+        networks = networks.to(device, precision(name), memory_format=layout(device))  # pyright: ignore
+        return LiveSynthesizer(networks, traits)
+    for part, module in networks.named_children():
+        module.to(device, torch.float32 if part in FULL_PRECISION else precision(name))
+    if engine != "cuda":
+        return Synthesizer(networks, traits)
+    from gcd_model.engines.cuda import CudaEngine  # torch.compile takes seconds to import
+
+    return Synthesizer(networks, traits, CudaEngine(networks))
 
 
 def weights_path(source: str | Path) -> Path:
@@ -145,46 +178,6 @@ def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
     )
 
 
-def _require_export_options(source: str | Path, engine: EngineName | None, given: Sequence[object]) -> None:
-    if engine not in (None, "onnxruntime"):
-        raise OptionError(
-            f"{source} is an export, which the engine onnxruntime runs; for {engine} give the weights it was made from"
-        )
-    if any(option is not None for option in given):
-        raise OptionError(
-            f"{source} is an export and says all of itself; leave out family, dtype, head width, image heads, frames "
-            "and adapter, or export the weights again with them"
-        )
-
-
-def _require_no_export_options(source: str | Path, engine: EngineName | None, providers: Sequence[str]) -> None:
-    if engine == "onnxruntime" or providers:
-        raise OptionError(
-            f"the engine onnxruntime runs exports, and {source} is none; "
-            f"make one: gcd-node export --weights {source} --onnx FOLDER"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """Where the networks compute, and in which precision."""
-
-    device: torch.device
-    dtype: torch.dtype
-    precision: str
-    engine: EngineName = "torch"
-
-
-def _place(device: str, dtype: str | None, engine: EngineName = "torch") -> _Place:
-    chosen = _device(device)
-    if engine not in ENGINES:
-        raise OptionError(f"the engine must be one of {', '.join(ENGINES)}, got {engine!r}")
-    if engine == "cuda" and chosen.type != "cuda":
-        raise OptionError(f"the engine cuda needs a CUDA device, got {chosen}; take the engine torch")
-    name = dtype or default_precision(chosen, live=False)
-    return _Place(chosen, precision(name), name, engine)
-
-
 def default_precision(device: torch.device, *, live: bool) -> str:
     """What networks compute in where nobody says: bfloat16 on CUDA; of the live model on a CPU that has it, too."""
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # older versions of torch cannot tell
@@ -192,46 +185,17 @@ def default_precision(device: torch.device, *, live: bool) -> str:
     return "bfloat16" if device.type == "cuda" or (live and fast) else "float32"
 
 
-def _device(name: str) -> torch.device:
+def device_named(name: str, engine: EngineName | None = None) -> torch.device:
+    """The device, which is there and which the engine can use. Raises OptionError, as `load_synthesizer`."""
+    if engine not in (None, *ENGINES):
+        raise OptionError(f"the engine must be one of {', '.join(ENGINES)}, got {engine!r}")
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     kind, _, index = name.partition(":")
     if kind not in ("cpu", "cuda") or (index and not index.isdecimal()) or (kind == "cpu" and index):
         raise OptionError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
     if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
         raise OptionError(f"device {name} was asked for, this machine has {torch.cuda.device_count()} CUDA devices")
+    if engine == "cuda" and kind != "cuda":
+        raise OptionError(f"the engine cuda needs a CUDA device, got {name}; take the engine torch")
     return torch.device(name)
-
-
-def _live_synthesizer(
-    loaded: LoadedWeights, networks: LiveNetworks, place: _Place, *, asked: str | None
-) -> LiveSynthesizer:
-    if asked == "float16":
-        raise OptionError(
-            f"{loaded.name} is the live model, which was not trained for float16; take bfloat16 or float32"
-        )
-    if place.engine != "torch":
-        raise OptionError(
-            f"{loaded.name} is the live model, which torch runs as it is; leave engine {place.engine} out"
-        )
-    if asked is None:
-        name = default_precision(place.device, live=True)
-        place = replace(place, dtype=precision(name), precision=name)
-    networks = networks.to(place.device, place.dtype, memory_format=layout(place.device))  # pyright: ignore
-    return LiveSynthesizer(networks, _traits(loaded, place))
-
-
-def _synthesizer(loaded: LoadedWeights, place: _Place) -> Synthesizer:
-    """Everything to its device and precision; what has both already stays in the mapped file."""
-    networks, engine = loaded.diffusion, None
-    for name, module in networks.named_children():
-        module.to(place.device, torch.float32 if name in FULL_PRECISION else place.dtype)
-    if place.engine == "cuda":
-        from gcd_model.engines.cuda import CudaEngine  # torch.compile takes seconds to import
-
-        engine = CudaEngine(networks)
-    return Synthesizer(networks, _traits(loaded, place), engine)
-
-
-def _traits(loaded: LoadedWeights, place: _Place) -> Traits:
-    return Traits.of(loaded.card, sha256_12=loaded.sha256_12, precision=place.precision, device=str(place.device))

@@ -8,10 +8,9 @@ from typing import overload
 import torch
 from torch import Tensor, nn
 
-from gcd_model.conditioning import CameraEmbedder
+from gcd_model.conditioning import CameraEmbedder, ImageEncoder
 from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError
-from gcd_model.image_encoder import ImageEncoder
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import DepthNet, Familiarity
 from gcd_model.live.paint_net import PaintNet

@@ -7,10 +7,9 @@ from typing import ParamSpec, Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor
 
-from gcd_model.clip import Augmentation, Clip, RenderOptions, View
-from gcd_model.colours import nearest_classes
+from gcd_model.clip import Augmentation, Clip, View, nearest_classes
 from gcd_model.conditioning import Conditioning, SourceFeatures, condition_latents, condition_tokens, micro_conditioning
-from gcd_model.diffusion import Schedule, unit_noise
+from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
 from gcd_model.engines.torch import Engine, TorchEngine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory

@@ -4,57 +4,130 @@ Nothing that is constant over a window or a schedule is computed in `forward`: `
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import UNetConfig
-from gcd_model.layers import Downsample, Layers, TokenAttention, Upsample, embedding_mlp, sinusoid, zeroed
-from gcd_model.temporal import TemporalShare, VideoResBlock, VideoTransformer
+from gcd_model.layers import (
+    Attention,
+    Derived,
+    Downsample,
+    FeedForward,
+    Layers,
+    TemporalShare,
+    TokenAttention,
+    Upsample,
+    VideoResBlock,
+    embedding_mlp,
+    sinusoid,
+    zeroed,
+)
 
 
-@dataclass(frozen=True, slots=True)
-class StageInputs:
-    """What a stage needs besides the pixels, for one denoising step; of a U-Net that of all stages, side by side.
+class FramePositions(Derived[Tensor]):
+    """An embedding of the frame number, [T, C]: a function of the weights alone."""
 
-    embeddings: [N, C], noise level, micro-conditioning and camera, projected for the stage.
-    crosses: what the image token adds; spatial [N, C], temporal [B, C]; None without attention or image tower.
-    """
+    def __init__(self, channels: int, frames: int) -> None:
+        super().__init__()
+        self.channels, self.frames = channels, frames
+        self.mlp = embedding_mlp(channels, 4 * channels, channels)
 
-    spatial_embedding: Tensor
-    temporal_embedding: Tensor
-    spatial_cross: Tensor | None
-    temporal_cross: Tensor | None
-
-    def chunk(self, parts: int) -> tuple["StageInputs", ...]:
-        """Of each clip, or of each guidance branch, in order."""
-        every = (self.spatial_embedding, self.temporal_embedding, self.spatial_cross, self.temporal_cross)
-        chunks = [[None] * parts if each is None else each.chunk(parts) for each in every]
-        return tuple(StageInputs(*part) for part in zip(*chunks, strict=True))
+    def derive(self) -> Tensor:
+        """The table, [T, C]."""
+        weight = next(self.mlp.parameters())
+        numbers = torch.arange(self.frames, device=weight.device)
+        return self.mlp(sinusoid(numbers, self.channels).to(weight.dtype))
 
 
-@dataclass(frozen=True, slots=True)
-class UNetPlan:
-    """All that the U-Net takes besides pixels, for every step of a schedule: all stages side by side.
+class SpatialBlock(nn.Module):
+    """Attention over the pixels of a frame, the image token, feed-forward."""
 
-    embeddings: [S, N, sum of C]. crosses: of all attending stages, as in StageInputs; they do not depend on the step.
-    repeats: how often the rows of the embeddings repeat in the batch (2 when an unconditional branch rides along).
-    """
+    def __init__(self, channels: int, heads: int, context_width: int | None) -> None:
+        super().__init__()
+        self.norm_attention = nn.LayerNorm(channels)
+        self.attention = Attention(channels, heads)
+        self.token = None if context_width is None else TokenAttention(channels, context_width)
+        self.norm_feed = nn.LayerNorm(channels)
+        self.feed = FeedForward(channels)
 
-    spatial_embedding: Tensor
-    temporal_embedding: Tensor
-    spatial_cross: Tensor | None
-    temporal_cross: Tensor | None
-    repeats: int = 1
+    def forward(self, x: Tensor, cross: Tensor | None) -> Tensor:
+        """x: [B*T, L, C]. cross: [B*T, C], what the image token adds."""
+        x = x + self.attention(self.norm_attention(x))
+        if cross is not None:
+            x = x + cross[:, None]
+        return x + self.feed(self.norm_feed(x))
 
-    def step(self, index: int) -> StageInputs:
-        """What `VideoUNet.forward` takes at one step."""
-        spatial, temporal = (
-            each[index].repeat(self.repeats, 1) for each in (self.spatial_embedding, self.temporal_embedding)
-        )
-        return StageInputs(spatial, temporal, self.spatial_cross, self.temporal_cross)
+
+class TemporalBlock(nn.Module):
+    """Feed-forward, attention over the frames of a pixel, the first frame's image token, feed-forward."""
+
+    def __init__(self, channels: int, heads: int, context_width: int | None) -> None:
+        super().__init__()
+        self.norm_first = nn.LayerNorm(channels)
+        self.feed_first = FeedForward(channels)
+        self.norm_attention = nn.LayerNorm(channels)
+        self.attention = Attention(channels, heads)
+        self.token = None if context_width is None else TokenAttention(channels, context_width)
+        self.norm_feed = nn.LayerNorm(channels)
+        self.feed = FeedForward(channels)
+
+    def forward(self, x: Tensor, cross: Tensor | None) -> Tensor:
+        """x: [B, T, L, C]. cross: [B, C]."""
+        x = x + self.feed_first(self.norm_first(x))
+        by_pixel = self.norm_attention(x).transpose(1, 2).contiguous()  # [B, L, T, C]
+        mixed = self.attention(by_pixel.flatten(0, 1)).view_as(by_pixel)
+        x = x + mixed.transpose(1, 2)
+        if cross is not None:
+            x = x + cross[:, None, None]
+        return x + self.feed(self.norm_feed(x))
+
+
+class VideoTransformer(nn.Module):
+    """Attention within frames, then across frames, blended by a learned share."""
+
+    def __init__(self, channels: int, *, head_width: int, context_width: int | None, groups: int, frames: int) -> None:
+        super().__init__()
+        heads = channels // head_width
+        self.norm = nn.GroupNorm(groups, channels, eps=1e-6)
+        self.proj_in = nn.Linear(channels, channels)
+        self.spatial = SpatialBlock(channels, heads, context_width)
+        self.positions = FramePositions(channels, frames)
+        self.temporal = TemporalBlock(channels, heads, context_width)
+        self.share = TemporalShare(of_sigmoid="space", initial=0.5)
+        self.proj_out = nn.Linear(channels, channels)
+
+    def start_apart(self) -> None:
+        """Make the part across frames the identity, so that what single frames taught holds for clips at first."""
+        for layer in (self.positions.mlp[-1], self.temporal.attention.out):
+            zeroed(layer)
+        for feed in (self.temporal.feed_first, self.temporal.feed):
+            zeroed(feed.contract)
+
+    def cross(self, tokens: Tensor) -> Tensor | None:
+        """What image tokens [B*T, D] add within frames, and across them, where only a clip's first one counts:
+        [B*T, 2C]; None without cross-attention."""
+        if self.spatial.token is None or self.temporal.token is None:
+            return None
+        frames = self.positions.frames
+        across = self.temporal.token(tokens[::frames]).repeat_interleave(frames, dim=0)[: len(tokens)]
+        return torch.cat([self.spatial.token(tokens), across], dim=1)
+
+    def forward(self, x: Tensor, cross: Tensor | None, frames: int | None) -> Tensor:
+        """x: [B*T, C, H, W] -> the same shape. cross: [B*T, 2C], see there.
+
+        frames: T; None for unrelated frames, which stay apart.
+        """
+        within, between = (None, None) if cross is None else cross.chunk(2, dim=1)
+        tokens = self.proj_in(self.norm(x).flatten(2).transpose(1, 2))  # [B*T, L, C]
+        tokens = self.spatial(tokens, within)
+        if frames is not None:
+            across = tokens.unflatten(0, (-1, frames)) + self.positions.derived()[:frames, None]  # [B, T, L, C]
+            across = self.temporal(across, None if between is None else between[::frames])
+            tokens = self.share.blend(tokens, across.flatten(0, 1))
+        return x + self.proj_out(tokens).transpose(1, 2).unflatten(2, x.shape[-2:])
 
 
 class Stage(nn.Module):
@@ -82,12 +155,10 @@ class Stage(nn.Module):
             else None
         )
 
-    def forward(self, x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
-        """x: [N, C, h, w] -> [N, C', h, w]. frames: None for unrelated frames."""
-        x = self.res(x, frames, inputs.spatial_embedding, inputs.temporal_embedding)
-        if self.attention is None:
-            return x
-        return self.attention(x, frames, inputs.spatial_cross, inputs.temporal_cross)
+    def forward(self, x: Tensor, embedding: Tensor, cross: Tensor | None, frames: int | None) -> Tensor:
+        """x: [N, C, h, w] -> [N, C', h, w]. embedding, cross: [N, 2C'] each. frames: None for unrelated frames."""
+        x = self.res(x, frames, embedding)
+        return x if self.attention is None else self.attention(x, cross, frames)
 
 
 class DownLevel(nn.Module):
@@ -114,6 +185,21 @@ class UpLevel(nn.Module):
             for i in range(config.blocks_per_level + 1)
         )
         self.up = Upsample(width) if level > 0 else None
+
+
+class UNetPlan(NamedTuple):
+    """All that the U-Net takes besides pixels, for every step of a schedule, the parts of all stages side by side.
+
+    embeddings: [S, N, E], noise level, micro-conditioning and camera; the same for both guidance branches.
+    crosses: [R*N, X], what the image token adds in both branches, the same in every step; None without tokens.
+    """
+
+    embeddings: Tensor
+    crosses: Tensor | None
+
+    def step(self, index: int, branches: int = 1) -> tuple[Tensor, Tensor | None]:
+        """What `VideoUNet.forward` takes of it at one step. branches: R."""
+        return self.embeddings[index].repeat(branches, 1), self.crosses
 
 
 class VideoUNet(nn.Module):
@@ -144,38 +230,26 @@ class VideoUNet(nn.Module):
         self.conv_out = nn.Conv2d(width, config.latent_channels, 3, padding=1)
         self._start_as_identity()
 
-    def plan(
-        self, noise_labels: Tensor, vector: Tensor, camera: Tensor | None, tokens: Tensor | None, *, repeats: int = 1
-    ) -> UNetPlan:
+    def plan(self, noise_labels: Tensor, vector: Tensor, camera: Tensor | None, tokens: Tensor | None) -> UNetPlan:
         """Compute all that does not depend on the pixels.
 
         Args:
             noise_labels: [S] one per step (or [S, N]), c_noise. vector: [N, V], micro-conditioning.
-            camera: [N, camera_width] or None. tokens: [N * repeats, D] image tokens of the whole batch, or None.
-            repeats: how often the N rows occur in the batch (2 with an unconditional branch).
+            camera: [N, camera_width] or None. tokens: [R*N, D] image tokens of the whole batch, or None.
         """
         labels = noise_labels if noise_labels.ndim == 2 else noise_labels[:, None]
         embedding = self.embed_noise(sinusoid(labels, self.config.width).to(vector.dtype)) + self.embed_vector(vector)
         if self.embed_camera is not None:
             assert camera is not None, "this U-Net wants a camera vector"
             embedding = embedding + self.embed_camera(camera)  # [S, N, E]
-        stages = list(self.all_stages())
-        spatial = torch.cat([stage.res.spatial.project(embedding) for stage in stages], dim=-1)
-        temporal = torch.cat([stage.res.temporal.project(embedding) for stage in stages], dim=-1)
-        return UNetPlan(spatial, temporal, *self._crosses(tokens), repeats)
+        embeddings = torch.cat([stage.res.project(embedding) for stage in self.all_stages()], dim=-1)
+        return UNetPlan(embeddings, None if tokens is None else self.crosses(tokens))
 
-    def _crosses(self, tokens: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        if tokens is None:
-            return None, None
-        spatial, temporal = self.token_layers()
-        of_clips = tokens[:: self.frames]  # across frames only the first frame's token counts
-        return torch.cat([layer(tokens) for layer in spatial], 1), torch.cat([layer(of_clips) for layer in temporal], 1)
-
-    def token_layers(self) -> tuple[list[TokenAttention], list[TokenAttention]]:
-        """What takes the image token: within frames, and across them."""
+    def crosses(self, tokens: Tensor) -> Tensor | None:
+        """What image tokens [R*N, D] add in every transformer, side by side; None without cross-attention."""
         attending = [stage.attention for stage in self.all_stages() if stage.attention is not None]
-        blocks = [(each.spatial.token, each.temporal.token) for each in attending]
-        return [each for each, _ in blocks if each is not None], [each for _, each in blocks if each is not None]
+        found = [cross for cross in (each.cross(tokens) for each in attending) if cross is not None]
+        return torch.cat(found, dim=1) if found else None
 
     def all_stages(self) -> Iterator[Stage]:
         """Every stage in the order of the forward pass."""
@@ -185,47 +259,57 @@ class VideoUNet(nn.Module):
         for level in self.up:
             yield from level.stages
 
-    def forward(self, latents: Tensor, condition: Tensor, inputs: StageInputs, *, image_mode: bool = False) -> Tensor:
+    def forward(
+        self,
+        latents: Tensor,
+        condition: Tensor,
+        embeddings: Tensor,
+        crosses: Tensor | None = None,
+        *,
+        image_mode: bool = False,
+    ) -> Tensor:
         """One evaluation of the network F.
 
         Args:
             latents: [B*T, C, h, w], scaled noisy latents. condition: [B*T, C', h, w], source latents, unscaled.
-            inputs: one step of a plan made for this batch.
+            embeddings, crosses: [B*T, ...], of one step of a plan that was made for this batch.
             image_mode: leave out every layer across frames; the rows are then unrelated frames, any number of them.
         Returns:
             [B*T, C, h, w].
         """
         frames = None if image_mode else self.frames
-        inputs_left = self._by_stage(inputs)
+        inputs = self._by_stage(embeddings, crosses)
         x = self.stem(torch.cat([latents, condition], dim=1))
         skips = [x]
         for level in self.down:
             for stage in level.stages:
-                x = stage(x, next(inputs_left), frames)
+                x = stage(x, *next(inputs), frames)
                 skips.append(x)
             if level.down is not None:
                 x = level.down(x)
                 skips.append(x)
         for stage in self.middle:
-            x = stage(x, next(inputs_left), frames)
+            x = stage(x, *next(inputs), frames)
         for level in self.up:
             for stage in level.stages:
-                x = stage(torch.cat([x, skips.pop()], dim=1), next(inputs_left), frames)
+                x = stage(torch.cat([x, skips.pop()], dim=1), *next(inputs), frames)
             if level.up is not None:
                 x = level.up(x)
         return self.conv_out(F.silu(self.norm_out(x)))
 
-    def _by_stage(self, inputs: StageInputs) -> Iterator[StageInputs]:
-        """Every stage's own, in the order of the forward pass."""
-        widths = [stage.res.spatial.norm2.num_channels for stage in self.all_stages()]
-        attending = [stage.attention is not None for stage in self.all_stages()]
-        spatial, temporal = (each.split(widths, 1) for each in (inputs.spatial_embedding, inputs.temporal_embedding))
-        crossed = [width for width, attends in zip(widths, attending, strict=True) if attends]
-        crosses = [
-            None if x is None else iter(x.split(crossed, 1)) for x in (inputs.spatial_cross, inputs.temporal_cross)
-        ]
-        for own, across, attends in zip(spatial, temporal, attending, strict=True):
-            yield StageInputs(own, across, *(next(each) if attends and each is not None else None for each in crosses))
+    def _by_stage(self, embeddings: Tensor, crosses: Tensor | None) -> Iterator[tuple[Tensor, Tensor | None]]:
+        """Every stage's own part, in the order of the forward pass."""
+        taken = 0
+        for stage, embedding in zip(self.all_stages(), embeddings.split(self.embedding_widths, 1), strict=True):
+            cross, width = None, embedding.shape[1]
+            if stage.attention is not None and crosses is not None:
+                cross, taken = crosses[:, taken : taken + width], taken + width
+            yield embedding, cross
+
+    @property
+    def embedding_widths(self) -> list[int]:
+        """How many numbers of an embedding are each stage's."""
+        return [2 * stage.res.spatial.norm2.num_channels for stage in self.all_stages()]
 
     def start_apart(self) -> None:
         """Make all transformers across frames the identity too: for learning from single frames first, then clips."""

@@ -8,8 +8,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.config import VAEConfig
-from gcd_model.layers import Downsample, FrameConv, Layers, ResBlock, Upsample, zeroed
-from gcd_model.temporal import TemporalShare, VideoResBlock
+from gcd_model.layers import (
+    Downsample,
+    FrameConv,
+    Layers,
+    ResBlock,
+    TemporalShare,
+    Upsample,
+    VideoResBlock,
+    zeroed,
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from gcd_model.engines.graphs import Replay
+from gcd_model.engines.graphs import Recorder, Replay
 
 _ATEN = torch.ops.aten
 _HOST = {_ATEN._local_scalar_dense, _ATEN.nonzero, _ATEN.equal, _ATEN.is_nonzero, _ATEN.lift_fresh, _ATEN.item}
@@ -43,8 +43,8 @@ class _Tape(TorchDispatchMode):
                     old.copy_(new)
 
 
-class TapeRecorder:
-    """Implements Recorder. Python numbers are as they were when the work was recorded, as in a CUDA graph."""
+class TapeRecorder(Recorder):
+    """Python numbers are as they were when the work was recorded, as in a CUDA graph."""
 
     def __init__(self) -> None:
         self.recorded, self.played, self.forgotten = 0, 0, 0

@@ -10,7 +10,7 @@ import pytest
 import torch
 from small_models import TINY, random_clip, relative_error, tiny_synthesizer
 
-from gcd_model.clip import RenderOptions
+from gcd_model.diffusion import RenderOptions
 from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin
 from gcd_model.geometry import SphericalDelta
 from gcd_model.synthesizer import Synthesizer

@@ -9,8 +9,9 @@ import pytest
 import torch
 from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
 
-from gcd_model.clip import RenderOptions, View
+from gcd_model.clip import View
 from gcd_model.config import SVD_14, ModelConfig
+from gcd_model.diffusion import RenderOptions
 from gcd_model.engines.cuda import CudaEngine, CudaOptions
 from gcd_model.errors import Cancelled
 from gcd_model.geometry import SphericalDelta

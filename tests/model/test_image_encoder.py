@@ -8,8 +8,8 @@ from small_models import draw, randomise, relative_error
 from torch.testing import assert_close
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
+from gcd_model.conditioning import ImageEncoder, clip_pixels
 from gcd_model.config import ImageEncoderConfig
-from gcd_model.image_encoder import ImageEncoder, clip_pixels
 
 TOWER = ImageEncoderConfig(image_size=28, patch=7, width=32, layers=3, heads=4, hidden_width=64, output_width=24)
 

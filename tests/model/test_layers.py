@@ -7,8 +7,8 @@ from small_models import draw, randomise, relative_error
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model.layers import Derived, TokenAttention, Upsample, prepare
-from gcd_model.temporal import FramePositions, TemporalShare, VideoResBlock
+from gcd_model.layers import Derived, TemporalShare, TokenAttention, Upsample, VideoResBlock, prepare
+from gcd_model.unet import FramePositions
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 5), (4, 6)])

@@ -8,8 +8,9 @@ from published import SMALL_GCD, filled, write_diffusers, write_gcd
 from torch import Tensor
 
 from gcd_model import loading
-from gcd_model.clip import Clip, RenderOptions, View
+from gcd_model.clip import Clip, View
 from gcd_model.config import SMALL
+from gcd_model.diffusion import RenderOptions
 from gcd_model.errors import CheckpointError, OptionError, ViewFixedError
 from gcd_model.geometry import SphericalDelta
 from gcd_model.live.config import LIVE_TINY

@@ -9,7 +9,8 @@ import pytest
 from msgspec import structs
 from small_models import TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
 
-from gcd_model.clip import RenderOptions, View
+from gcd_model.clip import View
+from gcd_model.diffusion import RenderOptions
 from gcd_model.engines.onnx_export import Manifest, export_onnx
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta

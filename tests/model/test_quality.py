@@ -9,13 +9,23 @@ from msgspec import structs
 from small_models import TINY, draw, random_clip, tiny_synthesizer
 from torch import Tensor
 
-from gcd_model.clip import QUALITIES, Quality, RenderOptions, SolverName
 from gcd_model.config import PLAIN_SMALL, SVD_14, SamplingConfig
-from gcd_model.diffusion import PRESETS, Sampler, Schedule, edm_sigmas, sample, sampler_of, solver_steps
+from gcd_model.diffusion import (
+    PRESETS,
+    QUALITIES,
+    Quality,
+    RenderOptions,
+    Sampler,
+    Schedule,
+    SolverName,
+    edm_sigmas,
+    sample,
+    sampler_of,
+    solver_steps,
+)
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
 from gcd_model.synthesizer import Synthesizer, synthesize
-from gcd_model.unet import StageInputs
 
 PUBLISHED = SamplingConfig()
 
@@ -34,9 +44,9 @@ def denoised(x: Tensor, sigma: float) -> Tensor:
 @lru_cache
 def flow(solver: SolverName, steps: int) -> Tensor:
     """Where the noise ends up: [64, 32]."""
-    sigmas = edm_sigmas(PUBLISHED, steps)
-    start = NOISE * (sigmas[0].item() ** 2 + 1) ** 0.5
-    return sample(lambda x, i: denoised(x, sigmas[i].item()), start, solver_steps(solver, sigmas))
+    table = solver_steps(solver, edm_sigmas(PUBLISHED, steps))
+    start = NOISE * (table[0].sigma ** 2 + 1) ** 0.5
+    return sample(lambda x, i: denoised(x, table[i].sigma), start, table)
 
 
 def error(solver: SolverName, steps: int) -> float:
@@ -104,7 +114,7 @@ def latents(synthesizer: Synthesizer, options: RenderOptions) -> Tensor:
 
 
 def test_guidance_applies_within_its_interval_alone() -> None:
-    levels = Schedule.of(TINY, RenderOptions(steps=STEPS)).sigmas.tolist()
+    levels = [step.sigma for step in Schedule.of(TINY, RenderOptions(steps=STEPS)).steps]
     schedule = Schedule.of(TINY, RenderOptions(steps=STEPS, guidance_interval=(levels[2], levels[1])))
     assert schedule.guided == (False, True, True, False)
     assert (schedule.branches, schedule.evaluations) == (2, STEPS + 2)
@@ -125,12 +135,12 @@ def test_outside_the_interval_the_network_sees_the_conditional_rows_alone(
     unet, seen = synthesizer.networks.unet, list[int]()
     forward = unet.forward
 
-    def counted(rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+    def counted(rows: Tensor, *inputs: Tensor) -> Tensor:
         seen.append(len(rows))
-        return forward(rows, condition, inputs)
+        return forward(rows, *inputs)
 
     monkeypatch.setattr(unet, "forward", counted)
-    levels = Schedule.of(TINY, RenderOptions(steps=STEPS)).sigmas.tolist()
+    levels = [step.sigma for step in Schedule.of(TINY, RenderOptions(steps=STEPS)).steps]
     latents(synthesizer, RenderOptions(guidance_interval=(levels[1], levels[0])))
     assert seen == [2 * TINY.frames, 2 * TINY.frames, TINY.frames, TINY.frames]
 

@@ -1,7 +1,7 @@
 """The sampler: noise levels, preconditioning, guidance, Euler steps, and the whole of it against a plain reference."""
 
 import math
-from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 import torch
@@ -9,11 +9,13 @@ from small_models import draw
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model.clip import SOLVERS, SolverName
 from gcd_model.config import SamplingConfig
 from gcd_model.diffusion import (
+    SOLVERS,
+    SolverName,
     edm_sigmas,
     guided,
+    heun_steps,
     multistep_steps,
     preconditioning,
     sample,
@@ -22,12 +24,6 @@ from gcd_model.diffusion import (
 )
 
 PUBLISHED = SamplingConfig()
-
-
-def follow(
-    denoise: Callable[[Tensor, int], Tensor], start: Tensor, sigmas: Tensor, solver: SolverName = "euler"
-) -> Tensor:
-    return sample(denoise, start, solver_steps(solver, sigmas))
 
 
 def test_25_noise_levels_have_the_published_values() -> None:
@@ -65,7 +61,7 @@ def test_guidance_moves_each_frame_away_from_the_unconditional_prediction_by_its
     assert_close(result[:, 2], 2.5 * conditional[:, 2] - 1.5 * unconditional[:, 2])
 
 
-@pytest.mark.parametrize(("solver", "order", "bound"), [("euler", 1, 0.02), ("dpmpp_2m", 2, 0.0005)])
+@pytest.mark.parametrize(("solver", "order", "bound"), [("euler", 1, 0.02), ("dpmpp_2m", 2, 0.0005), ("heun", 2, 5e-4)])
 def test_a_solver_approaches_the_true_flow_of_a_gaussian_with_its_order(
     solver: SolverName, order: int, bound: float
 ) -> None:
@@ -74,8 +70,8 @@ def test_a_solver_approaches_the_true_flow_of_a_gaussian_with_its_order(
     exact = start * spread / math.sqrt(spread**2 + PUBLISHED.sigma_max**2)
 
     def error(steps: int) -> float:
-        sigmas = edm_sigmas(PUBLISHED, steps)
-        final = follow(lambda x, i: x * spread**2 / (spread**2 + sigmas[i] ** 2), start, sigmas, solver)
+        table = solver_steps(solver, edm_sigmas(PUBLISHED, steps))
+        final = sample(lambda x, i: x * spread**2 / (spread**2 + table[i].sigma ** 2), start, table)
         return (final / exact - 1).abs().item()
 
     assert error(400) < bound
@@ -88,23 +84,39 @@ def test_the_multistep_solver_uses_the_prediction_of_half_way_where_it_is_a_line
     def line(log_sigma: float) -> float:
         return 3.0 - 0.7 * log_sigma
 
-    steps = multistep_steps(levels)
-    for i in range(1, len(steps)):
-        earlier, now, after = levels[i - 1 : i + 2]
-        counted = steps[i].new * line(math.log(now)) + steps[i].before * line(math.log(earlier))
-        half_way = line((math.log(now) + math.log(after)) / 2)
-        assert counted == pytest.approx((1 - after / now) * half_way)
+    for i, step in list(enumerate(multistep_steps(levels)))[1:]:
+        earlier, now, after = (math.log(level) for level in levels[i - 1 : i + 2])
+        counted = (1 - step.keep) * line(now) + step.gain * (line(now) - line(earlier))
+        assert counted == pytest.approx((1 - step.keep) * line((now + after) / 2))
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_heun_is_algorithm_1_of_karras_without_churn(steps: int) -> None:
+    """Line by line as printed, on a denoiser that is no straight line."""
+    sigmas = edm_sigmas(PUBLISHED, steps)
+
+    def denoise(x: Tensor, sigma: float) -> Tensor:
+        return torch.tanh(x / (1 + sigma**2) ** 0.5)
+
+    x = start = 700 * draw(5).double()
+    for now, after in pairwise(sigmas.tolist()):
+        slope = (x - denoise(x, now)) / now
+        ahead = x + (after - now) * slope
+        if after != 0:
+            slope_ahead = (ahead - denoise(ahead, after)) / after
+            ahead = x + (after - now) * (slope / 2 + slope_ahead / 2)
+        x = ahead
+    table = heun_steps(sigmas.tolist())
+    assert len(table) == 2 * steps - 1
+    assert_close(sample(lambda x, i: denoise(x, table[i].sigma), start, table), x, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 25])
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_every_step_of_a_solver_weighs_its_terms_to_one_and_the_last_leaves_no_noise(
-    solver: SolverName, steps: int
-) -> None:
+def test_the_first_step_asks_for_nothing_before_and_the_last_leaves_no_noise(solver: SolverName, steps: int) -> None:
     made = solver_steps(solver, edm_sigmas(PUBLISHED, steps))
-    assert [step.keep + step.new + step.before for step in made] == pytest.approx([1.0] * steps)
-    assert (made[-1].keep, made[-1].before) == (0.0, 0.0)
-    assert made[0].before == 0.0
+    assert made[0].gain == 0.0
+    assert made[-1][1:] == (0.0, 0.0)
 
 
 def test_unit_noise_is_fixed_by_seed_and_stream_and_differs_between_them() -> None:

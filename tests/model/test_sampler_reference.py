@@ -11,9 +11,9 @@ from plain_unet import plain_unet
 from small_models import TINY, draw, random_clip, relative_error, tiny_synthesizer
 from torch import Tensor
 
-from gcd_model.clip import RenderOptions
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import SamplingConfig
+from gcd_model.diffusion import RenderOptions
 from gcd_model.geometry import SphericalDelta
 
 FRAMES, STEPS = 14, 25

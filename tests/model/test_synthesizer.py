@@ -10,9 +10,9 @@ from small_models import TINY, draw, random_clip, relative_error, tiny_synthesiz
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.clip import Augmentation, Clip, View
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.diffusion import unit_noise
+from gcd_model.diffusion import RenderOptions, unit_noise
 from gcd_model.errors import Cancelled, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
 from gcd_model.synthesizer import Synthesizer, synthesize
@@ -109,6 +109,9 @@ def test_the_number_of_steps_is_the_checkpoints_unless_asked_and_progress_counts
     seen.clear()
     synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, steps=1))
     assert seen == [(1, 1)]
+    seen.clear()
+    synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, steps=2, solver="heun"))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_cancelling_between_two_steps_raises_and_leaves_the_synthesizer_usable(synthesizer: Synthesizer) -> None:

@@ -1,6 +1,7 @@
 """The U-Net against its plain twin and against diffusers, and what it costs at full size."""
 
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any
 
 import msgspec
@@ -17,8 +18,7 @@ from gcd_model.conditioning import CameraEmbedder
 from gcd_model.config import CameraControl
 from gcd_model.geometry import Spherical, SphericalDelta, spherical_trajectory
 from gcd_model.layers import prepare
-from gcd_model.temporal import VideoTransformer
-from gcd_model.unet import VideoUNet
+from gcd_model.unet import VideoTransformer, VideoUNet
 
 FRAMES, CLIPS, BRANCHES = 3, 2, 2
 FULL_FRAMES, FULL_HEIGHT, FULL_WIDTH = 14, 32, 48
@@ -41,8 +41,8 @@ class Batch:
     def ours(self, unet: VideoUNet) -> Tensor:
         """With a plan of two steps, of which this batch is the second."""
         labels = torch.tensor([1.5, self.noise_label])
-        plan = unet.plan(labels, self.vector, self.camera, self.tokens, repeats=BRANCHES)
-        return unet(self.latents, self.condition, plan.step(1))
+        plan = unet.plan(labels, self.vector, self.camera, self.tokens)
+        return unet(self.latents, self.condition, *plan.step(1, BRANCHES))
 
     def plain(self, weights: dict[str, Tensor]) -> Tensor:
         vector = self.vector if self.camera is None else torch.cat([self.vector, self.camera], dim=1)
@@ -123,22 +123,20 @@ def test_gradients_through_derived_values_equal_the_published_ones() -> None:
 
 @pytest.mark.parametrize("frame", [0, 2, FRAMES])
 def test_a_token_counts_for_its_own_frame_and_the_first_of_a_clip_for_all_its_frames_together(frame: int) -> None:
-    unet = small_unet()
-    rows = CLIPS * FRAMES
-    vector, camera, tokens = draw(rows, UNET.vector_width), draw(rows, UNET.camera_width), draw(rows, 48)
+    unet, rows = small_unet(), CLIPS * FRAMES
+    tokens = draw(rows, 48)
     changed = tokens.clone()
     changed[frame] += 1
     with torch.no_grad():
-        before, after = (unet.plan(torch.tensor([0.5]), vector, camera, each) for each in (tokens, changed))
-    assert before.spatial_cross is not None
-    assert after.spatial_cross is not None
-    assert before.temporal_cross is not None
-    assert after.temporal_cross is not None
-    differ = (after.spatial_cross != before.spatial_cross).any(dim=1).tolist()
-    assert differ == [row == frame for row in range(rows)]
-    differ = (after.temporal_cross != before.temporal_cross).any(dim=1).tolist()
-    assert differ == [clip * FRAMES == frame for clip in range(CLIPS)]
-    assert len(unet.token_layers()[0]) == 16
+        before, after = (unet.crosses(each) for each in (tokens, changed))
+    assert before is not None
+    assert after is not None
+    attending = [stage.attention is not None for stage in unet.all_stages()]
+    assert sum(attending) == 16
+    for differ in (before != after).split(list(compress(unet.embedding_widths, attending)), dim=1):
+        within, between = (each.any(dim=1).tolist() for each in differ.chunk(2, dim=1))
+        assert within == [row == frame for row in range(rows)]
+        assert between == [row - row % FRAMES == frame for row in range(rows)]
 
 
 def test_a_fresh_u_net_starts_as_published_with_zero_output_and_even_shares() -> None:
@@ -188,7 +186,7 @@ def test_the_u_net_equals_diffusers() -> None:
         vector = theirs.add_time_proj(ids.flatten()).reshape(CLIPS, -1).repeat_interleave(FRAMES, dim=0)
         plan = ours.plan(torch.tensor([-0.7]), vector, None, tokens[:, 0].repeat_interleave(FRAMES, dim=0))
         rows = latents.flatten(0, 1)
-        result = ours(rows[:, :4], rows[:, 4:], plan.step(0))
+        result = ours(rows[:, :4], rows[:, 4:], *plan.step(0))
     assert relative_error(result, expected) < 1e-5
 
 
@@ -199,11 +197,10 @@ def test_a_transformer_with_a_token_per_frame_equals_diffusers_which_takes_the_f
     place = ("unet.down.0.stages.0.attention", "unet/down_blocks.0.attentions.0.")
     theirs.load_state_dict(diffusers_state(ours, *place, levels_of(unet=UNET)))
     x, tokens = draw(CLIPS * FRAMES, 32, 4, 6), draw(CLIPS * FRAMES, 48)
-    assert ours.spatial.token is not None
-    assert ours.temporal.token is not None
     with torch.inference_mode():
         expected = theirs(x, tokens[:, None], image_only_indicator=torch.zeros(CLIPS, FRAMES)).sample
-        result = ours(x, FRAMES, ours.spatial.token(tokens), ours.temporal.token(tokens[::FRAMES]))
-        wrong = ours(x, FRAMES, ours.spatial.token(tokens), ours.temporal.token(tokens[1::FRAMES]))
+        cross = ours.cross(tokens)
+        assert cross is not None
+        result, wrong = ours(x, cross, FRAMES), ours(x, cross.roll(1, dims=0), FRAMES)
     assert relative_error(result, expected) < 1e-5
     assert relative_error(wrong, expected) > 1e-3

@@ -10,13 +10,12 @@ from small_models import UNET, random_clip, tiny_synthesizer
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from gcd_model.clip import RenderOptions
 from gcd_model.config import SVD_14
+from gcd_model.diffusion import RenderOptions
 from gcd_model.geometry import SphericalDelta
-from gcd_model.layers import Derived, Upsample, prepare
+from gcd_model.layers import Derived, TemporalShare, Upsample, prepare
 from gcd_model.networks import Networks, empty_networks
-from gcd_model.temporal import FramePositions, TemporalShare
-from gcd_model.unet import VideoUNet
+from gcd_model.unet import FramePositions, VideoUNet
 
 FULL_FRAMES, FULL_HEIGHT, FULL_WIDTH = 14, 32, 48
 
@@ -50,7 +49,7 @@ def _our_flops(unet: VideoUNet) -> int:
     plan = unet.plan(_meta(1), vector, camera, tokens)
     latents = _meta(FULL_FRAMES, 4, FULL_HEIGHT, FULL_WIDTH)
     with FlopCounterMode(display=False) as counter:
-        unet(latents, latents, plan.step(0))
+        unet(latents, latents, *plan.step(0))
     return counter.get_total_flops()
 
 
@@ -146,6 +145,6 @@ def test_a_network_evaluation_never_waits_for_the_device_or_builds_anything_on_t
     with torch.device("meta"):
         unet = VideoUNet(UNET, 3)
     prepare(unet)
-    plan = unet.plan(_meta(4), _meta(3, UNET.vector_width), _meta(3, UNET.camera_width), _meta(6, 48), repeats=2)
+    plan = unet.plan(_meta(4), _meta(3, UNET.vector_width), _meta(3, UNET.camera_width), _meta(6, 48))
     latents = _meta(6, 4, 8, 16)
-    assert unet(latents, latents, plan.step(3)).shape == (6, 4, 8, 16)
+    assert unet(latents, latents, *plan.step(3, 2)).shape == (6, 4, 8, 16)

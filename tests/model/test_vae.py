@@ -9,8 +9,7 @@ from torch import nn
 from torch.testing import assert_close
 
 from gcd_model.config import VAEConfig
-from gcd_model.layers import prepare
-from gcd_model.temporal import VideoResBlock
+from gcd_model.layers import VideoResBlock, prepare
 from gcd_model.vae import Encoder, Posterior, TemporalDecoder
 
 VAE = VAEConfig(width=32, multipliers=(1, 2, 4, 4), norm_groups=32)

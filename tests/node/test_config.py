@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from gcd_model import RenderOptions
-from gcd_model.clip import QUALITIES, SOLVERS
+from gcd_model.diffusion import QUALITIES, SOLVERS
 from gcd_node.config import ModelSection, NodeConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.stream_context import drawing_options

@@ -38,7 +38,7 @@ def gradients(unet: VideoUNet) -> tuple[dict[str, torch.Tensor], int]:
     watched = [stage.res.register_forward_pre_hook(lambda *_: runs.append(1)) for stage in stages_of(unet)]
     batch = Noise().whole_clips(Draws(0, "x", 0, torch.device("cpu")), 1)
     plan = unet.plan(torch.ones(1, FRAMES), batch.vector, None, None)
-    unet(batch.target, batch.condition, plan.step(0)).square().mean().backward()
+    unet(batch.target, batch.condition, *plan.step(0)).square().mean().backward()
     for hook in watched:
         hook.remove()
     found = {name: weight.grad for name, weight in unet.named_parameters() if weight.grad is not None}

@@ -49,7 +49,7 @@ def batch_of(networks: Networks, clips: int) -> Batch:
 def network_output(networks: Networks, noisy: Tensor, sigma: Tensor, batch: Batch) -> Tensor:
     plan = networks.unet.plan(0.25 * sigma.log()[None], batch.vector, None, None)
     scaled = noisy / (sigma**2 + 1).sqrt()[:, None, None, None]
-    return networks.unet(scaled, batch.condition, plan.step(0))
+    return networks.unet(scaled, batch.condition, *plan.step(0))
 
 
 @pytest.mark.parametrize("step", [0, 2500, 5000])

@@ -7,46 +7,28 @@ import copy
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
-from functools import partial, wraps
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeAlias, TypeVar
+from typing import Any, Literal, Self, TypeAlias, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.clip import RenderOptions
-from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, unit_noise
-from gcd_model.engines.graphs import (
-    CudaGraphs,
-    Pace,
-    Recent,
-    RecordedCall,
-    Recorder,
-    StepMemory,
-    Unrecorded,
-    Update,
-    solved,
-)
-from gcd_model.engines.torch import TorchEngine
-from gcd_model.errors import Cancelled
-from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import ImageTransformerLayer, clip_pixels
-from gcd_model.layers import Downsample, ResBlock, Upsample, prepare
+from gcd_model.conditioning import Conditioning, ImageTransformerLayer
+from gcd_model.diffusion import RenderOptions, Schedule, unit_noise, watched
+from gcd_model.engines.graphs import CudaGraphs, Recent, RecordedCall, Recorder, StepMemory, Update, solved
+from gcd_model.engines.torch import NetworkName, TorchEngine
+from gcd_model.layers import Downsample, ResBlock, Upsample, VideoResBlock, prepare
 from gcd_model.networks import Networks
-from gcd_model.temporal import VideoResBlock
 from gcd_model.unet import Stage
 from gcd_model.vae import PixelAttention, TemporalDecoder, to_pixels
 
 _LOG = logging.getLogger(__name__)
-
-Given = ParamSpec("Given")
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,30 +54,7 @@ class CudaOptions:
         return cls() if device.type == "cuda" else cls(backend=None, channels_last=False, decoder="float32")
 
 
-def _forgetful(
-    method: Callable[Concatenate["CudaEngine", Given], Made],
-) -> Callable[Concatenate["CudaEngine", Given], Made]:
-    """The method, on the engine's own device; when that is full, what was recorded is dropped, so that its memory is
-    free again."""
-
-    @wraps(method)
-    def guarded(engine: "CudaEngine", *args: Given.args, **kwargs: Given.kwargs) -> Made:
-        try:
-            with torch.inference_mode(), _on(engine.like.device):
-                return method(engine, *args, **kwargs)
-        except torch.OutOfMemoryError:
-            engine.forget()
-            raise
-
-    return guarded
-
-
-def _on(device: torch.device) -> AbstractContextManager[object]:
-    """Streams, events and graphs are of the current device."""
-    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
-
-
-class CudaEngine:
+class CudaEngine(TorchEngine):
     """Implements Engine. Not for several threads at once."""
 
     def __init__(
@@ -112,78 +71,90 @@ class CudaEngine:
         if options.channels_last:
             channels_last(networks)
         prepare(networks)
+        super().__init__(networks)
         self._beat: Callable[[], object] = lambda: None  # called before each piece of code is compiled
-        self._networks, self._update = networks, _compiled(networks, options, lambda: self._beat())
-        self._plain = TorchEngine(networks)
+        self._update = _compiled(networks, options, lambda: self._beat())
         on_gpu = options.graphs and self.like.device.type == "cuda"
-        with _on(self.like.device):
-            self._recorder = recorder or (CudaGraphs() if on_gpu else Unrecorded())
+        with self._on_device():
+            self._recorder = recorder or (CudaGraphs() if on_gpu else Recorder())
         self._memories: Recent[StepMemory] = Recent()
-        self._tower = RecordedCall(self._tokens_of, self._recorder)
-        self._encoder = RecordedCall(lambda frames: networks.condition_encoder(frames).mean, self._recorder)
-        self._decoder = RecordedCall(lambda latents: networks.decoder(latents, len(latents)), self._recorder)
+        self._calls: Recent[RecordedCall] = Recent()
 
     def forget(self) -> None:
         """Drop what was recorded, and with it the memory it holds."""
         self._memories.clear()
-        for call in (self._tower, self._encoder, self._decoder):
-            call.forget()
+        self._calls.clear()
         self._recorder.forget()
 
-    @property
-    def like(self) -> Tensor:
-        return self._networks.unet.stem.weight
+    def _on_device(self) -> AbstractContextManager[object]:
+        """Streams, events and graphs are of the current device."""
+        device = self.like.device
+        return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
-    @_forgetful
-    def tokens(self, frames: Tensor) -> Tensor | None:
-        tower = self._networks.image_encoder
-        if tower is None:
-            return None
-        return self._tower(clip_pixels(frames.to(self.like.device), tower.config.image_size).to(self.like))
+    @contextmanager
+    def _at_work(self) -> Generator[None]:
+        """When the device is full, what was recorded is dropped, so that its memory is free again."""
+        try:
+            with torch.inference_mode(), self._on_device():
+                yield
+        except torch.OutOfMemoryError:
+            self.forget()
+            raise
 
-    @_forgetful
-    def condition_mean(self, frames: Tensor) -> Tensor:
-        return self._encoder(frames.to(self.like))
+    def compute(self, name: NetworkName, given: Tensor) -> Tensor:
+        with self._at_work():
+            work = partial(super().compute, name)
+            key = name, given.shape, given.dtype
+            return self._calls.get(key, lambda: RecordedCall(work, given, self._recorder))(given)
 
-    @_forgetful
-    def camera(self, path: Trajectory) -> Tensor | None:
-        return self._plain.camera(path)
-
-    @_forgetful
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        """See Engine. With somebody to tell or to ask, each step is waited for before the next is queued; while code
-        is compiled, progress is told of, as none."""
-        start = start.to(self.like.device)
-        widths = [2 if guided else 1 for guided in schedule.guided]
+        """See Engine. One view and sample after the other: so no number of them has code or graphs of its own, and none
+        that comes is compiled while views are awaited."""
+        views, clips = len(start), list[Tensor]()
+        for k in range(views):
+            part = options
+            if options.progress is not None:
+                part = replace(options, progress=partial(_tell, options.progress, k, views))
+            clips.append(self._sample(start[k : k + 1], of_view(given, k, views), schedule, part))
+        return torch.cat(clips)
+
+    def _sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
+        """With somebody to tell or to ask, each step is waited for before the next is queued; while code is compiled,
+        progress is told of again."""
+        start, widths = start.to(self.like.device), [1 + guided for guided in schedule.guided]
+        done = torch.cuda.Event(blocking=True) if start.is_cuda and (options.cancel or options.progress) else None
         if options.progress is not None:
             self._beat = partial(options.progress, 0, len(widths))
-        memory = self._memories.get(
-            (start.shape, given.latents.shape, given.tokens is None),
-            lambda: StepMemory(self._plain, self._update, start, given, schedule),
-        )
-        memory.begin(start, given, schedule)
-        if memory.record(set(widths), self._recorder):
+        with self._at_work():
+            memory = self._memories.get(
+                (start.shape, given.latents.shape, given.tokens is None),
+                lambda: StepMemory(self, self._update, start, given, schedule),
+            )
             memory.begin(start, given, schedule)
-        pace = Pace(self.like.device)
-        for i, branches in enumerate(widths):
-            if options.cancel is not None and options.cancel.is_set():
-                raise Cancelled(f"stopped before step {i + 1} of {len(widths)}")
-            memory.seek(i)
-            memory.advance(branches)
-            if options.cancel is not None or options.progress is not None:
-                pace.wait()
-            if options.progress is not None:
-                options.progress(i + 1, len(widths))
-        return memory.result()
+            if memory.record(set(widths), self._recorder):
+                memory.begin(start, given, schedule)
+            for i in watched(len(widths), options):
+                memory.seek(i)
+                memory.advance(widths[i])
+                if done is not None:
+                    done.record()
+                    done.synchronize()  # of the event alone: the device does not notice
+            return memory.result()
 
-    @_forgetful
-    def decode(self, latents: Tensor) -> Tensor:
-        return self._decoder(latents.to(self._networks.decoder.stem.weight)).float()
 
-    def _tokens_of(self, pixels: Tensor) -> Tensor:
-        tower = self._networks.image_encoder
-        assert tower is not None, "only models with an image tower have tokens"
-        return tower(pixels)
+def _tell(progress: Callable[[int, int], object], k: int, views: int, done: int, steps: int) -> None:
+    progress(k * steps + done, views * steps)
+
+
+def of_view(given: Conditioning, k: int, views: int) -> Conditioning:
+    """The rows of one of so many views, of both guidance branches if there are two."""
+    frames = len(given.vector) // views
+
+    def rows(batch: Any) -> Any:
+        is_batch = isinstance(batch, Tensor)
+        return batch.unflatten(0, (-1, views, frames))[:, k].flatten(0, 1) if is_batch else batch
+
+    return Conditioning(**{field.name: rows(getattr(given, field.name)) for field in fields(given)})
 
 
 def _settle_decoder(networks: Networks, precision: str) -> None:
@@ -268,15 +239,11 @@ def _allow_shapes() -> None:
 
 def channels_last(model: nn.Module) -> None:
     """Lay convolution weights out as tensor cores read them; what they make is then laid out so, too."""
+    orders = {4: torch.channels_last, 5: torch.channels_last_3d}
     for module in model.modules():
-        if isinstance(module, nn.Conv2d):
-            module.weight = _laid_out(module.weight, torch.channels_last)
-        elif isinstance(module, nn.Conv3d):
-            module.weight = _laid_out(module.weight, torch.channels_last_3d)
-
-
-def _laid_out(weight: Tensor, order: torch.memory_format) -> nn.Parameter:
-    return nn.Parameter(weight.contiguous(memory_format=order), requires_grad=False)
+        if isinstance(module, nn.Conv2d | nn.Conv3d):
+            weight = module.weight.contiguous(memory_format=orders[module.weight.ndim])
+            module.weight = nn.Parameter(weight, requires_grad=False)
 
 
 def cache_folder() -> Path:

@@ -12,18 +12,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gcd_model.clip import RenderOptions
-from gcd_model.conditioning import Conditioning, camera_features
+from gcd_model.conditioning import Conditioning, camera_features, clip_pixels
 from gcd_model.config import ModelConfig
-from gcd_model.diffusion import Schedule, planned_denoiser, sample
 from gcd_model.engines.onnx_export import MANIFEST, read_manifest
+from gcd_model.engines.torch import Engine
 from gcd_model.errors import CheckpointError, DeviceMemoryError, ModelError, OptionError
 from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.unet import StageInputs, UNetPlan
+from gcd_model.unet import UNetPlan
 from gcd_model.weights.card import Card
 
 CPU_PROVIDER, CUDA_PROVIDER = "CPUExecutionProvider", "CUDAExecutionProvider"
@@ -76,14 +74,16 @@ def provider_options(device: str, names: Sequence[str], cache: Path, *, half: bo
     return [*((name, options.get(name, {})) for name in names if name != CPU_PROVIDER), (CPU_PROVIDER, {})]
 
 
-class OnnxEngine:
-    """The networks of an export, clip by clip. Implements Engine, and Backbone with graphs for the U-Net."""
+class OnnxEngine(Engine):
+    """The networks of an export, clip by clip."""
 
     def __init__(self, graphs: "Sessions", config: ModelConfig) -> None:
         self._graphs, self._config = graphs, config
         self._frames = config.frames
-        self.like = torch.zeros(())
-        """See Engine: float32 on the CPU; onnxruntime copies to its own device."""
+
+    @property
+    def like(self) -> Tensor:
+        return torch.zeros(())  # float32 on the CPU; onnxruntime copies to its own device
 
     def tokens(self, frames: Tensor) -> Tensor | None:
         tower = self._config.image_encoder
@@ -107,10 +107,6 @@ class OnnxEngine:
         control = self._config.camera
         return None if control == "none" else camera_features(control, path)
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = planned_denoiser(self, given, schedule)
-        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
-
     def decode(self, latents: Tensor) -> Tensor:
         return self._graphs.run("decoder", latents)[0]
 
@@ -119,24 +115,18 @@ class OnnxEngine:
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         rows = [given.vector] if given.camera is None else [given.vector, given.camera]
-        clips = list(zip(*(each.split(self._frames) for each in rows), strict=True))
-        steps = [self._joined([("embeddings", label, *clip) for clip in clips]) for label in labels.float().split(1)]
-        spatial, temporal = (torch.stack(each) for each in zip(*steps, strict=True))
-        crosses: Sequence[Tensor | None] = (None, None)
-        if given.tokens is not None:
-            crosses = self._joined([("crosses", clip) for clip in given.tokens.split(self._frames)])
-        return UNetPlan(spatial, temporal, crosses[0], crosses[1], given.branches)
+        steps = [self._clip_by_clip("embeddings", *rows, label=label) for label in labels.split(1)]
+        crosses = None if given.tokens is None else self._clip_by_clip("crosses", given.tokens)
+        return UNetPlan(torch.stack(steps), crosses)
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
-        parts = [rows, condition, inputs.spatial_embedding, inputs.temporal_embedding]
-        clips = [each.split(self._frames) for each in parts]
-        if inputs.spatial_cross is not None and inputs.temporal_cross is not None:
-            clips += [inputs.spatial_cross.split(self._frames), inputs.temporal_cross.split(1)]
-        return torch.cat([self._graphs.run("step", *clip)[0] for clip in zip(*clips, strict=True)])
+    def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
+        inputs = [rows, condition, embeddings] if crosses is None else [rows, condition, embeddings, crosses]
+        return self._clip_by_clip("step", *inputs)
 
-    def _joined(self, runs: Sequence[tuple[Any, ...]]) -> tuple[Tensor, ...]:
-        made = [self._graphs.run(*run) for run in runs]
-        return tuple(torch.cat(each) for each in zip(*made, strict=True))
+    def _clip_by_clip(self, name: str, *rows: Tensor, label: Tensor | None = None) -> Tensor:
+        first = () if label is None else (label,)
+        clips = zip(*(each.split(self._frames) for each in rows), strict=True)
+        return torch.cat([self._graphs.run(name, *first, *clip)[0] for clip in clips])
 
 
 class _Session(nn.Module):

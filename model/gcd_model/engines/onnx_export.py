@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import compress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,14 +25,14 @@ from gcd_model.errors import CheckpointError, FileError, OptionError
 from gcd_model.layers import prepare
 from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.small_files import decode_json, read_small
-from gcd_model.unet import StageInputs, VideoUNet
+from gcd_model.unet import VideoUNet
 from gcd_model.weights.card import FULL_PRECISION, Card
 from gcd_model.weights.load import digest
 from gcd_model.weights.save import whole_folder
 
 MANIFEST = "manifest.json"
 """The file that makes a folder an export."""
-FORMAT = "gcd-onnx-2"
+FORMAT = "gcd-onnx-3"
 OPSET = 20
 """Of the ONNX operators: what TensorRT 10 and onnxruntime 1.20 know."""
 APART_ABOVE = 1 << 30  # bytes of weights beside a graph instead of in it; one file of ONNX holds 2 GiB at most
@@ -48,62 +49,37 @@ Report = Callable[[str, int, int], None]
 class Embeddings(nn.Module):
     """Noise level [1], micro-conditioning [T, V] and camera features [T, F], projected for every stage of the U-Net."""
 
-    def __init__(self, unet: VideoUNet, camera: nn.Linear | None) -> None:
+    def __init__(self, networks: Networks) -> None:
         super().__init__()
-        self.unet, self.camera = unet, camera
+        self.unet, self.camera = networks.unet, None if networks.camera is None else networks.camera.proj
 
-    def forward(self, label: Tensor, vector: Tensor, camera: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Spatial and temporal, [T, sum of C] each."""
+    def forward(self, label: Tensor, vector: Tensor, camera: Tensor | None = None) -> Tensor:
+        """[T, E]."""
         features = None if self.camera is None or camera is None else self.camera(camera)
-        plan = self.unet.plan(label, vector, features, None)
-        return plan.spatial_embedding[0], plan.temporal_embedding[0]
-
-
-class Crosses(nn.Module):
-    """What the image tokens [T, D] add in every transformer of the U-Net."""
-
-    def __init__(self, unet: VideoUNet) -> None:
-        super().__init__()
-        self.spatial, self.temporal = (nn.ModuleList(layers) for layers in unet.token_layers())
-
-    def forward(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """[T, sum of C] and, of the first frame alone, [1, sum of C]."""
-        spatial = torch.cat([layer(tokens) for layer in self.spatial], dim=1)
-        return spatial, torch.cat([layer(tokens[:1]) for layer in self.temporal], dim=1)
-
-
-class Step(nn.Module):
-    """One evaluation of the U-Net over one clip; what follows the pixels comes from `Embeddings` and `Crosses`."""
-
-    def __init__(self, unet: VideoUNet) -> None:
-        super().__init__()
-        self.unet = unet
-
-    def forward(
-        self, latents: Tensor, condition: Tensor, spatial: Tensor, temporal: Tensor, *crosses: Tensor
-    ) -> Tensor:
-        """latents: [T, C, h, w] -> the same shape."""
-        return self.unet(latents, condition, StageInputs(spatial, temporal, *(crosses or (None, None))))
+        return self.unet.plan(label, vector, features, None).embeddings[0]
 
 
 class _Function(nn.Module):
-    def __init__(self, module: nn.Module, compute: Callable[[Any, Tensor], Tensor]) -> None:
+    def __init__(self, module: nn.Module, compute: Callable[[Any, Tensor], Tensor | None]) -> None:
         super().__init__()
         self.module, self.compute = module, compute
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor | None:
         """What is computed of a module and one tensor."""
         return self.compute(self.module, x)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Graph:
     """One graph to export. inputs: by name, of the sizes it will always have; their values do not matter."""
 
     name: str
     module: nn.Module
     inputs: dict[str, Tensor]
-    outputs: tuple[str, ...]
+    output: str
+
+    def __post_init__(self) -> None:
+        prepare(self.module)
 
 
 def graphs(networks: Networks) -> Iterator[Graph]:
@@ -112,42 +88,35 @@ def graphs(networks: Networks) -> Iterator[Graph]:
     frames, height, width, factor = config.frames, config.height, config.width, config.vae.down_factor
     if tower is not None:
         pixels = torch.zeros(1, 3, tower.config.image_size, tower.config.image_size)
-        yield _graph("image_encoder", tower, {"pixels": pixels}, "token")
-        tokens = torch.zeros(frames, tower.config.output_width)
-        yield _graph("crosses", Crosses(networks.unet), {"tokens": tokens}, "spatial_cross", "temporal_cross")
+        yield Graph("image_encoder", tower, {"pixels": pixels}, "token")
+        crosses = _Function(networks.unet, VideoUNet.crosses)
+        yield Graph("crosses", crosses, {"tokens": torch.zeros(frames, tower.config.output_width)}, "crosses")
     encoder = _Function(networks.condition_encoder, lambda encoder, frame: encoder(frame).mean)
-    yield _graph("condition_encoder", encoder, {"frames": torch.zeros(1, 3, height, width)}, "latents")
+    yield Graph("condition_encoder", encoder, {"frames": torch.zeros(1, 3, height, width)}, "latents")
     inputs = {"label": torch.zeros(1), "vector": torch.zeros(frames, config.unet.vector_width)}
     if networks.camera is not None:
         inputs["camera"] = torch.zeros(frames, CAMERA_FEATURES[config.camera])
-    camera = None if networks.camera is None else networks.camera.proj
-    yield _graph("embeddings", Embeddings(networks.unet, camera), inputs, "spatial_embedding", "temporal_embedding")
+    yield Graph("embeddings", Embeddings(networks), inputs, "embeddings")
     yield step_graph(networks)
     decoder = _Function(networks.decoder, lambda decoder, latents: decoder(latents, frames))
     latents = torch.zeros(frames, config.vae.latent_channels, height // factor, width // factor)
-    yield _graph("decoder", decoder, {"latents": latents}, "pictures")
+    yield Graph("decoder", decoder, {"latents": latents}, "pictures")
 
 
 def step_graph(networks: Networks) -> Graph:
     """The U-Net alone, which is most of what there is to export."""
-    config, unet, step = networks.config, networks.config.unet, Step(networks.unet)
+    config, unet = networks.config, networks.unet
     frames, factor = config.frames, config.vae.down_factor
     size = (config.height // factor, config.width // factor)
     inputs = {
-        "latents": torch.zeros(frames, unet.latent_channels, *size),
-        "condition": torch.zeros(frames, unet.condition_channels, *size),
+        "latents": torch.zeros(frames, unet.config.latent_channels, *size),
+        "condition": torch.zeros(frames, unet.config.condition_channels, *size),
+        "embeddings": torch.zeros(frames, sum(unet.embedding_widths)),
     }
-    widths = [stage.res.spatial.norm2.num_channels for stage in networks.unet.all_stages()]
-    inputs |= {name: torch.zeros(frames, sum(widths)) for name in ("spatial_embedding", "temporal_embedding")}
+    attending = [stage.attention is not None for stage in unet.all_stages()]
     if networks.image_encoder is not None:
-        crossed = sum(layer.out.out_features for layer in networks.unet.token_layers()[0])
-        inputs |= {"spatial_cross": torch.zeros(frames, crossed), "temporal_cross": torch.zeros(1, crossed)}
-    return _graph("step", step, inputs, "prediction")
-
-
-def _graph(name: str, module: nn.Module, inputs: dict[str, Tensor], *outputs: str) -> Graph:
-    prepare(module)
-    return Graph(name=name, module=module, inputs=inputs, outputs=outputs)
+        inputs["crosses"] = torch.zeros(frames, sum(compress(unet.embedding_widths, attending)))
+    return Graph("step", unet, inputs, "prediction")
 
 
 class TensorRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -356,7 +325,7 @@ def _exported(graph: Graph) -> Any:
             dynamo=True,
             verbose=False,
             input_names=list(graph.inputs),
-            output_names=list(graph.outputs),
+            output_names=[graph.output],
             opset_version=OPSET,
         )
     assert program is not None

@@ -3,23 +3,21 @@
 from collections.abc import Callable
 from functools import partial
 from itertools import repeat
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.clip import RenderOptions
-from gcd_model.conditioning import Conditioning
-from gcd_model.diffusion import Schedule, planned_denoiser, sample
+from gcd_model.conditioning import Conditioning, clip_pixels
+from gcd_model.diffusion import Backbone, GuidedDenoiser, RenderOptions, Schedule, sample
 from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample
 from gcd_model.networks import Networks
-from gcd_model.unet import StageInputs, UNetPlan, VideoUNet
+from gcd_model.unet import UNetPlan, VideoUNet
 
 
-class Engine(Protocol):
+class Engine(Backbone, Protocol):
     """Computes networks; what they are given and what becomes of it is the synthesizer's.
 
     Tensors may come from any device and are float32 unless `like` says otherwise; results lie where `like` does.
@@ -47,15 +45,19 @@ class Engine(Protocol):
 
         Raises Cancelled.
         """
-        ...
+        start = start.to(self.like.device)
+        return sample(GuidedDenoiser(self, given, schedule, start), start, schedule.steps, options)
 
     def decode(self, latents: Tensor) -> Tensor:
         """Unscaled latents of one clip [T, C, h, w] -> pictures float32 [T, 3, H, W], about [-1, 1]."""
         ...
 
 
-class TorchEngine:
-    """The networks as torch runs them. Implements Engine, and Backbone with the U-Net in its own precision."""
+NetworkName = Literal["image_encoder", "condition_encoder", "decoder"]
+
+
+class TorchEngine(Engine):
+    """The networks as torch runs them, the U-Net in its own precision."""
 
     def __init__(self, networks: Networks) -> None:
         self._networks = networks
@@ -65,33 +67,35 @@ class TorchEngine:
         return self._networks.unet.stem.weight
 
     def tokens(self, frames: Tensor) -> Tensor | None:
-        tower = self._networks.image_encoder
+        tower = self._networks.config.image_encoder
         if tower is None:
             return None
-        return tower(clip_pixels(frames.to(self.like.device), tower.config.image_size).to(self.like))
+        return self.compute("image_encoder", clip_pixels(frames.to(self.like.device), tower.image_size).to(self.like))
 
     def condition_mean(self, frames: Tensor) -> Tensor:
-        return self._networks.condition_encoder(frames.to(self.like)).mean
+        return self.compute("condition_encoder", frames.to(self.like))
 
     def camera(self, path: Trajectory) -> Tensor | None:
         embedder = self._networks.camera
         return None if embedder is None else embedder(path)
 
-    def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
-        denoiser = planned_denoiser(self, given, schedule)
-        start = start.to(self.like.device)
-        return sample(denoiser, start, schedule.steps, progress=options.progress, cancel=options.cancel)
+    def decode(self, latents: Tensor) -> Tensor:
+        return self.compute("decoder", latents.to(self._networks.decoder.stem.weight)).float()
+
+    def compute(self, name: NetworkName, given: Tensor) -> Tensor:
+        """A network but for the U-Net, on its device and in its precision: token, mean of latents, or pictures."""
+        if name == "decoder":
+            return self._networks.decoder(given, len(given))
+        if name == "condition_encoder":
+            return self._networks.condition_encoder(given).mean
+        assert self._networks.image_encoder is not None, "only models with an image tower have tokens"
+        return self._networks.image_encoder(given)
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
-        unet, on_device = self._networks.unet, labels.to(self.like.device)
-        return unet.plan(on_device, given.vector, given.camera, given.tokens, repeats=given.branches)
+        return self._networks.unet.plan(labels.to(self.like.device), given.vector, given.camera, given.tokens)
 
-    def predict(self, rows: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
-        return self._networks.unet(rows.to(self.like), condition, inputs).float()
-
-    def decode(self, latents: Tensor) -> Tensor:
-        decoder = self._networks.decoder
-        return decoder(latents.to(decoder.stem.weight), len(latents))
+    def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
+        return self._networks.unet(rows.to(self.like), condition, embeddings, crosses).float()
 
 
 # --- a CPU: working sets that fit its caches and the memory it has at hand -------------------------------------------
@@ -217,10 +221,13 @@ def _laid_out(_module: nn.Module, _given: object, x: Tensor) -> Tensor:
     return x.contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)
 
 
-def _clip_by_clip(unet: VideoUNet, latents: Tensor, condition: Tensor, inputs: StageInputs) -> Tensor:
+def _clip_by_clip(
+    unet: VideoUNet, latents: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None = None
+) -> Tensor:
     """Clips that are large together go through it one after the other: nothing of one is held for the next."""
     clips, widest = len(latents) // unet.frames, unet.stem.out_channels * latents.shape[-2:].numel()
     if clips == 1 or _rows_at_once(widest) >= len(latents):
-        return VideoUNet.forward(unet, latents, condition, inputs).contiguous()
-    parts = zip(latents.chunk(clips), condition.chunk(clips), inputs.chunk(clips), strict=True)
+        return VideoUNet.forward(unet, latents, condition, embeddings, crosses).contiguous()
+    inputs = [[None] * clips if each is None else each.chunk(clips) for each in (embeddings, crosses)]
+    parts = zip(latents.chunk(clips), condition.chunk(clips), *inputs, strict=True)
     return torch.cat([VideoUNet.forward(unet, *part).contiguous() for part in parts])

@@ -8,8 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gcd_model.clip import Augmentation, Clip, RenderOptions, View
+from gcd_model.clip import Augmentation, Clip, View
 from gcd_model.conditioning import SourceFeatures, SourceGeometry
+from gcd_model.diffusion import RenderOptions
 from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.live.eyes import Eyes, Floor, SeenFrame

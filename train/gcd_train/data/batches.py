@@ -13,9 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import Family, ModelConfig
-from gcd_model.conditioning import micro_conditioning
+from gcd_model.conditioning import clip_pixels, micro_conditioning
 from gcd_model.geometry import Trajectory
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips, LatentRows

@@ -18,9 +18,9 @@ import msgspec
 import torch
 from torch import Tensor
 
+from gcd_model.conditioning import clip_pixels
 from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.loading import random_weights, weights_path
 from gcd_model.networks import Networks
 from gcd_model.vae import Posterior

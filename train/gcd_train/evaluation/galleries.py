@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gcd_model.colours import palette
+from gcd_model.clip import palette
 from gcd_model.config import SemanticClass
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip

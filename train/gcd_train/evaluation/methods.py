@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, load_synthesizer, sampler_of
-from gcd_model.colours import nearest_classes
+from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError

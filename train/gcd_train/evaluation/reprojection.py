@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gcd_model.colours import nearest_classes, palette
+from gcd_model.clip import nearest_classes, palette
 from gcd_model.config import SemanticClass
 from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.errors import DataError

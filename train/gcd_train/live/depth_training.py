@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gcd_model.colours import palette
+from gcd_model.clip import palette
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import (
     SKY_M,

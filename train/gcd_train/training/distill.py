@@ -7,8 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import ModelConfig
-from gcd_model.clip import RenderOptions
-from gcd_model.diffusion import Schedule, sample
+from gcd_model.diffusion import RenderOptions, Schedule, sample
 from gcd_model.networks import Networks
 from gcd_train.recipe import StudentRecipe, UNetRecipe
 from gcd_train.training.draws import Draws
@@ -32,10 +31,9 @@ def sampled(denoiser: nn.Module, batch: Batch, noise: Tensor, schedule: Schedule
     Returns:
         Latents [N, C, h, w], scaled.
     """
-    levels: list[float] = schedule.sigmas.tolist()
 
     def denoise(x: Tensor, step: int) -> Tensor:
-        sigma = torch.full(x.shape[:1], levels[step], device=x.device)
+        sigma = torch.full(x.shape[:1], schedule.steps[step].sigma, device=x.device)
         return denoiser(x, sigma, batch)
 
     return sample(denoise, schedule.start(noise[None], 1)[0], schedule.steps)

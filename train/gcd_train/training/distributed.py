@@ -21,7 +21,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.checkpoint import checkpoint
 
 from gcd_model.layers import Dormant
-from gcd_model.unet import Stage, StageInputs
+from gcd_model.unet import Stage
 from gcd_train.errors import Interrupted, RecipeError, TrainError
 from gcd_train.recipe_data import ComputeRecipe
 from gcd_train.stop import StopSignal
@@ -184,7 +184,7 @@ def _device(compute: ComputeRecipe) -> Generator[str]:
         yield "nccl"
 
 
-_Forward = Callable[[Tensor, StageInputs, int | None], Tensor]
+_Forward = Callable[[Tensor, Tensor, Tensor | None, int | None], Tensor]
 Module = TypeVar("Module", bound=nn.Module)
 
 
@@ -212,10 +212,10 @@ def recompute_blocks(module: nn.Module, every: int) -> None:
 
 
 def _recomputed(forward: _Forward) -> _Forward:
-    def twice(x: Tensor, inputs: StageInputs, frames: int | None) -> Tensor:
+    def twice(x: Tensor, embedding: Tensor, cross: Tensor | None, frames: int | None) -> Tensor:
         if not torch.is_grad_enabled():
-            return forward(x, inputs, frames)
-        done = checkpoint(forward, x, inputs, frames, use_reentrant=False, preserve_rng_state=False)
+            return forward(x, embedding, cross, frames)
+        done = checkpoint(forward, x, embedding, cross, frames, use_reentrant=False, preserve_rng_state=False)
         assert isinstance(done, Tensor), "a block returns one tensor"
         return done
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gcd_model import Clip, Family, ModelError, Synthesizer, Traits
-from gcd_model.colours import palette
+from gcd_model.clip import palette
 from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter
 from gcd_model.weights.card import Card, precision

@@ -52,7 +52,7 @@ class Denoiser(nn.Module):
         if torch.is_grad_enabled() and noisy.device.type == "cpu" and not self.unet.stem.weight.requires_grad:
             # torch's group norm crashes on a CPU where channels-last pictures need no gradient and its weights do
             scaled.requires_grad_()
-        raw = self.unet(scaled, batch.condition, plan.step(0), image_mode=image_mode).float()
+        raw = self.unet(scaled, batch.condition, *plan.step(0), image_mode=image_mode).float()
         return _column(levels.c_skip) * noisy + _column(levels.c_out) * raw
 
 
