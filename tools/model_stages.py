@@ -51,7 +51,7 @@ VARIANTS = {
     "ours on cuda, tuned": {"tuned": True},
     "ours on cuda, float32 decoder": {"decoder": "float32"},
     "ours, compiled alone": {"graphs": False},
-    "ours, graphs alone": {"backend": None, "channels_last": False, "decoder": "float32"},
+    "ours, graphs alone": {"backend": None, "channels_last": False, "joined": False, "decoder": "float32"},
 }
 """Of the engine for a GPU, as its options have them; beside them there are "ours" (plain torch), "diffusers" and
 "diffusers compiled"."""

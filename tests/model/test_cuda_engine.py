@@ -16,16 +16,25 @@ from torch import nn
 from gcd_model.clip import Clip, View
 from gcd_model.config import ModelConfig
 from gcd_model.diffusion import RenderOptions, Schedule
-from gcd_model.engines.cuda import CudaEngine, CudaOptions, cache_folder, checked_decoder, keep_compiled, regions, twin
+from gcd_model.engines.cuda import (
+    CudaEngine,
+    CudaOptions,
+    cache_folder,
+    checked_decoder,
+    join_attention,
+    keep_compiled,
+    regions,
+    twin,
+)
 from gcd_model.engines.graphs import CudaGraphs, Recent, Recorder, Replay
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
 from gcd_model.geometry import SphericalDelta, Trajectory
-from gcd_model.layers import ResBlock
+from gcd_model.layers import Attention, ResBlock
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 
-PLAIN = CudaOptions(backend=None, channels_last=False, decoder="float32")
+PLAIN = CudaOptions(backend=None, channels_last=False, joined=False, decoder="float32")
 
 
 def with_engine(
@@ -328,3 +337,15 @@ def test_a_second_gpu_is_the_current_one_while_its_engine_works(monkeypatch: pyt
     monkeypatch.setattr(CudaEngine, "like", SimpleNamespace(device=torch.device("cuda:1")))
     with engine._at_work():
         assert entered == [torch.device("cuda:1")]
+
+
+def test_joined_attention_is_plain_attention_in_the_same_memory() -> None:
+    attention, x = Attention(8, 2).requires_grad_(False), torch.randn(3, 5, 8)
+    expected = attention(x)
+    join_attention(attention)
+    assert relative_error(attention(x), expected) < 1e-6
+    assert attention.key.weight.untyped_storage().data_ptr() == attention.joint.untyped_storage().data_ptr()
+    changed = Attention(8, 2)
+    changed.key = nn.Sequential(changed.key)  # as an adapter does
+    join_attention(changed)
+    assert type(changed) is Attention

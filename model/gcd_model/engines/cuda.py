@@ -23,7 +23,7 @@ from gcd_model.conditioning import Conditioning, ImageTransformerLayer
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise, watched
 from gcd_model.engines.graphs import CudaGraphs, Recent, RecordedCall, Recorder, StepMemory, Update, solved
 from gcd_model.engines.torch import NetworkName, TorchEngine
-from gcd_model.layers import Downsample, ResBlock, Upsample, VideoResBlock, prepare
+from gcd_model.layers import Attention, Downsample, ResBlock, Upsample, VideoResBlock, prepare
 from gcd_model.networks import Networks
 from gcd_model.unet import Stage
 from gcd_model.vae import PixelAttention, TemporalDecoder, to_pixels
@@ -37,7 +37,8 @@ class CudaOptions:
 
     backend: of torch.compile; None runs the blocks as they are. tuned: inductor tries kernels for each shape, which
         takes many times as long to compile. graphs: record steps, encoders and decoder as CUDA
-        graphs. channels_last: lay convolutions out as tensor cores read them.
+        graphs. channels_last: lay convolutions out as tensor cores read them. joined: query, key and value of an
+        attention are one product.
     decoder: its precision; "checked" means float16, else bfloat16, where its pictures reach 50 dB against float32,
         see `checked_decoder`.
     """
@@ -46,12 +47,15 @@ class CudaOptions:
     tuned: bool = False
     graphs: bool = True
     channels_last: bool = True
+    joined: bool = True
     decoder: Literal["checked", "float32", "float16", "bfloat16"] = "checked"
 
     @classmethod
     def of_device(cls, device: torch.device) -> Self:
         """Everything on a GPU, and nothing on a CPU, where none of it would gain."""
-        return cls() if device.type == "cuda" else cls(backend=None, channels_last=False, decoder="float32")
+        if device.type == "cuda":
+            return cls()
+        return cls(backend=None, channels_last=False, joined=False, decoder="float32")
 
 
 class CudaEngine(TorchEngine):
@@ -70,6 +74,8 @@ class CudaEngine(TorchEngine):
         _settle_decoder(networks, options.decoder)
         if options.channels_last:
             channels_last(networks)
+        if options.joined:
+            join_attention(networks)
         prepare(networks)
         super().__init__(networks)
         self._beat: Callable[[], object] = lambda: None  # called before each piece of code is compiled
@@ -244,6 +250,30 @@ def channels_last(model: nn.Module) -> None:
         if isinstance(module, nn.Conv2d | nn.Conv3d):
             weight = module.weight.contiguous(memory_format=orders[module.weight.ndim])
             module.weight = nn.Parameter(weight, requires_grad=False)
+
+
+class JoinedAttention(Attention):
+    """Attention whose query, key and value are one product. joint: their weights, of which theirs are now parts."""
+
+    joint: Tensor
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: [N, L, C]."""
+        query, key, value = map(self._split, F.linear(x, self.joint).chunk(3, dim=-1))
+        mixed = F.scaled_dot_product_attention(query, key, value)
+        return self.out(mixed.transpose(1, 2).flatten(2))
+
+
+def join_attention(model: nn.Module) -> None:
+    """Make every attention a JoinedAttention, in place and in no more memory; not one that an adapter changes."""
+    for module in model.modules():
+        layers = (module.query, module.key, module.value) if type(module) is Attention else ()
+        if layers and all(type(layer) is nn.Linear for layer in layers):
+            joint = torch.cat([layer.weight for layer in layers])
+            for layer, part in zip(layers, joint.chunk(3), strict=True):
+                layer.weight.data = part
+            module.__class__ = JoinedAttention
+            module.joint = joint
 
 
 def cache_folder() -> Path:
