@@ -6,7 +6,7 @@ from functools import lru_cache
 import pytest
 import torch
 from msgspec import structs
-from small_models import TINY, draw, random_clip, tiny_synthesizer
+from small_models import TINY, draw, random_clip, synthesize, tiny_synthesizer
 from torch import Tensor
 
 from gcd_model.config import PLAIN_SMALL, SVD_14, SamplingConfig
@@ -25,7 +25,7 @@ from gcd_model.diffusion import (
 )
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
-from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.synthesizer import Synthesizer
 
 PUBLISHED = SamplingConfig()
 
