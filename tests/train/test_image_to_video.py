@@ -7,7 +7,8 @@ import pytest
 import torch
 from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 
-from gcd_model import FAMILIES, load_synthesizer
+from gcd_model import load_synthesizer
+from gcd_model.weights.families import FAMILIES
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import Clips, video_clips
 from gcd_train.errors import RecipeError
