@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from gcd_client.control import Code
 from gcd_client.protocol import PROTO
-from gcd_model import ASSUMED_SOURCE, DeltaFit, ModelError, Traits, ViewFixedError, ViewRangeError, nearest_delta
+from gcd_model import ModelError, SphericalDelta, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.auth import Role
 from gcd_node.config import ViewConfig, pose_matrix, without_secrets
 from gcd_node.health import Level
@@ -127,12 +127,12 @@ class NodeCommands:
         if view.pose is not None:
             result["rotation_error_deg"] = 0.0
             if not traits.takes_any_pose:
-                fit = self._fitted(pose_matrix(view.pose), traits)
-                result["rotation_error_deg"] = round(fit.rotation_error_deg, 4)
+                delta, rotation_error_deg = self._fitted(pose_matrix(view.pose), traits)
+                result["rotation_error_deg"] = round(rotation_error_deg, 4)
                 view = ViewConfig(
-                    azimuth_deg=fit.delta.azimuth_deg,
-                    elevation_deg=fit.delta.elevation_deg,
-                    radius=fit.delta.radius_m,
+                    azimuth_deg=delta.azimuth_deg,
+                    elevation_deg=delta.elevation_deg,
+                    radius=delta.radius_m,
                 )
         self._check_view(args.view, view, traits)
         result["goal"] = view.plain
@@ -195,13 +195,13 @@ class NodeCommands:
             message = f"{view_id} is at revision {now}, not {revision}: another client has changed it"
             raise RequestError(message, Code.WRONG_STATE, result={"view_rev": now})
 
-    def _fitted(self, numbers: tuple[float, ...], traits: Traits) -> DeltaFit:
-        """The differences that a rigid goal pose comes to. Raises RequestError."""
+    def _fitted(self, numbers: tuple[float, ...], traits: Traits) -> tuple[SphericalDelta, float]:
+        """The differences that a rigid goal pose comes to, and the degrees they miss it by. Raises RequestError."""
         if traits.config.camera == "none":
             raise RequestError(f"{traits.name} has one fixed view and takes no poses", Code.VIEW_FIXED)
         pose = torch.tensor(numbers, dtype=torch.float64).reshape(4, 4)
         try:
-            fit = nearest_delta(pose, stated_sphere(self._live.config.source.pose) or ASSUMED_SOURCE)
+            fit = nearest_delta(pose, stated_sphere(self._live.config.source.pose) or Traits.ASSUMED_SOURCE)
         except ModelError as error:
             raise RequestError(f"the pose: {error}", Code.BAD_ARG) from error
         if fit.rotation_error_deg > _TOLERATED_DEG:
@@ -211,7 +211,7 @@ class NodeCommands:
                 Code.OUT_OF_RANGE,
                 result={"allowed": {"rotation_error_deg": [0.0, _TOLERATED_DEG]}},
             )
-        return fit
+        return fit.delta, fit.rotation_error_deg
 
     def _check_view(self, view_id: str, view: ViewConfig, traits: Traits) -> None:
         """Raises RequestError if the checkpoint cannot give it."""

@@ -37,6 +37,12 @@ class WindowConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     max_skew: Annotated[float, Meta(gt=0, le=0.5)] = 0.5
 
 
+EngineName = Literal["torch", "cuda", "onnxruntime"]
+Quality = Literal["exact", "fast", "fastest"]
+SolverName = Literal["euler", "dpmpp_2m", "heun"]
+"""The model's own words once more: readers of launch files need no model, which takes seconds to import."""
+
+
 class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model and how it is sampled. What is left out is as the checkpoint was made for.
 
@@ -59,13 +65,13 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     adapter: str | None = None
     family: str | None = None
     device: str = "auto"
-    engine: Literal["torch", "cuda", "onnxruntime"] | None = None
+    engine: EngineName | None = None
     providers: tuple[str, ...] = ()
     dtype: str | None = None
     threads: Count | None = None
-    quality: Literal["exact", "fast", "fastest"] = "exact"
+    quality: Quality = "exact"
     steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
-    solver: Literal["euler", "dpmpp_2m", "heun"] | None = None
+    solver: SolverName | None = None
     guidance: tuple[float, float] | None = None
     guidance_interval: tuple[NotNegative, NotNegative] | None = None
     samples: Count = 1

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_model import (
-    ASSUMED_SOURCE,
-    FAMILIES,
     CameraMount,
     Intrinsics,
+    ModelError,
     OptionError,
-    ShapeError,
     Spherical,
     Traits,
     center_crop_box,
@@ -55,7 +53,7 @@ class Fit:
         beside = round(width * (1 - self.share) / 2)
         try:
             left, top, wide, high = center_crop_box(max(1, width - 2 * beside), height, self.width / self.height)
-        except ShapeError as error:
+        except ModelError as error:
             raise ConfigError(str(error)) from error
         if not self.allow_upscale and (wide < self.width or high < self.height):
             raise ConfigError(
@@ -261,8 +259,8 @@ def stated_sphere(pose: SourcePose | None) -> Spherical | None:
         return None
     return Spherical(
         azimuth_deg=0.0,
-        elevation_deg=ASSUMED_SOURCE.elevation_deg if pose.elevation_deg is None else pose.elevation_deg,
-        radius_m=ASSUMED_SOURCE.radius_m if pose.radius is None else pose.radius,
+        elevation_deg=Traits.ASSUMED_SOURCE.elevation_deg if pose.elevation_deg is None else pose.elevation_deg,
+        radius_m=Traits.ASSUMED_SOURCE.radius_m if pose.radius is None else pose.radius,
     )
 
 
@@ -286,10 +284,8 @@ def stated_mount(pose: SourcePose | None, hfov_deg: float | None, traits: Traits
 
 
 def assumed_hfov_deg(pose: SourcePose | None) -> float:
-    """Field of view that the live model takes a camera to have where nobody states one: of the orbits' training for a
-    camera on a sphere, else of the vehicle's."""
-    orbits = FAMILIES["kubric90"].hfov_deg
-    return orbits if pose is not None and pose.on_sphere and orbits is not None else CameraMount().hfov_deg
+    """See `Traits.assumed_hfov_deg`."""
+    return Traits.assumed_hfov_deg(on_sphere=pose is not None and pose.on_sphere)
 
 
 def in_words(mount: CameraMount | None, pose: SourcePose | None, traits: Traits) -> str:
@@ -302,6 +298,6 @@ def in_words(mount: CameraMount | None, pose: SourcePose | None, traits: Traits)
     if mount is not None:
         where = f"{mount.height_m:g} m above the ground, {mount.forward_m:g} m ahead, tilted {mount.tilt_deg:g} degrees"
     else:
-        source = stated_sphere(pose) or ASSUMED_SOURCE
+        source = stated_sphere(pose) or Traits.ASSUMED_SOURCE
         where = f"at an elevation of {source.elevation_deg:g} degrees and a radius of {source.radius_m:g} m"
     return f"the source camera stands {where}"

@@ -14,16 +14,12 @@ from msgspec import structs
 
 from gcd_client.protocol import SourcePoseRecord, ViewKind
 from gcd_model import (
-    ASSUMED_SOURCE,
-    LIVE_LENS_DEG,
     CameraMount,
     Intrinsics,
-    ModelConfig,
     OptionError,
     RenderOptions,
     Sampler,
     Traits,
-    sampler_of,
 )
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError
@@ -220,12 +216,10 @@ def _view_camera(config: NodeConfig, camera: Intrinsics | None, traits: Traits) 
 
 
 def _is_foreign_field(camera: Intrinsics | None, traits: Traits) -> bool:
-    trained = _trained_hfov_deg(traits)
-    if camera is None:
+    if camera is None or traits.lens_deg is None:
         return False
-    if traits.live:
-        return not LIVE_LENS_DEG[0] - _HFOV_TOLERANCE_DEG <= camera.hfov_deg <= LIVE_LENS_DEG[1] + _HFOV_TOLERANCE_DEG
-    return trained is not None and abs(camera.hfov_deg - trained) > _HFOV_TOLERANCE_DEG
+    narrowest, widest = traits.lens_deg
+    return not narrowest - _HFOV_TOLERANCE_DEG <= camera.hfov_deg <= widest + _HFOV_TOLERANCE_DEG
 
 
 def _trained_hfov_deg(traits: Traits) -> float | None:
@@ -256,7 +250,7 @@ def source_pose(context: StreamContext) -> SourcePoseRecord | None:
     if context.traits.config.camera == "none" or context.mount is not None:
         return None  # a fixed path states its rigid transforms itself
     stated = stated_sphere(context.config.source.pose)
-    source = stated or ASSUMED_SOURCE
+    source = stated or Traits.ASSUMED_SOURCE
     return SourcePoseRecord(el_deg=source.elevation_deg, r=source.radius_m, assumed=stated is None)
 
 
@@ -278,7 +272,7 @@ def drawing_options(section: ModelSection) -> RenderOptions:
 
 def sampler_in_use(section: ModelSection, traits: Traits) -> Sampler:
     """The same in full: what [model] leaves out as quality and checkpoint have it."""
-    return sampler_of(traits.config.sampling, drawing_options(section))
+    return Sampler.of(traits.config.sampling, drawing_options(section))
 
 
 def config_digest(config: NodeConfig, traits: Traits) -> str:
@@ -304,7 +298,7 @@ def config_digest(config: NodeConfig, traits: Traits) -> str:
 
 def _model_in_use(section: ModelSection, traits: Traits) -> ModelSection:
     sampling, family = traits.config.sampling, traits.family
-    networks = traits.config if isinstance(traits.config, ModelConfig) else None
+    networks = None if traits.live else traits.diffusion
     tower = None if networks is None else networks.image_encoder
     used = sampler_in_use(section, traits)
     return structs.replace(
@@ -337,7 +331,7 @@ def _pose_in_use(pose: SourcePose | None, traits: Traits) -> SourcePose | None:
         )
     if traits.config.camera == "none":
         return None
-    sphere = stated_sphere(pose) or ASSUMED_SOURCE
+    sphere = stated_sphere(pose) or Traits.ASSUMED_SOURCE
     return SourcePose(elevation_deg=sphere.elevation_deg, radius=sphere.radius_m)
 
 

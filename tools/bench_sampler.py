@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 
-from gcd_model import RenderOptions, Sampler, Schedule, load_synthesizer, sampler_of
-from gcd_model.diffusion import SOLVERS
+from gcd_model import RenderOptions, load_synthesizer
+from gcd_model.diffusion import SOLVERS, Sampler, Schedule
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
@@ -44,7 +44,7 @@ def main():
     model = load_synthesizer(options.weights, device=options.device, dtype=options.dtype)
     clips = open_clips(ClipOptions(data=options.data, split=options.split, limit=options.limit), model.traits)[0]
     views = SynthesizedViews.of(model, clips, RenderOptions(seed=options.seed))
-    own = sampler_of(model.traits.config.sampling, RenderOptions())
+    own = Sampler.of(model.traits.config.sampling, RenderOptions())
     references = [replace(own, steps=25), replace(own, steps=options.fine, solver="dpmpp_2m")]
     ways = list(dict.fromkeys(map(plainest, [own, *grid(own, options)])))
     print(f"{model.traits.name}, {len(clips.keys)} clips, noise of seed {options.seed}\n")

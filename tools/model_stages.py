@@ -488,7 +488,6 @@ def _sampling(engine: Engine, config: ModelConfig, work: Work, size: tuple[int, 
         camera=_empty(frames, unet.camera_width) if unet.camera_width else None,
         tokens=None if unet.context_width is None else _empty(branches * frames, unet.context_width),
         latents=_empty(branches * frames, unet.condition_channels, *size),
-        branches=branches,
     )
     so_far: list[int] = []
     with FlopCounterMode(display=False) as counter:

@@ -12,10 +12,7 @@ from typer import Argument, Option
 
 from gcd_model import (
     Augmentation,
-    EngineName,
-    Quality,
     RenderOptions,
-    SolverName,
     Traits,
     Trajectory,
     export_weights,
@@ -24,6 +21,7 @@ from gcd_model import (
 )
 from gcd_node.cli.main import progress_bar
 from gcd_node.cli.weights import FamilyOption, HeadWidth, ImageHeads
+from gcd_node.config import EngineName, Quality, SolverName
 from gcd_node.errors import SourceError, UsageError
 from gcd_node.messages import ontology
 from gcd_node.offline import ClipRequest, plan, read_clip, write_view

@@ -9,9 +9,8 @@ The node imports from here only. Source: Van Hoorick et al., "Generative Camera 
 
 from gcd_model.clip import Augmentation, Clip, View, hatched
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.config import ModelConfig
-from gcd_model.diffusion import Quality, RenderOptions, Sampler, Schedule, SolverName, sampler_of
-from gcd_model.engines.onnx_export import ExportPrecision, is_export
+from gcd_model.diffusion import RenderOptions, Sampler
+from gcd_model.engines.onnx_export import is_export
 from gcd_model.errors import (
     Cancelled,
     CheckpointError,
@@ -21,13 +20,11 @@ from gcd_model.errors import (
     NonFiniteError,
     OptionError,
     PoseError,
-    ShapeError,
     ViewFixedError,
     ViewRangeError,
 )
 from gcd_model.geometry import (
     CameraMount,
-    DeltaFit,
     Intrinsics,
     Orbit,
     Spherical,
@@ -35,55 +32,40 @@ from gcd_model.geometry import (
     Trajectory,
     center_crop_box,
     nearest_delta,
-    pose_trajectory,
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.eyes import SeenFrame
 from gcd_model.live.memory import PlacedFrame
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.loading import EngineName, default_precision, export_weights, load_synthesizer, weights_path
+from gcd_model.loading import default_precision, export_weights, load_synthesizer, weights_path
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
-from gcd_model.synthesizer import FrameSynthesizer, Synthesizer, ViewSynthesizer
-from gcd_model.traits import ASSUMED_SOURCE, Traits
+from gcd_model.synthesizer import FrameSynthesizer, ViewSynthesizer
+from gcd_model.traits import Traits
 from gcd_model.weights.card import WeightsReport
-from gcd_model.weights.families import FAMILIES, LIVE_LENS_DEG, Family
 from gcd_model.weights.load import convert_weights, inspect_weights
 
 __all__ = [
-    "ASSUMED_SOURCE",
-    "FAMILIES",
-    "LIVE_LENS_DEG",
     "Augmentation",
     "CameraMount",
     "Cancelled",
     "CheckpointError",
     "Clip",
-    "DeltaFit",
     "DeviceMemoryError",
-    "EngineName",
-    "ExportPrecision",
-    "Family",
     "FileError",
     "FrameSynthesizer",
     "Intrinsics",
-    "ModelConfig",
     "ModelError",
     "NonFiniteError",
     "OptionError",
     "Orbit",
     "PlacedFrame",
     "PoseError",
-    "Quality",
     "RenderOptions",
     "Sampler",
-    "Schedule",
     "SeenFrame",
-    "ShapeError",
-    "SolverName",
     "SourceFeatures",
     "Spherical",
     "SphericalDelta",
-    "Synthesizer",
     "Traits",
     "Trajectory",
     "View",
@@ -102,12 +84,10 @@ __all__ = [
     "is_export",
     "load_synthesizer",
     "nearest_delta",
-    "pose_trajectory",
     "printable",
     "read_json",
     "read_small",
     "require_motion",
-    "sampler_of",
     "visibility_of",
     "weights_path",
 ]

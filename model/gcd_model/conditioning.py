@@ -108,7 +108,6 @@ class Conditioning:
     camera: Tensor | None
     tokens: Tensor | None
     latents: Tensor
-    branches: int
 
 
 def micro_conditioning(fps: float, motion_bucket: float, augmentation: float, width: int) -> Tensor:

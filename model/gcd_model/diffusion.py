@@ -19,7 +19,7 @@ SolverName = Literal["euler", "dpmpp_2m", "heun"]
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 
 Quality = Literal["exact", "fast", "fastest"]
-"""How much of a checkpoint's own sampling is kept, see `sampler_of`."""
+"""How much of a checkpoint's own sampling is kept, see `Sampler.of`."""
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 
 Guidance: TypeAlias = tuple[float, float]
@@ -45,7 +45,7 @@ class RenderOptions:
     guidance_interval: lowest and highest noise level at which guidance applies; elsewhere the conditional branch counts
         alone and is computed alone (Kynkäänniemi et al. 2024). None: everywhere, unless the quality has an interval.
     solver: "euler" as published; "dpmpp_2m" or "heun", of second order, which need fewer steps for the same error.
-    quality: what is left open here is the checkpoint's own ("exact"), or cheaper; see `sampler_of`.
+    quality: what is left open here is the checkpoint's own ("exact"), or cheaper; see `Sampler.of`.
     samples: draws per view. seed: sample s draws from (seed, s), whatever else is rendered with it.
     initial_noise: float32 [T, C, h, w] or [S, T, C, h, w], unit variance, used instead of a draw.
     motion_bucket: the motion number, instead of the formula's.
@@ -250,6 +250,12 @@ def guided(unconditional: Tensor, conditional: Tensor, scale: Tensor) -> Tensor:
 # --- qualities: a checkpoint's own way of sampling, or a cheaper one -------------------------------------------------
 
 
+PRESETS: dict[Quality, tuple[SolverName, int]] = {"fast": ("dpmpp_2m", 16), "fastest": ("dpmpp_2m", 10)}
+"""Solver and steps of the cheaper qualities. "fast" is no farther from the limit of many steps than 25 Euler steps, on
+mixtures whose denoiser is known exactly; "fastest" at most three times as far. Trained small models of many steps are
+nearer to the limit with either than with 25 Euler steps; guidance is left alone, as nothing was measured of it."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Sampler:
     """A way to sample, complete.
@@ -263,30 +269,24 @@ class Sampler:
     guidance: Guidance
     guidance_interval: NoiseInterval | None = None
 
+    @classmethod
+    def of(cls, sampling: SamplingConfig, options: RenderOptions) -> Self:
+        """What `options` come to for a checkpoint.
 
-PRESETS: dict[Quality, tuple[SolverName, int]] = {"fast": ("dpmpp_2m", 16), "fastest": ("dpmpp_2m", 10)}
-"""Solver and steps of the cheaper qualities. "fast" is no farther from the limit of many steps than 25 Euler steps, on
-mixtures whose denoiser is known exactly; "fastest" at most three times as far. Trained small models of many steps are
-nearer to the limit with either than with 25 Euler steps; guidance is left alone, as nothing was measured of it."""
-
-
-def sampler_of(sampling: SamplingConfig, options: RenderOptions) -> Sampler:
-    """What `options` come to for a checkpoint.
-
-    What they name counts; what they leave open is as their quality has it: "exact" is the checkpoint's own way, Euler
-    steps with guidance everywhere; "fast" and "fastest" are presets for checkpoints that take more steps than those. A
-    checkpoint of fewer steps, such as our small models, is sampled its own way in every quality.
-    """
-    solver, steps = "euler", sampling.steps
-    preset = PRESETS.get(options.quality)
-    if preset is not None and preset[1] < steps:
-        solver, steps = preset
-    return Sampler(
-        steps=options.steps or steps,
-        solver=options.solver or solver,
-        guidance=options.guidance or sampling.guidance,
-        guidance_interval=options.guidance_interval,
-    )
+        What they name counts; what they leave open is as their quality has it: "exact" is the checkpoint's own way,
+        Euler steps with guidance everywhere; "fast" and "fastest" are presets for checkpoints that take more steps than
+        those. A checkpoint of fewer steps, such as our small models, is sampled its own way in every quality.
+        """
+        solver, steps = "euler", sampling.steps
+        preset = PRESETS.get(options.quality)
+        if preset is not None and preset[1] < steps:
+            solver, steps = preset
+        return cls(
+            steps=options.steps or steps,
+            solver=options.solver or solver,
+            guidance=options.guidance or sampling.guidance,
+            guidance_interval=options.guidance_interval,
+        )
 
 
 # --- one run of the sampler, and the network as it calls it -----------------------------------------------------------
@@ -307,8 +307,8 @@ class Schedule:
 
     @classmethod
     def of(cls, config: ModelConfig, options: RenderOptions | None = None) -> Self:
-        """What `sampler_of` makes of the options."""
-        sampler = sampler_of(config.sampling, RenderOptions() if options is None else options)
+        """What `Sampler.of` makes of the options."""
+        sampler = Sampler.of(config.sampling, RenderOptions() if options is None else options)
         steps = solver_steps(sampler.solver, edm_sigmas(config.sampling, sampler.steps))
         guides = sampler.guidance != (1.0, 1.0)
         low, high = sampler.guidance_interval or (0.0, math.inf)

@@ -84,13 +84,6 @@ class FrameSynthesizer(ViewSynthesizer, Protocol):
         ...
 
 
-def synthesize(
-    synthesizer: ViewSynthesizer, clip: Clip, trajectory: Trajectory, options: RenderOptions | None = None
-) -> View:
-    """One clip, one view: `encode`, then `render`."""
-    return synthesizer.render(synthesizer.encode(clip), [trajectory], options)[0]
-
-
 def out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given, Made]:
     """The method, with torch's out-of-memory error as DeviceMemoryError and the device's cache given back."""
 
@@ -118,26 +111,22 @@ class Download:
     def __init__(self, source: Tensor) -> None:
         """Begin, as soon as the device has made the tensor. It must not be written to any more."""
         self._held, self._arrived = source, None
-        if source.is_cuda:
-            self._held, self._arrived = _begun(source)
+        if not source.is_cuda:
+            return
+        side = torch.cuda.Stream(source.device)
+        side.wait_stream(torch.cuda.current_stream(source.device))
+        with torch.cuda.stream(side):
+            self._held = torch.empty(source.shape, dtype=source.dtype, pin_memory=True)
+            self._held.copy_(source, non_blocking=True)
+            source.record_stream(side)  # or its memory could be given away before it is read
+            self._arrived = torch.cuda.Event(blocking=True)
+            self._arrived.record(side)
 
     def result(self) -> Tensor:
         """The copy, once it is there."""
         if self._arrived is not None:
             self._arrived.synchronize()
         return self._held
-
-
-def _begun(source: Tensor) -> tuple[Tensor, torch.cuda.Event]:
-    side = torch.cuda.Stream(source.device)
-    side.wait_stream(torch.cuda.current_stream(source.device))
-    with torch.cuda.stream(side):
-        held = torch.empty(source.shape, dtype=source.dtype, pin_memory=True)
-        held.copy_(source, non_blocking=True)
-        source.record_stream(side)  # or its memory could be given away before it is read
-        arrived = torch.cuda.Event(blocking=True)
-        arrived.record(side)
-    return held, arrived
 
 
 def whole_levels(pixels: Tensor) -> Tensor:
@@ -183,21 +172,23 @@ class Synthesizer:
 
         extra: [T, C', h, w], for checkpoints with further condition channels.
         """
-        augmentation = Augmentation() if augmentation is None else augmentation
-        told = augmentation.strength
-        strength = self._config.sampling.augmentation if told is None else told
+        augmentation = augmentation or Augmentation()
+        strength = self._config.sampling.augmentation if augmentation.strength is None else augmentation.strength
         self._traits.check_size(*clip.video.shape[-2:])
-        self._check_extra(extra)
+        wanted, given = self._config.extra_condition_channels, 0 if extra is None else extra.shape[1]
+        if wanted != given:
+            raise ShapeError(f"{self._traits.name} wants {wanted} extra condition channels, got {given}")
         noise = augmentation.noise
         if noise is None:
             noise = unit_noise(tuple(clip.video.shape), augmentation.seed)
         if noise.shape != clip.video.shape:
             raise ShapeError(f"augmentation noise must be {list(clip.video.shape)}, got {list(noise.shape)}")
         noisy = clip.video + strength * noise.to(clip.video.device)
+        tokens = [self._engine.tokens(frames) for frames in clip.video.split(_ENCODE_FRAMES)]
         return SourceFeatures(
-            tokens=self._tokens(clip.video),
+            tokens=torch.cat([each for each in tokens if each is not None]) if self._config.image_encoder else None,
             latents=torch.cat([self._engine.condition_mean(frames) for frames in noisy.split(_ENCODE_FRAMES)]),
-            extra=None if extra is None else extra.to(self._like),
+            extra=None if extra is None else extra.to(self._engine.like),
             fps=clip.fps,
             augmentation=strength,
         )
@@ -211,29 +202,21 @@ class Synthesizer:
         self._check_lengths(features, trajectories)
         given = options.motion_bucket
         buckets = [self._traits.motion_bucket(path) if given is None else given for path in trajectories]
-        made = self._denoise(features, trajectories, buckets, options)
-        pictures = self._decode(made / self._config.vae.scale, as_levels=options.whole_levels)
-        latents = made.cpu()
+        latents = self._denoise(features, trajectories, buckets, options)
+        pictures, classes = self._decode(latents / self._config.vae.scale, as_levels=options.whole_levels)
         return [
             View(
-                samples=pixels,
-                latents=latents[v],
-                trajectory=trajectories[v],
-                motion_bucket=buckets[v],
-                classes=classes,
+                samples=samples,
+                latents=own,
+                trajectory=path,
+                motion_bucket=bucket,
+                classes=ids,
                 uncertainty_scale=self._traits.uncertainty_scale,
             )
-            for v, (pixels, classes) in enumerate(pictures)
+            for samples, own, path, bucket, ids in zip(
+                pictures, latents.cpu(), trajectories, buckets, classes, strict=True
+            )
         ]
-
-    @property
-    def _like(self) -> Tensor:
-        return self._engine.like
-
-    def _check_extra(self, extra: Tensor | None) -> None:
-        wanted, given = self._config.extra_condition_channels, 0 if extra is None else extra.shape[1]
-        if wanted != given:
-            raise ShapeError(f"{self._traits.name} wants {wanted} extra condition channels, got {given}")
 
     def _check_lengths(self, features: SourceFeatures, trajectories: Sequence[Trajectory]) -> None:
         frames = self._config.frames
@@ -243,11 +226,6 @@ class Synthesizer:
             if length != frames:
                 raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
 
-    def _tokens(self, video: Tensor) -> Tensor | None:
-        chunks = [self._engine.tokens(frames) for frames in video.split(_ENCODE_FRAMES)]
-        made = [each for each in chunks if each is not None]
-        return torch.cat(made) if made else None
-
     def _denoise(
         self,
         features: SourceFeatures,
@@ -256,22 +234,21 @@ class Synthesizer:
         options: RenderOptions,
     ) -> Tensor:
         """Scaled latents, [V, S, T, C, h, w]; rows of the batch are ordered view by view, sample by sample."""
-        config, samples, views = self._config, options.samples, len(trajectories)
+        config, samples, views, like = self._config, options.samples, len(trajectories), self._engine.like
         schedule = Schedule.of(config, options)
         width, strength = config.unet.vector_width, features.augmentation
         vectors = [micro_conditioning(features.fps, bucket, strength, width) for bucket in buckets]
-        told = [self._engine.camera(path) for path in trajectories]
-        cameras = [each.repeat(samples, 1) for each in told if each is not None]
+        cameras = [self._engine.camera(path) for path in trajectories]
+        cameras = [each.repeat(samples, 1) for each in cameras if each is not None]
         unconditional = schedule.branches == 2
         given = Conditioning(
-            vector=torch.cat([vector.expand(samples * config.frames, -1) for vector in vectors]).to(self._like),
+            vector=torch.cat([vector.expand(samples * config.frames, -1) for vector in vectors]).to(like),
             camera=torch.cat(cameras) if cameras else None,
             tokens=condition_tokens(features, views * samples, unconditional=unconditional),
             latents=condition_latents(features, views * samples, unconditional=unconditional),
-            branches=schedule.branches,
         )
         noise = self._noise(tuple(features.latents.shape[1:]), options)
-        latents = self._engine.sample(schedule.start(noise.to(self._like.device), views), given, schedule, options)
+        latents = self._engine.sample(schedule.start(noise.to(like.device), views), given, schedule, options)
         if not latents.isfinite().all():
             raise NonFiniteError(
                 f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
@@ -291,28 +268,26 @@ class Synthesizer:
             raise OptionError(f"initial noise must be {[samples, frames, *each]}, got {list(given.shape)}")
         return given.float()
 
-    def _decode(self, latents: Tensor, *, as_levels: bool) -> list[tuple[Tensor, Tensor | None]]:
+    def _decode(self, latents: Tensor, *, as_levels: bool) -> tuple[list[Tensor], list[Tensor] | list[None]]:
         """Of every view pixels [S, T, 3, H, W] and class ids, on the CPU. latents: [V, S, T, C, h, w], unscaled.
 
         One clip at a time; while one is decoded, the one before it arrives.
         """
         painted, finite = self._traits.painted_classes, list[Tensor]()
-        coming: list[list[tuple[Download, Download | None]]] = []
-        for view in latents:
-            coming.append([])
-            for clip in view:
-                decoded = self._engine.decode(clip)
-                pixels = to_pixels(decoded)
-                classes = Download(nearest_classes(pixels, painted)) if painted else None
-                coming[-1].append((Download(whole_levels(pixels) if as_levels else pixels), classes))
-                finite.append(decoded.isfinite().all())
+        pictures, classes = list[Download](), list[Download]()
+        for clip in latents.flatten(0, 1):
+            decoded = self._engine.decode(clip)
+            finite.append(decoded.isfinite().all())
+            pixels = to_pixels(decoded)
+            if painted:
+                classes.append(Download(nearest_classes(pixels, painted)))
+            pictures.append(Download(whole_levels(pixels) if as_levels else pixels))
         if not all(each.item() for each in finite):
             raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
-        arrived = [[(pixels.result(), classes and classes.result()) for pixels, classes in view] for view in coming]
-        return [
-            (
-                torch.stack([pixels for pixels, _ in view]),
-                torch.stack([classes for _, classes in view if classes is not None]) if painted else None,
-            )
-            for view in arrived
-        ]
+        views, samples = latents.shape[:2]
+
+        def by_view(clips: list[Download]) -> list[Tensor]:
+            rows = [clips[v * samples : (v + 1) * samples] for v in range(views)]
+            return [torch.stack([each.result() for each in row]) for row in rows]
+
+        return by_view(pictures), by_view(classes) if painted else [None] * views

@@ -3,7 +3,7 @@
 import logging
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Self
 
 import msgspec
 import torch
@@ -28,7 +28,7 @@ from gcd_model.geometry import (
 )
 from gcd_model.live.config import LiveConfig
 from gcd_model.weights.card import NO_DIFFUSION, Card
-from gcd_model.weights.families import Family, family_named
+from gcd_model.weights.families import KUBRIC90, LIVE_LENS_DEG, Family, family_named
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
@@ -58,6 +58,7 @@ class Traits:
     device: str
     trained: bool = True
     uncertainty_scale: float | None = None
+    ASSUMED_SOURCE: ClassVar[Spherical] = ASSUMED_SOURCE
 
     @classmethod
     def of(cls, card: Card, *, sha256_12: str, precision: str, device: str) -> Self:
@@ -78,6 +79,21 @@ class Traits:
     def live(self) -> bool:
         """Whether it is the live model, which needs to know the lens and takes a mount, depth and odometry."""
         return isinstance(self.config, LiveConfig)
+
+    @staticmethod
+    def assumed_hfov_deg(*, on_sphere: bool) -> float:
+        """Field of view that the live model takes a camera to have where nobody states one: of the orbits' training for
+        a camera on a sphere, else of the vehicle's."""
+        orbits = KUBRIC90.hfov_deg
+        return orbits if on_sphere and orbits is not None else CameraMount().hfov_deg
+
+    @property
+    def lens_deg(self) -> tuple[float, float] | None:
+        """The narrowest and the widest field of view of the training; None where the family does not say."""
+        if self.live:
+            return LIVE_LENS_DEG
+        hfov_deg = None if self.family is None else self.family.hfov_deg
+        return None if hfov_deg is None else (hfov_deg, hfov_deg)
 
     @property
     def ood_threshold(self) -> float | None:

@@ -33,15 +33,16 @@ def fill(module: nn.Module) -> None:
 def main(folder: Path) -> None:
     networks = empty_networks(SVD_14)
     fill(networks)
-    record = write_graph(step_graph(networks), folder)
+    graph = step_graph(networks)
+    files = write_graph(graph, folder)
     model = onnx.load(folder / "step.onnx", load_external_data=False)
     large = [each for each in model.graph.initializer if math.prod(each.dims) > SMALL]
     apart = [each for each in model.graph.initializer if each.data_location == onnx.TensorProto.EXTERNAL]
     found = {
-        "inputs": {each.name: each.shape for each in record.inputs},
-        "files": [file.name for file in record.files],
-        "graph_mb": record.files[0].size / 1e6,
-        "data_gb": sum(file.size for file in record.files[1:]) / 1e9,
+        "inputs": {name: each.shape for name, each in graph.inputs.items()},
+        "files": [file.name for file in files],
+        "graph_mb": files[0].size / 1e6,
+        "data_gb": sum(file.size for file in files[1:]) / 1e9,
         "weights": len(large),
         "apart": len(apart),
         "nodes": len(model.graph.node),

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gcd_model import Clip, Intrinsics, Trajectory, pose_trajectory
+from gcd_model import Clip, Intrinsics, Trajectory
+from gcd_model.geometry import pose_trajectory
 
 HEIGHT, WIDTH, FRAMES = 32, 64, 14
 LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)

@@ -5,8 +5,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from gcd_model.clip import Clip
+from gcd_model.clip import Clip, View
 from gcd_model.config import ImageEncoderConfig, ModelConfig, SamplingConfig, SemanticClass, UNetConfig, VAEConfig
+from gcd_model.diffusion import RenderOptions
+from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
@@ -148,6 +150,11 @@ def tiny_driving(config: ModelConfig = TINY_DRIVING, seed: int = 0) -> Synthesiz
     networks = Networks(config)
     randomise(networks, seed)
     return Synthesizer(networks, replace(tiny_traits(config), name="tiny-driving", family=DRIVING_SEMANTIC))
+
+
+def synthesize(synthesizer: Synthesizer, clip: Clip, path: Trajectory, options: RenderOptions | None = None) -> View:
+    """One clip, one view."""
+    return synthesizer.render(synthesizer.encode(clip), [path], options)[0]
 
 
 def random_clip(config: ModelConfig = TINY, *, frames: int | None = None, seed: int = 0) -> Clip:

@@ -24,7 +24,6 @@ from gcd_model import (
     OptionError,
     PoseError,
     RenderOptions,
-    ShapeError,
     SphericalDelta,
     Trajectory,
     View,
@@ -33,6 +32,7 @@ from gcd_model import (
     load_synthesizer,
     visibility_of,
 )
+from gcd_model.errors import ShapeError
 from gcd_model.geometry import driving_trajectory
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live

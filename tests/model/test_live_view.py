@@ -7,7 +7,8 @@ from live_room import FRAMES, HEIGHT, LENS, WIDTH, one_thread, path, room  # noq
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, ShapeError, load_synthesizer
+from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, load_synthesizer
+from gcd_model.errors import ShapeError
 from gcd_model.live.config import LIVE_TINY, SKY_M, LiveConfig
 from gcd_model.live.depth_net import Reference
 from gcd_model.live.eyes import Eyes

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from published import SMALL_GCD, filled, write_diffusers, write_gcd
+from small_models import synthesize
 from torch import Tensor
 
 from gcd_model import loading
@@ -15,7 +16,7 @@ from gcd_model.errors import CheckpointError, OptionError, ViewFixedError
 from gcd_model.geometry import SphericalDelta
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.loading import load_synthesizer
-from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import convert_weights, save_weights

@@ -5,13 +5,13 @@ from collections.abc import Callable
 import msgspec
 import pytest
 import torch
-from small_models import TINY, draw, random_clip, relative_error, tiny_synthesizer
+from small_models import TINY, draw, random_clip, relative_error, synthesize, tiny_synthesizer
 
 from gcd_model.config import ModelConfig, SamplingConfig
 from gcd_model.diffusion import RenderOptions
 from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
-from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.synthesizer import Synthesizer
 
 LATENTS = (TINY.frames, 4, TINY.height // 4, TINY.width // 4)
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 import pytest
 import torch
 from msgspec import structs
-from small_models import TINY, draw, random_clip, tiny_synthesizer
+from small_models import TINY, draw, random_clip, synthesize, tiny_synthesizer
 from torch import Tensor
 
 from gcd_model.config import PLAIN_SMALL, SVD_14, SamplingConfig
@@ -20,12 +20,11 @@ from gcd_model.diffusion import (
     SolverName,
     edm_sigmas,
     sample,
-    sampler_of,
     solver_steps,
 )
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
-from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.synthesizer import Synthesizer
 
 PUBLISHED = SamplingConfig()
 
@@ -56,12 +55,12 @@ def error(solver: SolverName, steps: int) -> float:
 
 
 def in_quality(quality: Quality, sampling: SamplingConfig = PUBLISHED) -> Sampler:
-    return sampler_of(sampling, RenderOptions(quality=quality))
+    return Sampler.of(sampling, RenderOptions(quality=quality))
 
 
 def test_exact_is_what_was_published() -> None:
     assert in_quality("exact") == Sampler(steps=25, solver="euler", guidance=(1.0, 1.5), guidance_interval=None)
-    assert sampler_of(PUBLISHED, RenderOptions()) == in_quality("exact")
+    assert Sampler.of(PUBLISHED, RenderOptions()) == in_quality("exact")
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
@@ -82,14 +81,14 @@ def test_no_quality_takes_more_of_the_network_than_a_better_one(steps: int) -> N
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_what_is_named_wins_over_the_quality(quality: Quality) -> None:
     named = RenderOptions(quality=quality, steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0))
-    assert sampler_of(PUBLISHED, named) == Sampler(
+    assert Sampler.of(PUBLISHED, named) == Sampler(
         steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0)
     )
 
 
 def test_what_is_not_named_is_as_the_quality_has_it() -> None:
-    assert sampler_of(PUBLISHED, RenderOptions(quality="fast", steps=7)) == replace(in_quality("fast"), steps=7)
-    assert sampler_of(PUBLISHED, RenderOptions(solver="dpmpp_2m")) == replace(in_quality("exact"), solver="dpmpp_2m")
+    assert Sampler.of(PUBLISHED, RenderOptions(quality="fast", steps=7)) == replace(in_quality("fast"), steps=7)
+    assert Sampler.of(PUBLISHED, RenderOptions(solver="dpmpp_2m")) == replace(in_quality("exact"), solver="dpmpp_2m")
 
 
 def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are() -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_models import TINY, draw, random_clip, relative_error, tiny_synthesizer
+from small_models import TINY, draw, random_clip, relative_error, synthesize, tiny_synthesizer
 from torch import Tensor, nn
 from torch.testing import assert_close
 
@@ -15,7 +15,7 @@ from gcd_model.conditioning import SourceFeatures
 from gcd_model.diffusion import RenderOptions, unit_noise
 from gcd_model.errors import Cancelled, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
-from gcd_model.synthesizer import Synthesizer, synthesize
+from gcd_model.synthesizer import Synthesizer
 
 LATENTS = (TINY.frames, 4, TINY.height // 4, TINY.width // 4)
 

@@ -9,9 +9,10 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from small_models import TINY, random_clip, tiny_synthesizer, tiny_traits
 
-from gcd_model import RenderOptions, SphericalDelta, Synthesizer, convert_weights, inspect_weights, load_synthesizer
+from gcd_model import RenderOptions, SphericalDelta, convert_weights, inspect_weights, load_synthesizer
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import random_networks
+from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_weights, save_weights
 

@@ -13,7 +13,6 @@ from msgspec.structs import replace as struct_replace
 
 from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_model import (
-    FAMILIES,
     Augmentation,
     Clip,
     RenderOptions,
@@ -25,6 +24,7 @@ from gcd_model import (
     load_synthesizer,
 )
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL
+from gcd_model.weights.families import FAMILIES
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.inference import WindowReport

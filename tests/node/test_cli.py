@@ -14,9 +14,10 @@ from media import environment, noise
 from tiny_weights import HEIGHT, WIDTH, write_tiny
 from typer.main import get_command
 
-from gcd_model import ASSUMED_SOURCE, CameraMount, SphericalDelta
+from gcd_model import CameraMount, SphericalDelta
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import spherical_trajectory
+from gcd_model.traits import ASSUMED_SOURCE
 from gcd_node.cli import offline as cli_offline
 from gcd_node.cli.main import COMMANDS, new_app, run_app
 from gcd_node.image_io import write_video

@@ -6,8 +6,9 @@ import msgspec
 import pytest
 from fakes import live_traits, traits
 
-from gcd_model import RenderOptions, Traits, sampler_of
+from gcd_model import RenderOptions, Traits
 from gcd_model.config import SamplingConfig
+from gcd_model.diffusion import Sampler
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.stream_context import config_digest
 
@@ -81,7 +82,7 @@ def test_what_changes_the_pixels_changes_the_name(made: Traits, change: str) -> 
 
 def test_a_quality_has_the_name_of_what_it_comes_to() -> None:
     many = replace(STEERED, config=msgspec.structs.replace(STEERED.config, sampling=SamplingConfig()))
-    fast = sampler_of(many.config.sampling, RenderOptions(quality="fast"))
+    fast = Sampler.of(many.config.sampling, RenderOptions(quality="fast"))
     assert digest("model.quality=fast", made=many) != digest(made=many)
     named = digest(f"model.steps={fast.steps}", f"model.solver={fast.solver}", made=many)
     assert digest("model.quality=fast", made=many) == named

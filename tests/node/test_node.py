@@ -13,15 +13,8 @@ from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, tr
 
 from gcd_client.images import images
 from gcd_client.protocol import OriginHeader, StatusTopic
-from gcd_model import (
-    CheckpointError,
-    DeviceMemoryError,
-    NonFiniteError,
-    RenderOptions,
-    ShapeError,
-    ViewFixedError,
-    ViewRangeError,
-)
+from gcd_model import CheckpointError, DeviceMemoryError, NonFiniteError, RenderOptions, ViewFixedError, ViewRangeError
+from gcd_model.errors import ShapeError
 from gcd_node.config import NodeConfig, PublishConfig, parse_config
 from gcd_node.errors import EndpointError, ModelFailedError, NodeError, PublisherError, SourceError
 from gcd_node.pipeline import ending

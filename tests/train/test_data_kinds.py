@@ -11,9 +11,10 @@ from cached_sets import CHOICE, CLIP, HEIGHT, WIDTH, FakePictures, tiny_identity
 from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from tiny_world import tiny_recipe
 
-from gcd_model import FAMILIES, ModelConfig
+from gcd_model.config import ModelConfig
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
+from gcd_model.weights.families import FAMILIES
 from gcd_train.data.cache_writer import CacheJob, cache_scenes
 from gcd_train.data.latents import only_writer
 from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of

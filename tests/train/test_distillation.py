@@ -10,9 +10,10 @@ import torch
 from tiny_driving import smaller
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved
 
-from gcd_model import Clip, RenderOptions, Synthesizer, Traits, load_synthesizer
+from gcd_model import Clip, RenderOptions, Traits, load_synthesizer
 from gcd_model.config import SVD_14
 from gcd_model.networks import Networks, random_networks
+from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_weights, read_adapter, save_weights

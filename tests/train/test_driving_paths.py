@@ -39,9 +39,6 @@ def opened(recipe: Recipe, data: Path, valid: Path) -> RunData:
     return open_data(recipe, model_config(model), family_of(model), DataPlaces(data=data, valid=valid))
 
 
-# laws
-
-
 def test_a_direct_target_stands_where_a_gradual_one_arrives_and_the_source_is_the_same() -> None:
     gradual, direct = driving_scene(3, frames=3), driving_scene(3, frames=3, move_time=0)
     np.testing.assert_array_equal(direct.cameras["source"], gradual.cameras["source"])
@@ -70,9 +67,6 @@ def test_a_folder_says_which_path_its_target_camera_takes(tmp_path: Path) -> Non
         agree(agree_in, world(path))
         assert read_world(agree_in) == world(path)
         assert json.loads((agree_in / "world.json").read_text())["path"] == path
-
-
-# examples
 
 
 def test_clips_of_both_paths_do_not_go_together(tmp_path: Path) -> None:

@@ -8,11 +8,12 @@ import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, evaluated
 from torch import Tensor
 
-from gcd_model import FAMILIES, Clip, Family, ModelConfig, RenderOptions, Trajectory, View
+from gcd_model import Clip, RenderOptions, Trajectory, View
 from gcd_model.clip import Augmentation
 from gcd_model.conditioning import SourceFeatures
-from gcd_model.config import DRIVING_CLASSES, SMALL, SemanticClass
+from gcd_model.config import DRIVING_CLASSES, SMALL, ModelConfig, SemanticClass
 from gcd_model.geometry import CameraMount, Spherical, SphericalDelta, driving_trajectory, spherical_trajectory
+from gcd_model.weights.families import FAMILIES, Family
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.methods import SynthesizedViews

@@ -16,8 +16,6 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import (
-    ASSUMED_SOURCE,
-    FAMILIES,
     Augmentation,
     CameraMount,
     Clip,
@@ -33,6 +31,8 @@ from gcd_model import (
 from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics
+from gcd_model.traits import ASSUMED_SOURCE
+from gcd_model.weights.families import FAMILIES
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window

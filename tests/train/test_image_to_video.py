@@ -7,7 +7,8 @@ import pytest
 import torch
 from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
 
-from gcd_model import FAMILIES, load_synthesizer
+from gcd_model import load_synthesizer
+from gcd_model.weights.families import FAMILIES
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import Clips, video_clips
 from gcd_train.errors import RecipeError
@@ -25,9 +26,6 @@ def recipe(name: str, *changes: str) -> Recipe:
     return load_recipe(f"package:{name}", small=True, changes=[*SMALLER, *changes])
 
 
-# laws
-
-
 def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> None:
     pairs, orbits = TinyClips(2), TinyOrbits(1)
     videos = video_clips([pairs, orbits])
@@ -42,9 +40,6 @@ def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> No
     wanted = [pairs.sample(0).source, pairs.sample(0).target, orbits.sample(0).source, pairs.sample(1).target]
     assert all(np.array_equal(one, other) for one, other in zip(shown, wanted, strict=True))
     assert len(set(videos.seeds)) == 6
-
-
-# examples
 
 
 def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[Clips, ...] = ()) -> Trainer:

@@ -14,7 +14,8 @@ from headless import needs_egl
 from tiny_world import tiny_recipe
 from typer.testing import CliRunner
 
-from gcd_model import FAMILIES, ModelConfig
+from gcd_model.config import ModelConfig
+from gcd_model.weights.families import FAMILIES
 from gcd_train.cli.main import app
 from gcd_train.data.files import FileFault
 from gcd_train.data.open import DataPlaces, RunData, open_data

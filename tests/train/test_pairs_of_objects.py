@@ -80,9 +80,6 @@ def told(clips: PairedClips, number: int) -> dict[str, np.ndarray]:
     return {camera: np.array(rows) for camera, rows in poses.items()}
 
 
-# laws
-
-
 @needs_egl
 def test_a_clip_shows_its_time_steps_from_its_cameras(folder: Path) -> None:
     clips = PairedClips.open(folder)
@@ -144,9 +141,6 @@ def test_the_world_told_is_the_world_read(tmp_path: Path) -> None:
         (tmp_path / str(number)).mkdir()
         agree(tmp_path / str(number), world)
         assert read_world(tmp_path / str(number)) == world
-
-
-# examples
 
 
 @needs_egl

@@ -12,10 +12,10 @@ import pytest
 from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
 from typer.testing import CliRunner
 
-from gcd_model import FAMILIES, Traits
+from gcd_model import Traits
 from gcd_model.config import SVD_14
 from gcd_model.geometry import Spherical
-from gcd_model.weights.families import FamilyName
+from gcd_model.weights.families import FAMILIES, FamilyName
 from gcd_train.cli.main import app
 from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError

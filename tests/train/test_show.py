@@ -73,9 +73,6 @@ def shown(*arguments: object) -> tuple[int, str]:
     return result.exit_code, " ".join(result.output.split())
 
 
-# laws
-
-
 @pytest.mark.parametrize("layout", ["orbit", "drive", "pairs"])
 def test_every_layout_gives_a_clip_whose_path_begins_at_the_source(layout: str, request: pytest.FixtureRequest) -> None:
     footage = opened(request.getfixturevalue(layout))

@@ -12,11 +12,12 @@ from tiny_scenes4d import DRIVING_POSES, write_driving
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, TinyOrbits, saved, tiny_recipe
 from torch import Tensor
 
-from gcd_model import FAMILIES, Clip, load_synthesizer
+from gcd_model import Clip, load_synthesizer
 from gcd_model.conditioning import micro_conditioning, spherical_features
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
+from gcd_model.weights.families import FAMILIES
 from gcd_train.data.batches import EncodedBatches, SampleBatches
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.latents_writer import LatentsJob, encode_clips

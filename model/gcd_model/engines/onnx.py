@@ -50,7 +50,7 @@ def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence
     if manifest.graphs.keys() != wanted:
         raise CheckpointError(f"{folder}: its {MANIFEST} must name {', '.join(sorted(wanted))}; export it again")
     chosen = provider_options(device, providers, folder / "tensorrt", half=manifest.precision == "float16")
-    files = {name: folder / record.files[0].name for name, record in manifest.graphs.items()}
+    files = {name: folder / record[0].name for name, record in manifest.graphs.items()}
     traits = Traits.of(card, sha256_12=manifest.sha256_12, precision=manifest.precision, device="cpu")
     return Synthesizer(empty_networks(card.diffusion), traits, OnnxEngine(Sessions(files, chosen), card.diffusion))
 

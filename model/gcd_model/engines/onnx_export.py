@@ -12,12 +12,13 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
-from itertools import compress
+from itertools import chain, compress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import torch
+from msgspec import Meta
 from torch import Tensor, nn
 
 from gcd_model.config import CAMERA_FEATURES
@@ -119,14 +120,6 @@ def step_graph(networks: Networks) -> Graph:
     return Graph("step", unet, inputs, "prediction")
 
 
-class TensorRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One input or output of a graph."""
-
-    name: str
-    shape: tuple[int, ...]
-    dtype: str = "float32"
-
-
 class FileRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One file of the folder. sha256: see `digest`."""
 
@@ -135,19 +128,11 @@ class FileRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     sha256: str
 
 
-class GraphRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One graph. files: the graph first, then what it keeps its weights in beside it, if any."""
-
-    files: tuple[FileRecord, ...]
-    precision: ExportPrecision
-    inputs: tuple[TensorRecord, ...]
-    outputs: tuple[TensorRecord, ...]
-
-
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole export.
 
     card: as in the metadata of our weight files; the config's height and width are the export's.
+    graphs: files of each: the graph first, then what it keeps its weights in beside it, if any.
     source: 12 digits that name the weights it was made from. exporter: versions it was made with, for people.
     """
 
@@ -157,7 +142,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     precision: ExportPrecision
     opset: int
     exporter: str
-    graphs: dict[str, GraphRecord]
+    graphs: dict[str, Annotated[tuple[FileRecord, ...], Meta(min_length=1)]]
 
     @property
     def sha256_12(self) -> str:
@@ -192,9 +177,7 @@ def read_manifest(folder: str | Path) -> Manifest:
         if (found := decode_json(text, dict[str, Any]).get("format")) != FORMAT:
             raise FileError(f"has format {found!r}, this version reads {FORMAT!r}")
         manifest = decode_json(text, Manifest)
-        if not all(graph.files for graph in manifest.graphs.values()):
-            raise FileError("names no files of a graph")
-        for file in (file for graph in manifest.graphs.values() for file in graph.files):
+        for file in chain.from_iterable(manifest.graphs.values()):
             path = folder / file.name
             if Path(file.name).name != file.name or not path.is_file():
                 raise CheckpointError(f"{folder}: lacks its file {file.name}; export it again")
@@ -232,7 +215,7 @@ def export_onnx(
     """
     require_onnx()
     networks = _at_size(loaded, height, width)
-    records: dict[str, GraphRecord] = {}
+    records: dict[str, tuple[FileRecord, ...]] = {}
     with whole_folder(Path(out), is_ours=_is_export_of_ours if overwrite else None) as folder:
         wanted = list(graphs(networks))
         for graph in wanted:
@@ -272,23 +255,36 @@ def _at_size(loaded: LoadedWeights, height: int | None, width: int | None) -> Ne
 
 def write_graph(
     graph: Graph, folder: Path, precision: ExportPrecision = "float32", *, apart_above: int = APART_ABOVE
-) -> GraphRecord:
-    """Export one graph into a folder. Returns what the manifest says of it."""
+) -> tuple[FileRecord, ...]:
+    """Export one graph into a folder. What its weights alone determine is computed, and no path of ours is in it."""
     import onnx_ir
+    from onnxscript import optimizer
 
-    model = _exported(graph)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it speaks of packages we do not need
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            graph.module,
+            tuple(graph.inputs.values()),
+            dynamo=True,
+            verbose=False,
+            input_names=list(graph.inputs),
+            output_names=[graph.output],
+            opset_version=OPSET,
+        )
+    assert program is not None
+    model = program.model
+    optimizer.fold_constants(model, input_size_limit=_ANY_SIZE, output_size_limit=_ANY_SIZE)
+    optimizer.remove_unused_nodes(model)
+    for node in model.graph.all_nodes():
+        node.metadata_props.clear()  # file names and lines of this machine
     apart = sum(tensor.nbytes for tensor in graph.module.state_dict().values()) > apart_above
     path, beside = folder / f"{graph.name}.onnx", folder / f"{graph.name}.onnx.data"
     onnx_ir.save(model, path, external_data=beside.name if apart else None)
     if precision == "float16":
         _halve(path, beside, apart=apart)
     files = (path, *(each for each in [beside] if each.exists()))
-    return GraphRecord(
-        files=tuple(FileRecord(name=f.name, size=f.stat().st_size, sha256=digest((f,))) for f in files),
-        precision=precision,
-        inputs=tuple(TensorRecord(name=each.name, shape=tuple(map(int, each.shape))) for each in model.graph.inputs),
-        outputs=tuple(TensorRecord(name=each.name, shape=tuple(map(int, each.shape))) for each in model.graph.outputs),
-    )
+    return tuple(FileRecord(name=f.name, size=f.stat().st_size, sha256=digest((f,))) for f in files)
 
 
 def _halve(path: Path, beside: Path, *, apart: bool) -> None:
@@ -310,28 +306,3 @@ def _halve(path: Path, beside: Path, *, apart: bool) -> None:
         there.update(node.output)
     beside.unlink(missing_ok=True)
     onnx.save(model, path, save_as_external_data=apart, location=beside.name)
-
-
-def _exported(graph: Graph) -> Any:
-    """The graph as `onnx_ir` holds it: what its weights alone determine is computed, and no path of ours is in it."""
-    from onnxscript import optimizer
-
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it speaks of packages we do not need
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            graph.module,
-            tuple(graph.inputs.values()),
-            dynamo=True,
-            verbose=False,
-            input_names=list(graph.inputs),
-            output_names=[graph.output],
-            opset_version=OPSET,
-        )
-    assert program is not None
-    model = program.model
-    optimizer.fold_constants(model, input_size_limit=_ANY_SIZE, output_size_limit=_ANY_SIZE)
-    optimizer.remove_unused_nodes(model)
-    for node in model.graph.all_nodes():
-        node.metadata_props.clear()  # file names and lines of this machine
-    return model

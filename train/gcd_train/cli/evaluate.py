@@ -8,7 +8,7 @@ import torch
 import typer
 from typer import Option
 
-from gcd_model import Quality, SolverName
+from gcd_model.diffusion import Quality, SolverName
 from gcd_train.cli.common import command_line, errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews

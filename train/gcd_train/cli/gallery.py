@@ -94,14 +94,14 @@ def _angles(text: str) -> "SphericalDelta":
 
 def _source(elevation_deg: float | None, radius: float | None) -> "Spherical | None":
     """None where neither is given. Raises PoseError for what is no camera."""
-    from gcd_model import ASSUMED_SOURCE, Spherical
+    from gcd_model import Spherical, Traits
 
     if elevation_deg is None and radius is None:
         return None
     return Spherical(
-        azimuth_deg=ASSUMED_SOURCE.azimuth_deg,
-        elevation_deg=ASSUMED_SOURCE.elevation_deg if elevation_deg is None else elevation_deg,
-        radius_m=ASSUMED_SOURCE.radius_m if radius is None else radius,
+        azimuth_deg=Traits.ASSUMED_SOURCE.azimuth_deg,
+        elevation_deg=Traits.ASSUMED_SOURCE.elevation_deg if elevation_deg is None else elevation_deg,
+        radius_m=Traits.ASSUMED_SOURCE.radius_m if radius is None else radius,
     )
 
 

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from typer import Argument, BadParameter, Option, Typer
 
-from gcd_model import FAMILIES, Family
+from gcd_model.weights.families import FAMILIES, Family
 from gcd_train.cli.common import errors_shown
 
 lora = Typer(no_args_is_help=True, help="Adapters that a run with model.train = lora writes, and their bases.")

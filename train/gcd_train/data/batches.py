@@ -12,10 +12,11 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from gcd_model import Family, ModelConfig
 from gcd_model.conditioning import clip_pixels, micro_conditioning
+from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
+from gcd_model.weights.families import Family
 from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader

@@ -10,8 +10,9 @@ import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model import Family, ModelConfig
+from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks, weights_digest
+from gcd_model.weights.families import Family
 from gcd_train.data.latents import (
     LatentClips,
     LatentsMeta,

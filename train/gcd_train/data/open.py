@@ -7,8 +7,9 @@ from typing import TypeVar
 
 import torch
 
-from gcd_model import Family, ModelConfig
+from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
+from gcd_model.weights.families import Family
 from gcd_train.data.batches import CachedBatches, SampleBatches
 from gcd_train.data.cache import CachedLatents
 from gcd_train.data.dataset4d import Dataset4D, Ontology

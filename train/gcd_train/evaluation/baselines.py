@@ -21,10 +21,10 @@ from gcd_model import (
     ViewSynthesizer,
     inspect_weights,
     load_synthesizer,
-    pose_trajectory,
     weights_path,
 )
 from gcd_model.diffusion import unit_noise
+from gcd_model.geometry import pose_trajectory
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet

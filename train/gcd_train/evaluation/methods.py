@@ -10,7 +10,7 @@ from typing import Self, TypeAlias
 import torch
 from torch import Tensor
 
-from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, load_synthesizer, sampler_of
+from gcd_model import Clip, RenderOptions, Sampler, Trajectory, View, ViewSynthesizer, load_synthesizer
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_train.data.sample import to_network
@@ -192,7 +192,7 @@ def of_saved_frames(
 def _of_weights(weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions) -> Method:
     made = SynthesizedViews.of(weights(), clips, options)
     traits = made.synthesizer.traits
-    used = sampler_of(traits.config.sampling, options)
+    used = Sampler.of(traits.config.sampling, options)
     told = {
         "weights": traits.sha256_12,
         "family": "unknown" if traits.family is None else traits.family.name,

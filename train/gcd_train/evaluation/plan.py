@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from gcd_model import Quality, RenderOptions, SolverName
+from gcd_model.diffusion import Quality, RenderOptions, SolverName
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings, baselines
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet

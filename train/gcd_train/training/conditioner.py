@@ -3,10 +3,11 @@
 import torch
 from torch import Tensor
 
-from gcd_model import Family, ModelConfig
 from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
+from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory, motion_bucket
 from gcd_model.layers import sinusoid
+from gcd_model.weights.families import Family
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.training.setup import Precision

@@ -3,10 +3,9 @@
 Source: Martin Garcia et al. 2024, end-to-end finetuning of few-step diffusion.
 """
 
-import torch
 from torch import Tensor, nn
 
-from gcd_model import ModelConfig
+from gcd_model.config import ModelConfig
 from gcd_model.diffusion import RenderOptions, Schedule, sample
 from gcd_model.networks import Networks
 from gcd_train.recipe import StudentRecipe, UNetRecipe
@@ -31,12 +30,8 @@ def sampled(denoiser: nn.Module, batch: Batch, noise: Tensor, schedule: Schedule
     Returns:
         Latents [N, C, h, w], scaled.
     """
-
-    def denoise(x: Tensor, step: int) -> Tensor:
-        sigma = torch.full(x.shape[:1], schedule.steps[step].sigma, device=x.device)
-        return denoiser(x, sigma, batch)
-
-    return sample(denoise, schedule.start(noise[None], 1)[0], schedule.steps)
+    steps, start = schedule.steps, schedule.start(noise[None], 1)[0]
+    return sample(lambda x, i: denoiser(x, x.new_full(x.shape[:1], steps[i].sigma), batch), start, steps)
 
 
 class StudentTask(UNetTask):

@@ -10,7 +10,7 @@ from typing import Protocol
 import msgspec
 import torch
 
-from gcd_model import ModelConfig
+from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card

@@ -11,11 +11,12 @@ import msgspec
 import torch
 from torch import Tensor, nn
 
-from gcd_model import FAMILIES, Family, ModelConfig, weights_path
-from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, CameraControl
+from gcd_model import weights_path
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, CameraControl, ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import LoadedWeights, Networks, empty_networks
 from gcd_model.weights.adapter import DIFFUSION, carried_over
+from gcd_model.weights.families import FAMILIES, Family
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state
 from gcd_train.errors import RecipeError, RunError

@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model import ModelConfig
 from gcd_model.clip import nearest_classes
+from gcd_model.config import ModelConfig
 from gcd_model.layers import zeroed
 from gcd_model.networks import Networks
 from gcd_model.vae import Encoder, Posterior, TemporalDecoder
