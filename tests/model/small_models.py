@@ -7,9 +7,10 @@ from torch import Tensor, nn
 
 from gcd_model.clip import Clip
 from gcd_model.config import ImageEncoderConfig, ModelConfig, SamplingConfig, SemanticClass, UNetConfig, VAEConfig
-from gcd_model.networks import Networks
+from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.card import Card
 from gcd_model.weights.families import DRIVING_SEMANTIC, KUBRIC90
 
 UNET = UNetConfig(
@@ -148,6 +149,14 @@ def tiny_driving(config: ModelConfig = TINY_DRIVING, seed: int = 0) -> Synthesiz
     networks = Networks(config)
     randomise(networks, seed)
     return Synthesizer(networks, replace(tiny_traits(config), name="tiny-driving", family=DRIVING_SEMANTIC))
+
+
+def as_loaded(synthesizer: Synthesizer) -> LoadedWeights:
+    """What a file of a synthesizer's networks would give."""
+    networks, traits = synthesizer.networks, synthesizer.traits
+    family = None if traits.family is None else traits.family.name
+    card = Card(name=traits.name, config=networks.config, family=family, move_time=traits.move_time, trained=False)
+    return LoadedWeights(card=card, networks=networks)
 
 
 def random_clip(config: ModelConfig = TINY, *, frames: int | None = None, seed: int = 0) -> Clip:

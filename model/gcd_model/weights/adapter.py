@@ -126,6 +126,7 @@ CAMERA = ("camera.", "unet.embed_camera.")
 DIFFUSION = ("unet.", "camera.")
 """What the paper's "from scratch" leaves at random: the U-Net and the camera embedder."""
 
+
 @dataclass(frozen=True, slots=True)
 class CarriedOver:
     """weights: by our names, as they are stored. fresh: names of the new model that nothing was found for."""

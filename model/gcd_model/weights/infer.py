@@ -137,8 +137,11 @@ class _Probe:
 
 
 def _multipliers(what: str, width: int, widths: tuple[int, ...]) -> tuple[int, ...]:
-    if any(level % width for level in widths):
-        raise CheckpointError(f"{what} has level widths {list(widths)}, which are no multiples of {width}")
+    if any(level % width for level in widths) or width % _PUBLISHED_GROUPS:
+        raise CheckpointError(
+            f"{what} has level widths {list(widths)} over {width}; published layouts have multiples of "
+            f"{_PUBLISHED_GROUPS}, the groups of every group norm. Use our own format for other networks"
+        )
     return tuple(level // width for level in widths)
 
 

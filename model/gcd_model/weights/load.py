@@ -305,7 +305,7 @@ def _examined(path: Path, told: Told) -> _Examined:
     networks = _empty(config)
     expected = shapes_of(networks.state_dict())
     levels = Levels.of(config) if isinstance(config, ModelConfig) else Levels()
-    sources = {name: published_names(name, naming, levels) for name in expected}
+    sources = {name: published_names(name, naming, levels) or (name,) for name in expected}
     leftovers = match_weights(sources, expected, shapes)
     _require_usable({name: file.contents.tensors[name].dtype for names in sources.values() for name in names})
     last = config.frames - 1

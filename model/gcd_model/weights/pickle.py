@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import torch
-from torch import Tensor, UntypedStorage
+from torch import UntypedStorage
 
 from gcd_model.errors import CheckpointError
 
@@ -145,12 +145,12 @@ _REBUILDING = (
 )
 
 
-def read_pickle(path: Path) -> object:
-    """What stands at the root of a torch zip.
+def read_pickle(path: Path, file: BinaryIO) -> object:
+    """What stands at the root of a torch zip, which is open.
 
     Raises: CheckpointError if it is no checkpoint that can be mapped; whatever a damaged zip or pickle raises.
     """
-    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+    with zipfile.ZipFile(file) as archive:
         entries = {entry.filename: entry for entry in archive.infolist()}
         if any(name.endswith("constants.pkl") for name in entries):
             raise CheckpointError("is a TorchScript program, which would be executed; wanted are weights only")

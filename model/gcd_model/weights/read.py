@@ -54,7 +54,7 @@ class WeightsFile:
     layout: Layout
     files: tuple[Path, ...]
     contents: Contents
-    hints: Hints = Hints()
+    hints: Hints = field(default_factory=Hints)
     yaml: str = ""
 
 
@@ -90,8 +90,8 @@ def _layout_of(contents: Contents) -> Layout:
         )
     raise CheckpointError(
         f"holds {len(names)} tensors of no layout known here, first: {', '.join(list(names)[:5]) or 'none'}; wanted "
-        f"are names of GCD or Stable Video Diffusion ({GCD_UNET}...), a diffusers folder or a file of `gcd-node weights "
-        "convert`"
+        f"are names of GCD or Stable Video Diffusion ({GCD_UNET}...), a diffusers folder or a file of "
+        "`gcd-node weights convert`"
     )
 
 
@@ -102,7 +102,8 @@ def read_file(path: Path) -> Contents:
     """What a single file holds. Raises CheckpointError, OSError."""
     try:
         if _is_zip(path):
-            return _contents(read_pickle(path))
+            with path.open("rb") as opened:
+                return _contents(read_pickle(path, opened))
         with safe_open(path, framework="pt", device="cpu") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no dict
             return Contents(tensors, unpacked(file.metadata() or {}))

@@ -79,9 +79,9 @@ def run_config(recipe: Recipe) -> ModelConfig:
     if teacher.family not in (None, family):
         raise RecipeError(f"{weights} is of the family {teacher.family.name}; set model.family to it")
     goal = recipe.data.goal_frame(config.frames)
-    if teacher.move_time != goal:
+    if teacher.card.move_time != goal:
         raise RecipeError(
-            f"{weights} is at its goal in frame {teacher.move_time}, the recipe's [data] says frame {goal}; set "
+            f"{weights} is at its goal in frame {teacher.card.move_time}, the recipe's [data] says frame {goal}; set "
             "data.path, or data.move_time"
         )
     return student_config(config, student)
