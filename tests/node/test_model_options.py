@@ -62,7 +62,7 @@ def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(
 def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
     assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64
-    assert "exists; give another name, or allow an export to be overwritten" in capsys.readouterr().err
+    assert "exists; give another name, or allow weights or an export to be overwritten" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("change", ["model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'])

@@ -13,7 +13,7 @@ import zipfile
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import torch
 from torch import UntypedStorage
@@ -128,7 +128,7 @@ class _Reader(pickle.Unpickler):
             self._file.seek(entry.header_offset)
             name, extra = struct.unpack("<26x2H", self._file.read(30))
             start = entry.header_offset + 30 + name + extra
-            self._storages[key] = self._bytes[start : start + entry.file_size]
+            self._storages[key] = cast(UntypedStorage, self._bytes[start : start + entry.file_size])
         there = self._storages[key].nbytes()
         if there < claimed:
             raise CheckpointError(

@@ -34,7 +34,7 @@ def whole(out: Path, *, replaces: bool) -> Generator[Path]:
     if not out.parent.is_dir():
         raise OptionError(f"{out}: there is no folder {out.parent}; make it first")
     if os.path.lexists(out) and not replaces:
-        raise OptionError(f"{out} exists; give another name, or allow it to be overwritten")
+        raise OptionError(f"{out} exists; give another name, or allow weights or an export to be overwritten")
     partial, former = (out.with_name(f".{out.name}.{os.getpid()}.{end}") for end in ("partial", "former"))
     try:
         yield partial

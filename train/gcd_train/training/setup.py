@@ -272,7 +272,7 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     if ":" not in recipe.weights and not Path(recipe.weights).exists():
         raise RecipeError(f"model.weights, {recipe.weights}, is not there; give its place: --set model.weights=FILE")
     networks = fresh_networks(config, seed)
-    loaded = loaded_base(recipe.weights)
+    loaded = loaded_base(recipe.weights, config)
     try:
         over = carried_over(loaded.diffusion, config, anew=DIFFUSION if recipe.scratch else ())
     except CheckpointError as error:
@@ -283,11 +283,17 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     return networks
 
 
-def carried_leftovers(recipe: ModelRecipe) -> Mapping[str, Tensor]:
+def carried_leftovers(recipe: ModelRecipe, config: ModelConfig) -> Mapping[str, Tensor]:
     """Weights of the file training started from that nothing here uses; see gcd_model.weights.save."""
-    return {} if recipe.weights is None else loaded_base(recipe.weights).carried
+    return {} if recipe.weights is None else loaded_base(recipe.weights, config).carried
 
 
-def loaded_base(path: str) -> LoadedWeights:
-    """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError."""
-    return load_weights(weights_path(path), ask_family=False)
+def loaded_base(path: str, config: ModelConfig | None = None) -> LoadedWeights:
+    """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError.
+
+    config: what it is to be, for heads, which published layouts do not tell.
+    """
+    if config is None:
+        return load_weights(weights_path(path), ask_family=False)
+    heads = None if config.image_encoder is None else config.image_encoder.heads
+    return load_weights(weights_path(path), ask_family=False, head_width=config.unet.head_width, image_heads=heads)
