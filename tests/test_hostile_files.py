@@ -12,7 +12,9 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import pytest
@@ -28,10 +30,6 @@ from gcd_train.evaluation.store import RunNote
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 CODES = range(64, 79)
 """What may end a command here: sysexits, as docs/node.md lists them."""
-
-Plant = Callable[[str], str]
-"""Puts the hostile file at a place in the folder of the case, and names the place."""
-
 
 # --- text ------------------------------------------------------------------------------------------------------------
 
@@ -104,16 +102,18 @@ def escapes(path: Path, syntax: str) -> None:
 
 
 TEXTS = (fifo, zeros, loop, folder, sparse, latin, nul, deep, deep_unknown, digits, many, dots, escapes)
-Door = Callable[[Path, Plant], list[str]]
-TEXT_DOORS: dict[str, tuple[str, Door]] = {}
+
+Prepare = Callable[[Path], object]
+FILM = str(Path(__file__).parents[1] / "gcd_node" / "assets" / "drive.mp4")
 
 
-def text_door(syntax: str) -> Callable[[Door], Door]:
-    def keep(door: Door) -> Door:
-        TEXT_DOORS[door.__name__] = syntax, door
-        return door
+class Door(NamedTuple):
+    """What opens a text of a syntax at a place. prepare: makes what lies around it."""
 
-    return keep
+    syntax: str
+    place: str
+    command: str
+    prepare: Prepare = lambda here: None
 
 
 def launch_file(here: Path, more: str = "", *, source: str = 'kind = "synthetic"', weights: str = "random:live") -> str:
@@ -122,67 +122,22 @@ def launch_file(here: Path, more: str = "", *, source: str = 'kind = "synthetic"
     return "launch.toml"
 
 
-@text_door("toml")
-def launch_of_check(here: Path, plant: Plant) -> list[str]:
-    return ["gcd-node", "check", plant("launch.toml")]
-
-
-@text_door("toml")
-def launch_of_run(here: Path, plant: Plant) -> list[str]:
-    return ["gcd-node", "run", plant("launch.toml")]
-
-
-@text_door("toml")
-def launch_of_replay(here: Path, plant: Plant) -> list[str]:
-    return ["gcd-node", "replay", plant("launch.toml"), "--out", "run"]
-
-
-@text_door("toml")
-def allow_list(here: Path, plant: Plant) -> list[str]:
+def keys(here: Path) -> None:
     write_key_pair(here / "keys", new_key_pair())
-    more = f'[security]\nkeys = "keys"\nallow = "{plant("allow.toml")}"'
-    return ["gcd-node", "check", launch_file(here, more)]
 
 
-@text_door("key")
-def client_key(here: Path, plant: Plant) -> list[str]:
-    write_key_pair(here / "keys", new_key_pair())
-    (here / "keys" / "public.key").unlink()
-    plant("keys/public.key")
-    return ["gcd-node", "keys", "show", "keys"]
+def allowing(here: Path) -> None:
+    keys(here)
+    launch_file(here, '[security]\nkeys = "keys"\nallow = "allow.toml"')
 
 
-@text_door("key")
-def node_key(here: Path, plant: Plant) -> list[str]:
-    write_key_pair(here / "keys", new_key_pair())
-    return ["gcd-node", "status", "--once", "--keys", "keys", "--node-key", plant("node.key")]
+def without_its_key(here: Path) -> None:
+    keys(here)
+    (here / "keys/public.key").unlink()
 
 
-@text_door("yaml")
-def camera_info(here: Path, plant: Plant) -> list[str]:
-    source = f'kind = "file"\npath = "package:drive.mp4"\ncalibration = "{plant("camera.yaml")}"'
-    return ["gcd-node", "check", launch_file(here, source=source)]
-
-
-@text_door("json")
-def manifest_of_run(here: Path, plant: Plant) -> list[str]:
-    (here / "a").mkdir()
-    plant("a/manifest.json")
-    return ["gcd-node", "diff", "a", "a"]
-
-
-@text_door("json")
-def stereo_calibration(here: Path, plant: Plant) -> list[str]:
-    film = str(Path(__file__).parents[1] / "gcd_node" / "assets" / "drive.mp4")
-    pair = ["--depth", film, "--calibration", plant("board.json")]
-    return ["gcd-node", "synthesize", film, "--weights", "random:live", "--out", "out", *pair]
-
-
-@text_door("json")
-def export_manifest(here: Path, plant: Plant) -> list[str]:
-    (here / "export").mkdir()
-    plant("export/manifest.json")
-    return ["gcd-node", "check", launch_file(here, weights="export")]
+def calibrated(here: Path) -> None:
+    launch_file(here, source='kind = "file"\npath = "package:drive.mp4"\ncalibration = "camera.yaml"')
 
 
 def diffusers(here: Path) -> None:
@@ -191,153 +146,98 @@ def diffusers(here: Path) -> None:
         save_file({"x": torch.zeros(1)}, here / "model" / part / "model.safetensors")
 
 
-@text_door("json")
-def diffusers_config(here: Path, plant: Plant) -> list[str]:
-    diffusers(here)
-    plant("model/unet/config.json")
-    return ["gcd-node", "weights", "inspect", "model"]
-
-
-@text_door("json")
-def diffusers_index(here: Path, plant: Plant) -> list[str]:
+def index_alone(here: Path) -> None:
     diffusers(here)
     (here / "model/unet/model.safetensors").unlink()
-    plant("model/unet/diffusion_pytorch_model.safetensors.index.json")
-    return ["gcd-node", "weights", "inspect", "model"]
 
 
-@text_door("toml")
-def recipe(here: Path, plant: Plant) -> list[str]:
-    return ["gcd-train", "recipes", plant("recipe.toml")]
+def folders(*names: str) -> Prepare:
+    return lambda here: [(here / name).mkdir(parents=True) for name in names]
 
 
-@text_door("toml")
-def recipe_of_training(here: Path, plant: Plant) -> list[str]:
-    return ["gcd-train", "train", plant("recipe.toml"), "--data", "data", "--valid", "valid", "--out", "out"]
-
-
-@text_door("toml")
-def base_of_recipe(here: Path, plant: Plant) -> list[str]:
-    (here / "recipe.toml").write_text(f'base = "{plant("base.toml")}"\n')
-    return ["gcd-train", "recipes", "recipe.toml"]
-
-
-@text_door("json")
-def pair_world(here: Path, plant: Plant) -> list[str]:
-    (here / "pairs").mkdir()
-    plant("pairs/world.json")
-    return ["gcd-train", "train", "package:paper-driving", "--data", "pairs", "--valid", "pairs", "--out", "out"]
-
-
-@text_door("json")
-def scene_manifest(here: Path, plant: Plant) -> list[str]:
-    (here / "scn00000").mkdir()
-    plant("scn00000/gcd-manifest.json")
-    return ["gcd-train", "verify", "scn00000"]
-
-
-@text_door("json")
-def kubric_metadata(here: Path, plant: Plant) -> list[str]:
-    (here / "scn00000").mkdir()
-    plant("scn00000/scn00000_p0_v4.json")
-    return ["gcd-train", "show", "scn00000"]
-
-
-def driving_scene(here: Path) -> None:
-    for name in ("rgb/yaw-0", "rgb/camera0", "calibration", "ontology", "semantic_segmentation_2d"):
-        (here / "scene_000000" / name).mkdir(parents=True)
-
-
-@text_door("json")
-def driving_ontology(here: Path, plant: Plant) -> list[str]:
-    driving_scene(here)
-    plant("scene_000000/ontology/ontology.json")
-    return ["gcd-train", "show", "scene_000000"]
-
-
-@text_door("json")
-def driving_calibration(here: Path, plant: Plant) -> list[str]:
-    driving_scene(here)
-    (here / "scene_000000/semantic_segmentation_2d").rmdir()
-    plant("scene_000000/calibration/calibration.json")
-    return ["gcd-train", "show", "scene_000000"]
-
-
+DRIVING = ("rgb/yaw-0", "rgb/camera0", "calibration", "ontology")
+driving_scene = folders(*(f"scene_000000/{name}" for name in DRIVING))
+labelled_scene = folders(*(f"scene_000000/{name}" for name in (*DRIVING, "semantic_segmentation_2d")))
 NOTE = RunNote(
     command="x", made="x", versions={}, data=(), data_identity="x", kind="orbit", modality="rgb", protocol="pairs",
     frames=4, height=8, width=8, seed=0, methods={"copy": {}},
 )  # fmt: skip
 
 
-@text_door("json")
-def run_note(here: Path, plant: Plant) -> list[str]:
-    (here / "run").mkdir()
-    plant("run/run.json")
-    return ["gcd-train", "report", "run", "--out", "report"]
-
-
-@text_door("json")
-def run_record(here: Path, plant: Plant) -> list[str]:
+def noted_run(here: Path) -> None:
     (here / "run/records/copy").mkdir(parents=True)
     (here / "run/run.json").write_bytes(msgspec.json.encode(NOTE))
-    plant("run/records/copy/clip.json")
-    return ["gcd-train", "report", "run", "--out", "report"]
-
-
-def scenes(here: Path) -> list[str]:
-    (here / "scenes/scn00000").mkdir(parents=True)
-    return ["gcd-train", "evaluate", "--data", "scenes", "--out", "out"]
-
-
-@text_door("json")
-def controls(here: Path, plant: Plant) -> list[str]:
-    return [*scenes(here), "--controls", plant("controls.json")]
-
-
-@text_door("json")
-def split(here: Path, plant: Plant) -> list[str]:
-    (here / "scenes/scene_000000").mkdir(parents=True)
-    return ["gcd-train", "evaluate", "--data", "scenes", "--out", "out", "--split", plant("split.json")]
-
-
-@text_door("list")
-def scene_list(here: Path, plant: Plant) -> list[str]:
-    return [*scenes(here), "--list", plant("list.txt")]
 
 
 CAMERAS = {"a": {"dtype": "video"}, "b": {"dtype": "video"}}
 INFO = {"codebase_version": "v2.1", "fps": 30, "features": CAMERAS, "data_path": "x", "video_path": "y"}
 
 
-@text_door("json")
-def lerobot_info(here: Path, plant: Plant) -> list[str]:
-    (here / "set/meta").mkdir(parents=True)
-    plant("set/meta/info.json")
-    return ["gcd-train", "lerobot", "set"]
-
-
-@text_door("json")
-def lerobot_episodes(here: Path, plant: Plant) -> list[str]:
+def lerobot(here: Path, episodes: str | None = None) -> None:
     (here / "set/meta").mkdir(parents=True)
     (here / "set/meta/info.json").write_text(json.dumps(INFO))
-    plant("set/meta/episodes.jsonl")
-    return ["gcd-train", "lerobot", "set"]
+    if episodes is not None:
+        (here / "set/meta/episodes.jsonl").write_text(episodes)
 
 
-@text_door("json")
-def lerobot_cameras(here: Path, plant: Plant) -> list[str]:
-    (here / "set/meta").mkdir(parents=True)
-    (here / "set/meta/info.json").write_text(json.dumps(INFO))
-    (here / "set/meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 30}\n')
-    return ["gcd-train", "lerobot", "set", "--calibration", plant("cameras.json")]
+def counted_lerobot(here: Path) -> None:
+    lerobot(here, '{"episode_index": 0, "length": 30}\n')
 
 
-@text_door("json")
-def cache_index(here: Path, plant: Plant) -> list[str]:
-    (here / "cache").mkdir()
-    plant("cache/index.json")
-    options = ["--set", "data.kind=cache", "--set", "unet.source=cache", "--data", "cache", "--valid", "scenes"]
-    return ["gcd-train", "train", "package:pardom-gradual-rgb", *options, "--out", "out"]
+CHECK, INSPECT = "gcd-node check launch.toml", "gcd-node weights inspect model"
+EVALUATE, REPORT = "gcd-train evaluate --data scenes --out out", "gcd-train report run --out report"
+ON_PAIRS = "gcd-train train package:paper-driving --data pairs --valid pairs --out out"
+ON_CACHE = (
+    "gcd-train train package:pardom-gradual-rgb --set data.kind=cache --set unet.source=cache --data cache "
+    "--valid scenes --out out"
+)
+PAIRED = f"gcd-node synthesize {FILM} --weights random:live --out out --depth {FILM} --calibration board.json"
+KUBRIC, PARALLEL = folders("scn00000"), "gcd-train show scene_000000"
+TEXT_DOORS = {
+    "launch_of_check": Door("toml", "launch.toml", CHECK),
+    "launch_of_run": Door("toml", "launch.toml", "gcd-node run launch.toml"),
+    "launch_of_replay": Door("toml", "launch.toml", "gcd-node replay launch.toml --out run"),
+    "allow_list": Door("toml", "allow.toml", CHECK, allowing),
+    "client_key": Door("key", "keys/public.key", "gcd-node keys show keys", without_its_key),
+    "node_key": Door("key", "node.key", "gcd-node status --once --keys keys --node-key node.key", keys),
+    "camera_info": Door("yaml", "camera.yaml", CHECK, calibrated),
+    "manifest_of_run": Door("json", "a/manifest.json", "gcd-node diff a a", folders("a")),
+    "stereo_calibration": Door("json", "board.json", PAIRED),
+    "export_manifest": Door(
+        "json",
+        "export/manifest.json",
+        CHECK,
+        lambda here: (folders("export")(here), launch_file(here, weights="export")),
+    ),
+    "diffusers_config": Door("json", "model/unet/config.json", INSPECT, diffusers),
+    "diffusers_index": Door("json", "model/unet/diffusion_pytorch_model.safetensors.index.json", INSPECT, index_alone),
+    "recipe": Door("toml", "recipe.toml", "gcd-train recipes recipe.toml"),
+    "recipe_of_training": Door(
+        "toml", "recipe.toml", "gcd-train train recipe.toml --data data --valid valid --out out"
+    ),
+    "base_of_recipe": Door(
+        "toml",
+        "base.toml",
+        "gcd-train recipes recipe.toml",
+        lambda here: (here / "recipe.toml").write_text('base = "base.toml"\n'),
+    ),
+    "pair_world": Door("json", "pairs/world.json", ON_PAIRS, folders("pairs")),
+    "scene_manifest": Door("json", "scn00000/gcd-manifest.json", "gcd-train verify scn00000", KUBRIC),
+    "kubric_metadata": Door("json", "scn00000/scn00000_p0_v4.json", "gcd-train show scn00000", KUBRIC),
+    "driving_ontology": Door("json", "scene_000000/ontology/ontology.json", PARALLEL, labelled_scene),
+    "driving_calibration": Door("json", "scene_000000/calibration/calibration.json", PARALLEL, driving_scene),
+    "run_note": Door("json", "run/run.json", REPORT, folders("run")),
+    "run_record": Door("json", "run/records/copy/clip.json", REPORT, noted_run),
+    "controls": Door("json", "controls.json", f"{EVALUATE} --controls controls.json", folders("scenes/scn00000")),
+    "split": Door("json", "split.json", f"{EVALUATE} --split split.json", folders("scenes/scene_000000")),
+    "scene_list": Door("list", "list.txt", f"{EVALUATE} --list list.txt", folders("scenes/scn00000")),
+    "lerobot_info": Door("json", "set/meta/info.json", "gcd-train lerobot set", folders("set/meta")),
+    "lerobot_episodes": Door("json", "set/meta/episodes.jsonl", "gcd-train lerobot set", lerobot),
+    "lerobot_cameras": Door(
+        "json", "cameras.json", "gcd-train lerobot set --calibration cameras.json", counted_lerobot
+    ),
+    "cache_index": Door("json", "cache/index.json", ON_CACHE, folders("cache")),
+}
 
 
 # --- the rest --------------------------------------------------------------------------------------------------------
@@ -346,17 +246,27 @@ CASES: dict[str, Callable[[Path], tuple[list[str], str]]] = {}
 """By name: what prepares a folder, and gives the command line and the name that its error must tell."""
 
 
-def case(function: Callable[[Path], tuple[list[str], str]]) -> Callable[[Path], tuple[list[str], str]]:
-    CASES[function.__name__] = function
-    return function
-
-
 def add(name: str, function: Callable[[Path], tuple[list[str], str]]) -> None:
     CASES[name] = function
 
 
-def setting(more: str = "", **options: str) -> Callable[[Path], tuple[list[str], str]]:
-    return lambda here: (["gcd-node", "check", launch_file(here, more, **options)], "")
+def setting(more: str = "", *arguments: str, **options: str) -> Callable[[Path], tuple[list[str], str]]:
+    return lambda here: (["gcd-node", "check", launch_file(here, more, **options), *arguments], "")
+
+
+def planted(
+    write: Callable[[Path], object], place: str, command: str, prepare: Prepare = lambda here: None, count: int = 1
+) -> Callable[[Path], tuple[list[str], str]]:
+    """A hostile file at a place (or several, numbered), and the command that is to open it."""
+
+    def prepared(here: Path) -> tuple[list[str], str]:
+        prepare(here)
+        (here / place).parent.mkdir(exist_ok=True)
+        for number in range(count):
+            write(here / place.format(number))
+        return command.split(), Path(place).name if count == 1 else Path(place).parent.name
+
+    return prepared
 
 
 add("5,000 views", setting("".join(f"[view.v{number}]\n" for number in range(5000))))
@@ -376,25 +286,11 @@ add("an endpoint of 5,000 characters", setting(f'[publish]\ndata = "ipc:///tmp/{
 add("a port of 5,000 digits", setting(f'[publish]\ndata = "tcp://127.0.0.1:{"9" * 5000}"'))
 add("infinite rate", setting("[window]\nfps = inf"))
 add("NaN as a rate", setting("[window]\nfps = nan"))
-
-
-def steps_without_end(here: Path) -> tuple[list[str], str]:
-    return ["gcd-node", "check", launch_file(here, weights="random:kubric90"), "--set", "model.steps=1000000000"], ""
-
-
-CASES["steps without end"] = steps_without_end
+add("steps without end", setting("", "--set", "model.steps=1000000000", weights="random:kubric90"))
 for given in ("9" * 5000, "[" * 100_000, '"\\u0000"'):
-    add(
-        f"--set to {given[:9]}",
-        lambda here, given=given: (["gcd-node", "check", launch_file(here), "--set", f"window.fps={given}"], ""),
-    )
-    add(
-        f"gcd-train --set to {given[:9]}",
-        lambda here, given=given: (
-            ["gcd-train", "recipes", "package:tabletop", "--set", f"unet.batch={given}"],
-            "",
-        ),
-    )
+    add(f"--set to {given[:9]}", setting("", "--set", f"window.fps={given}"))
+    argv = ["gcd-train", "recipes", "package:tabletop", "--set", f"unet.batch={given}"]
+    add(f"gcd-train --set to {given[:9]}", lambda here, argv=argv: (argv, ""))
 
 
 CARD = Card(name="w", config=PLAIN_SMALL, family=None, move_time=0)
@@ -468,18 +364,10 @@ WEIGHTS: dict[str, Callable[[Path], None]] = {
     "a pickle of marks": pickle_bomb,
     "squares in its yaml": squares,
 }  # fmt: skip
-for about, write_weights in WEIGHTS.items():
-
-    def inspected(here: Path, write: Callable[[Path], None] = write_weights) -> tuple[list[str], str]:
-        write(here / "weights.ckpt")
-        return ["gcd-node", "weights", "inspect", "weights.ckpt"], "weights.ckpt"
-
-    def converted(here: Path, write: Callable[[Path], None] = write_weights) -> tuple[list[str], str]:
-        write(here / "weights.ckpt")
-        return ["gcd-node", "weights", "convert", "weights.ckpt", "out.safetensors"], "weights.ckpt"
-
-    add(f"weights: {about}", inspected)
-    add(f"weights to convert: {about}", converted)
+for about, write in WEIGHTS.items():
+    convert = "gcd-node weights convert weights.ckpt out.safetensors"
+    add(f"weights: {about}", planted(write, "weights.ckpt", "gcd-node weights inspect weights.ckpt"))
+    add(f"weights to convert: {about}", planted(write, "weights.ckpt", convert))
 
 ADAPTERS = {
     "rank 0": '{"rank": 0, "alpha": 1.0, "base": "x"}',
@@ -488,14 +376,11 @@ ADAPTERS = {
     "depth": '{"rank": ' + "[" * 100_000,
     "digits": '{"rank": ' + "9" * 5000 + "}",
 }
+PACKAGED = Path(__file__).parents[1] / "model/gcd_model/weights/live-small.safetensors"
 for about, facts in ADAPTERS.items():
-
-    def joined(here: Path, facts: str = facts) -> tuple[list[str], str]:
-        adapter(here / "adapter.safetensors", facts)
-        packaged = Path(__file__).parents[1] / "model/gcd_model/weights/live-small.safetensors"
-        return ["gcd-train", "lora", "merge", str(packaged), "adapter.safetensors", "out.safetensors"], "adapter"
-
-    add(f"an adapter of {about}", joined)
+    write = partial(adapter, facts=facts)
+    join = f"gcd-train lora merge {PACKAGED} adapter.safetensors out.safetensors"
+    add(f"an adapter of {about}", planted(write, "adapter.safetensors", join))
 
 
 def npy(shape: str) -> bytes:
@@ -531,15 +416,9 @@ ARRAYS: dict[str, Callable[[Path], None]] = {
     "a bomb": npz_bomb,
     "not UTF-8": lambda path: path.write_bytes(b"PK\x03\x04" + bytes(range(256))) and None,
 }
-FILM = str(Path(__file__).parents[1] / "gcd_node" / "assets" / "drive.mp4")
-for about, write_array in ARRAYS.items():
-
-    def posed(here: Path, write: Callable[[Path], object] = write_array) -> tuple[list[str], str]:
-        write(here / "poses.npy")
-        more = ["--weights", "random:kubric90", "--out", "out", "--poses", "poses.npy"]
-        return ["gcd-node", "synthesize", FILM, *more], "poses.npy"
-
-    add(f"poses: {about}", posed)
+for about, write in ARRAYS.items():
+    posed = f"gcd-node synthesize {FILM} --weights random:kubric90 --out out --poses poses.npy"
+    add(f"poses: {about}", planted(write, "poses.npy", posed))
 
 
 def png(width: int, height: int, rows: int = 0) -> bytes:
@@ -568,58 +447,36 @@ PICTURES: dict[str, Callable[[Path], object]] = {
     "SVG": lambda path: path.write_bytes(b"<?xml version='1.0'?><svg width='9" + b"9" * 5000 + b"' height='1'/>"),
     "WebP of nothing": lambda path: path.write_bytes(b"RIFF\xff\xff\xff\xffWEBPVP8X" + bytes(4)),
 }
-for about, write_picture in PICTURES.items():
-
-    def in_folder(here: Path, write: Callable[[Path], object] = write_picture) -> tuple[list[str], str]:
-        (here / "pictures").mkdir()
-        write(here / "pictures" / "0001.png")
-        source = 'kind = "folder"\nfps = 10\npath = "pictures"'
-        return ["gcd-node", "check", launch_file(here, source=source)], "0001.png"
-
-    def still(here: Path, write: Callable[[Path], object] = write_picture) -> tuple[list[str], str]:
-        write(here / "still.png")
-        return ["gcd-node", "synthesize", "still.png", "--weights", "random:live", "--out", "out"], "still.png"
-
-    def in_gallery(here: Path, write: Callable[[Path], object] = write_picture) -> tuple[list[str], str]:
-        (here / "pictures").mkdir()
-        for number in range(16):
-            write(here / "pictures" / f"im_{number}.png")
-        more = ["--weights", "random:kubric90", "--rate", "12", "--out", "out"]
-        return ["gcd-train", "gallery", "pictures", *more], "pictures"
-
-    add(f"a folder of pictures: {about}", in_folder)
-    add(f"a still: {about}", still)
-    add(f"a gallery of pictures: {about}", in_gallery)
-
 PLACES = ("a pipe", "endless zeros", "a link to itself", "a folder", "nothing", "a sparse file")
-VIDEOS = {name: PICTURES[name] for name in PLACES}
-for about, write_video in VIDEOS.items():
+GALLERY = "--weights random:kubric90 --out out"
 
-    def of_node(here: Path, write: Callable[[Path], object] = write_video) -> tuple[list[str], str]:
-        write(here / "film.mp4")
-        return ["gcd-node", "check", launch_file(here, source='path = "film.mp4"')], "film.mp4"
 
-    def of_gallery(here: Path, write: Callable[[Path], object] = write_video) -> tuple[list[str], str]:
-        write(here / "film.mp4")
-        return ["gcd-train", "gallery", "film.mp4", "--weights", "random:kubric90", "--out", "out"], "film.mp4"
+def reading(source: str) -> Prepare:
+    return lambda here: launch_file(here, source=source)
 
-    def as_log(here: Path, write: Callable[[Path], object] = write_video) -> tuple[list[str], str]:
-        write(here / "log.mcap")
-        return ["gcd-node", "check", launch_file(here, source='kind = "mcap"\npath = "log.mcap"')], "log.mcap"
 
-    add(f"a video: {about}", of_node)
-    add(f"a video for the gallery: {about}", of_gallery)
-    add(f"a log: {about}", as_log)
+for about, write in PICTURES.items():
+    folder_of = reading('kind = "folder"\nfps = 10\npath = "pictures"')
+    one = "gcd-node synthesize still.png --weights random:live --out out"
+    several = f"gcd-train gallery pictures --rate 12 {GALLERY}"
+    add(f"a folder of pictures: {about}", planted(write, "pictures/0001.png", CHECK, folder_of))
+    add(f"a still: {about}", planted(write, "still.png", one))
+    add(f"a gallery of pictures: {about}", planted(write, "pictures/im_{}.png", several, count=16))
+for about in PLACES:
+    write = PICTURES[about]
+    add(f"a video: {about}", planted(write, "film.mp4", CHECK, reading('path = "film.mp4"')))
+    add(f"a video for the gallery: {about}", planted(write, "film.mp4", f"gcd-train gallery film.mp4 {GALLERY}"))
+    add(f"a log: {about}", planted(write, "log.mcap", CHECK, reading('kind = "mcap"\npath = "log.mcap"')))
 
 
 def bag(write: Callable[[Path], object]) -> Callable[[Path], tuple[list[str], str]]:
-    def prepared(here: Path) -> tuple[list[str], str]:
+    def database(here: Path) -> None:
+        launch_file(here, source='kind = "mcap"\npath = "bag"')
         (here / "bag").mkdir()
-        write(here / "bag" / "metadata.yaml")
-        (here / "bag" / "log_0.db3").write_bytes(b"SQLite format 3\0" + bytes(4000))
-        return ["gcd-node", "check", launch_file(here, source='kind = "mcap"\npath = "bag"')], "bag"
+        (here / "bag/log_0.db3").write_bytes(b"SQLite format 3\0" + bytes(4000))
 
-    return prepared
+    prepared = planted(write, "bag/metadata.yaml", CHECK, database)
+    return lambda here: (prepared(here)[0], "bag")
 
 
 def laughs(path: Path) -> None:
@@ -635,14 +492,13 @@ add("a bag's metadata: laughs", bag(laughs))
 
 
 def shard(write: Callable[[Path], object]) -> Callable[[Path], tuple[list[str], str]]:
-    def prepared(here: Path) -> tuple[list[str], str]:
+    def world(here: Path) -> None:
         (here / "pairs").mkdir()
-        world = {"name": "driving", "width": 96, "height": 64, "frames": 14, "fps": 10}
-        (here / "pairs/world.json").write_text(json.dumps(world))
-        write(here / "pairs/shard-00000000.zip")
-        return ["gcd-train", "show", "pairs"], "pairs"
+        facts = {"name": "driving", "width": 96, "height": 64, "frames": 14, "fps": 10}
+        (here / "pairs/world.json").write_text(json.dumps(facts))
 
-    return prepared
+    prepared = planted(write, "pairs/shard-00000000.zip", "gcd-train show pairs", world)
+    return lambda here: (prepared(here)[0], "pairs")
 
 
 def scene_bomb(path: Path) -> None:
@@ -676,17 +532,11 @@ def here() -> Iterator[Path]:
 def test_a_hostile_text_ends_in_one_line_that_names_it(
     commands: WarmCommands, here: Path, door: str, kind: Callable[[Path, str], None]
 ) -> None:
-    syntax, prepare = TEXT_DOORS[door]
-    planted: list[str] = []
-
-    def plant(name: str) -> str:
-        planted.append(name)
-        kind(here / name, syntax)
-        return name
-
-    argv = prepare(here, plant)
-    told = "model" if door == "diffusers_config" and kind in (dots, escapes) else Path(planted[0]).name
-    require_one_line(commands, argv, here, told)  # diffusers' own files have many more keys than are read
+    syntax, place, command, prepare = TEXT_DOORS[door]
+    prepare(here)
+    kind(here / place, syntax)
+    told = "model" if door == "diffusers_config" and kind in (dots, escapes) else Path(place).name
+    require_one_line(commands, command.split(), here, told)  # diffusers' own files have many more keys than are read
 
 
 @pytest.mark.parametrize("name", CASES)

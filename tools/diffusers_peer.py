@@ -23,7 +23,7 @@ from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks, empty_networks
 from gcd_model.unet import UNetPlan
-from gcd_model.weights.names import Form, Levels, diffusers_source
+from gcd_model.weights.names import Levels, published_names, taken_apart
 
 _DEFAULT_GROUPS = 32
 
@@ -104,10 +104,8 @@ def published_states(networks: Networks) -> dict[str, dict[str, Tensor]]:
     levels = Levels.of(networks.config)
     states: dict[str, dict[str, Tensor]] = {"unet": {}, "vae": {}, "image_encoder": {}}
     for name, value in networks.state_dict().items():
-        source = diffusers_source(_encoder_named(name, networks), levels)
-        if source is None:
-            continue
-        for published, part in zip(source.names, _taken_apart(value, source.form), strict=True):
+        names = published_names(_encoder_named(name, networks), "diffusers", levels)
+        for published, part in taken_apart(names, value).items() if names else ():
             folder, _, inner = published.partition("/")
             states[folder][inner] = part
     return states
@@ -119,15 +117,7 @@ def _encoder_named(name: str, networks: Networks) -> str:
         return name
     if name.startswith("own_condition_encoder."):
         return name.replace("own_condition_encoder.", "target_encoder.", 1)
-    return name.replace("target_encoder.", "camera.unused.", 1) if name.startswith("target_encoder.") else name
-
-
-def _taken_apart(value: Tensor, form: Form) -> tuple[Tensor, ...]:
-    if form == "stacked":
-        return tuple(value.chunk(3))
-    if form == "transposed":
-        return (value.T,)
-    return (value.flatten(1) if form == "pixelwise" else value,)
+    return name.replace("target_encoder.", "camera.proj.", 1) if name.startswith("target_encoder.") else name
 
 
 @contextmanager

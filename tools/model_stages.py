@@ -33,7 +33,7 @@ from gcd_model.loading import device_named, load_synthesizer, placed_synthesizer
 from gcd_model.networks import LoadedWeights, Networks, empty_networks, random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.weights.card import NO_DIFFUSION
+from gcd_model.weights.card import NO_DIFFUSION, Card
 from gcd_model.weights.families import KUBRIC90
 from gcd_model.weights.load import save_weights
 
@@ -163,14 +163,9 @@ def _full_size(stages: Collection[StageName]) -> LoadedWeights:
     if not {"window", "encode", "decode"} & set(stages):
         vae = replace(vae, width=32, blocks_per_level=1)
     networks = random_networks(replace(SVD_14, image_encoder=tower, vae=vae), seed=0)
-    return LoadedWeights(
-        name="random-full",
-        networks=networks,
-        family=KUBRIC90,
-        move_time=networks.config.frames - 1,
-        trained=False,
-        sha256_12="0" * 12,
-    )
+    last = networks.config.frames - 1
+    card = Card(name="random-full", config=networks.config, family=KUBRIC90.name, move_time=last, trained=False)
+    return LoadedWeights(card=card, networks=networks)
 
 
 def engine_named(name: str, networks: Networks) -> Engine:

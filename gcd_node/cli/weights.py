@@ -1,7 +1,6 @@
 """`gcd-node weights`: look into checkpoints, convert them."""
 
 from dataclasses import astuple, fields
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +10,7 @@ from rich.text import Text
 from typer import Argument, Option, Typer
 
 from gcd_model import WeightsReport, convert_weights, inspect_weights, weights_path
-from gcd_node.cli.main import progress_bar, table
+from gcd_node.cli.main import table
 
 weights = Typer(no_args_is_help=True, help="Look into checkpoints, convert them.")
 
@@ -69,7 +68,7 @@ def convert(
 
     OUT appears whole or not at all.
     """
-    with progress_bar("converting") as advance:
+    with Console(stderr=True, markup=False).status(Text(f"converting {file}")):
         report = convert_weights(
             weights_path(str(file)),
             out,
@@ -79,7 +78,6 @@ def convert(
             head_width=head_width,
             image_heads=image_heads,
             overwrite=overwrite,
-            progress=partial(advance, "converting"),
         )
     console = Console(markup=False)
     _show(console, report)

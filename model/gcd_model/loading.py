@@ -17,7 +17,7 @@ from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, weights_digest
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.weights.card import FULL_PRECISION, precision
+from gcd_model.weights.card import FULL_PRECISION, Card, precision
 from gcd_model.weights.families import LIVE, family_named
 from gcd_model.weights.infer import Hints
 from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
@@ -168,14 +168,15 @@ def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
         unet, frames = msgspec.structs.replace(SMALL.unet, camera_width=width), frames or SMALL.frames
         config = msgspec.structs.replace(SMALL, camera=chosen.camera, unet=unet, frames=frames)
         networks = random_networks(config, seed=0)
-    return LoadedWeights(
+    card = Card(
         name=f"random-{family}",
-        networks=networks,
-        family=chosen,
+        config=networks.config,
+        family=family,
         move_time=0 if chosen is LIVE else networks.config.frames - 1,
         trained=False,
-        sha256_12=weights_digest(networks.state_dict()),
+        origin=weights_digest(networks.state_dict()),
     )
+    return LoadedWeights(card=card, networks=networks)
 
 
 def default_precision(device: torch.device, *, live: bool) -> str:

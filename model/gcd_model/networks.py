@@ -17,7 +17,7 @@ from gcd_model.live.paint_net import PaintNet
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights.card import NO_DIFFUSION, Card, Layout
-from gcd_model.weights.families import Family
+from gcd_model.weights.families import FAMILIES, Family
 
 
 class Networks(nn.Module):
@@ -60,20 +60,30 @@ class LiveNetworks(nn.Module):
 class LoadedWeights:
     """Networks with their weights, still in the mapped file, in the stored precision, on the CPU.
 
-    family: None if nobody could tell. move_time: frame in which the goal pose is reached.
-    sha256_12: first 12 digits of `digest`. uncertainty_scale: see `Traits`. layout: of the file.
-    carried: leftovers of a published file that its next owner may want, by published name; see `CARRIED`.
+    card: what a file made of them says about itself; its origin names these weights.
+    layout: of the file they came from. carried: leftovers of a published file that its next owner may want, by
+    published name; see `CARRIED`.
     """
 
-    name: str
+    card: Card
     networks: Networks | LiveNetworks
-    family: Family | None
-    move_time: int
-    trained: bool
-    sha256_12: str
-    uncertainty_scale: float | None = None
     layout: Layout = "gcd-node"
     carried: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
+
+    @property
+    def name(self) -> str:
+        """Of the checkpoint."""
+        return self.card.name
+
+    @property
+    def family(self) -> Family | None:
+        """None if nobody could tell."""
+        return None if self.card.family is None else FAMILIES[self.card.family]
+
+    @property
+    def sha256_12(self) -> str:
+        """First 12 digits of `digest`."""
+        return self.card.origin
 
     @property
     def diffusion(self) -> Networks:
@@ -81,19 +91,6 @@ class LoadedWeights:
         if isinstance(self.networks, LiveNetworks):
             raise CheckpointError(f"{self.name} {NO_DIFFUSION}")
         return self.networks
-
-    @property
-    def card(self) -> Card:
-        """What a file made of them says about itself."""
-        return Card(
-            name=self.name,
-            config=self.networks.config,
-            family=None if self.family is None else self.family.name,
-            move_time=self.move_time,
-            trained=self.trained,
-            origin=self.sha256_12,
-            uncertainty_scale=self.uncertainty_scale,
-        )
 
 
 @overload

@@ -3,14 +3,13 @@
 import gzip
 import json
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 import torch
-from naming import taken_apart
 from safetensors.torch import load_file, save_file
 from small_models import randomise
 from torch import Tensor
@@ -18,9 +17,8 @@ from torch import Tensor
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.networks import Networks
-from gcd_model.weights.infer import Naming
-from gcd_model.weights.load import load_weights
-from gcd_model.weights.names import Levels, diffusers_source, gcd_source
+from gcd_model.weights.load import convert_weights, inspect_weights, load_weights
+from gcd_model.weights.names import Levels, Naming, published_names, taken_apart
 
 MANIFEST = Path(__file__).parents[2].parent / "shared" / "spec" / "checkpoint-manifest.json.gz"
 
@@ -43,7 +41,13 @@ SMALL_GCD = ModelConfig(
         image_size=28, patch=14, width=64, layers=2, heads=16, hidden_width=96, output_width=48
     ),
 )
-"""Widths that published rules (32 groups, heads of 64, 16 image heads) can work with."""
+"""Widths that the published 32 groups can work with."""
+
+HEADS = {"head_width": 64, "image_heads": 16}
+"""What published layouts do not tell of it, but for diffusers' config.json."""
+load = partial(load_weights, **HEADS)
+inspect = partial(inspect_weights, **HEADS)
+convert = partial(convert_weights, **HEADS)
 
 
 def fixed_view(config: ModelConfig) -> ModelConfig:
@@ -66,18 +70,16 @@ def filled(config: ModelConfig = SMALL_GCD, seed: int = 0) -> Networks:
 
 def published_state(networks: Networks, naming: Naming) -> dict[str, Tensor]:
     """All weights by published name."""
-    levels, state = Levels.of(networks.config), {}
+    levels, state = Levels.of(networks.config), dict[str, Tensor]()
     for name, tensor in networks.state_dict().items():
-        source = naming(name, levels)
-        assert source is not None, name
-        state |= taken_apart(tensor.detach(), source)
-    return state
+        state |= taken_apart(published_names(name, naming, levels), tensor.detach())
+    return {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in state.items()}
 
 
 def gcd_state(networks: Networks) -> dict[str, Tensor]:
     """Weights by Stability's names, with the leftovers published files have."""
     clip, vae = "conditioner.embedders.0.open_clip.model", "conditioner.embedders.3.encoder"
-    return published_state(networks, gcd_source) | {
+    return published_state(networks, "gcd") | {
         f"{clip}.token_embedding.weight": torch.ones(7, 4),
         f"{clip}.logit_scale": torch.tensor(1.0),
         f"{clip}.transformer.resblocks.0.ln_1.weight": torch.ones(4),
@@ -113,7 +115,7 @@ def write_svd(folder: Path, name: str = "svd.safetensors") -> Path:
 
 def diffusers_parts(config: ModelConfig | None = None) -> dict[str, dict[str, Tensor]]:
     """Weights of the three folders, by name within each."""
-    state = published_state(filled(shared_vae(SMALL_GCD) if config is None else config), diffusers_source)
+    state = published_state(filled(shared_vae(SMALL_GCD) if config is None else config), "diffusers")
     parts: dict[str, dict[str, Tensor]] = {}
     for name, tensor in state.items():
         part, _, inner = name.partition("/")
@@ -156,20 +158,14 @@ def split_in_shards(part: Path) -> Path:
 
 
 def manifest(layout: str) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a published file at full size; skips the test where the manifest is not at hand."""
+    """Names and shapes of a published file, or of the folder "diffusers", at full size; skips the test without them."""
     if not MANIFEST.is_file():
         pytest.skip(f"needs {MANIFEST}")
     with gzip.open(MANIFEST) as file:
-        return {name: tuple(entry["shape"]) for name, entry in json.load(file)[layout].items()}
-
-
-def diffusers_manifest() -> dict[str, tuple[int, ...]]:
-    """The three parts of the diffusers folder together, by `part/name`."""
-    return {
-        f"{part}/{name}": shape
-        for part in ("unet", "vae", "image_encoder")
-        for name, shape in manifest(f"diffusers_{part}").items()
-    }
+        lists = json.load(file)
+    parts = {f"{part}/": lists[f"diffusers_{part}"] for part in ("unet", "vae", "image_encoder")}
+    whole = parts if layout == "diffusers" else {"": lists[layout]}
+    return {f"{part}{name}": tuple(e["shape"]) for part, entries in whole.items() for name, e in entries.items()}
 
 
 def assert_same_weights(ours: Networks, theirs: Networks) -> None:
@@ -182,7 +178,7 @@ def assert_same_weights(ours: Networks, theirs: Networks) -> None:
 def refused(path: Path) -> str:
     """The one line a file is refused with; it begins with the file's name."""
     with pytest.raises(CheckpointError) as caught:
-        load_weights(path)
+        load(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert "\n" not in message

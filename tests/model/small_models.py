@@ -9,9 +9,10 @@ from gcd_model.clip import Clip, View
 from gcd_model.config import ImageEncoderConfig, ModelConfig, SamplingConfig, SemanticClass, UNetConfig, VAEConfig
 from gcd_model.diffusion import RenderOptions
 from gcd_model.geometry import Trajectory
-from gcd_model.networks import Networks
+from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.card import Card
 from gcd_model.weights.families import DRIVING_SEMANTIC, KUBRIC90
 
 UNET = UNetConfig(
@@ -155,6 +156,14 @@ def tiny_driving(config: ModelConfig = TINY_DRIVING, seed: int = 0) -> Synthesiz
 def synthesize(synthesizer: Synthesizer, clip: Clip, path: Trajectory, options: RenderOptions | None = None) -> View:
     """One clip, one view."""
     return synthesizer.render(synthesizer.encode(clip), [path], options)[0]
+
+
+def as_loaded(synthesizer: Synthesizer) -> LoadedWeights:
+    """What a file of a synthesizer's networks would give."""
+    networks, traits = synthesizer.networks, synthesizer.traits
+    family = None if traits.family is None else traits.family.name
+    card = Card(name=traits.name, config=networks.config, family=family, move_time=traits.move_time, trained=False)
+    return LoadedWeights(card=card, networks=networks)
 
 
 def random_clip(config: ModelConfig = TINY, *, frames: int | None = None, seed: int = 0) -> Clip:

@@ -5,14 +5,25 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
-from published import SMALL_GCD, filled, fixed_view, shared_vae, write_diffusers, write_gcd, write_svd
+from published import (
+    HEADS,
+    SMALL_GCD,
+    convert,
+    filled,
+    fixed_view,
+    load,
+    shared_vae,
+    write_diffusers,
+    write_gcd,
+    write_svd,
+)
 from small_models import draw
 
 from gcd_model.errors import CheckpointError
 from gcd_model.loading import load_synthesizer
 from gcd_model.weights.adapter import DIFFUSION, Adapter, adapted, base_digest, carried_over, unshared
 from gcd_model.weights.card import Card
-from gcd_model.weights.load import convert_weights, load_adapted, load_weights, read_adapter
+from gcd_model.weights.load import load_adapted, read_adapter
 from gcd_model.weights.save import write_adapter
 
 LAYER = "unet.middle.0.attention.spatial.attention.query"
@@ -58,19 +69,19 @@ def test_an_adapter_survives_its_file(tmp_path: Path) -> None:
 
 def test_the_base_is_told_by_its_values_whatever_file_holds_them(tmp_path: Path) -> None:
     path, given = write_svd(tmp_path), adapter()
-    convert_weights(path, tmp_path / "ours.safetensors")
+    convert(path, tmp_path / "ours.safetensors")
     write_adapter(tmp_path / "adapter.safetensors", given, overwrite=False)
     for base in (path, tmp_path / "ours.safetensors"):
-        loaded = load_adapted(load_weights(base), read_adapter(tmp_path / "adapter.safetensors"))
+        loaded = load_adapted(load(base), read_adapter(tmp_path / "adapter.safetensors"))
         assert loaded.family is not None
-        assert (loaded.name, loaded.family.name, loaded.move_time) == ("steered", "kubric90", 13)
+        assert (loaded.name, loaded.family.name, loaded.card.move_time) == ("steered", "kubric90", 13)
 
 
 def test_a_synthesizer_loads_base_and_adapter_and_its_digest_tells_them_apart(tmp_path: Path) -> None:
     base = write_svd(tmp_path)
     write_adapter(tmp_path / "adapter.safetensors", adapter(), overwrite=False)
-    plain = load_synthesizer(base, device="cpu")
-    joined = load_synthesizer(base, device="cpu", adapter=tmp_path / "adapter.safetensors")
+    plain = load_synthesizer(base, device="cpu", **HEADS)
+    joined = load_synthesizer(base, device="cpu", adapter=tmp_path / "adapter.safetensors", **HEADS)
     assert joined.traits.config.camera == "spherical"
     assert plain.traits.sha256_12 != joined.traits.sha256_12
 
@@ -85,7 +96,7 @@ def test_another_base_is_refused_by_its_digest() -> None:
 def test_an_adapter_is_no_model_and_a_model_no_adapter(tmp_path: Path) -> None:
     write_adapter(tmp_path / "adapter.safetensors", adapter(), overwrite=False)
     with pytest.raises(CheckpointError):
-        load_weights(tmp_path / "adapter.safetensors")
+        load(tmp_path / "adapter.safetensors")
     with pytest.raises(CheckpointError):
         read_adapter(write_gcd(tmp_path))
     with pytest.raises(CheckpointError):
@@ -123,7 +134,7 @@ def test_from_scratch_keeps_autoencoders_and_image_tower_alone() -> None:
 
 
 def test_a_diffusers_folder_starts_the_papers_two_encoders(tmp_path: Path) -> None:
-    over = carried_over(load_weights(write_diffusers(tmp_path / "model")).networks, SMALL_GCD)
+    over = carried_over(load(write_diffusers(tmp_path / "model")).networks, SMALL_GCD)
     wanted = unshared(filled(shared_vae(SMALL_GCD)).state_dict())
     assert set(over.weights) == set(wanted)
     assert all(torch.equal(over.weights[name], wanted[name]) for name in wanted)

@@ -13,6 +13,8 @@ from published import (
     filled,
     fixed_view,
     gcd_state,
+    inspect,
+    load,
     refused,
     shared_vae,
     split_in_shards,
@@ -24,53 +26,69 @@ from published import (
 from safetensors.torch import load_file
 from torch import Tensor
 
+from gcd_model.config import ModelConfig
+from gcd_model.errors import CheckpointError
 from gcd_model.networks import Networks
 from gcd_model.weights.load import digest, inspect_weights, load_weights
 
 UNET = "model.diffusion_model"
-CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
 
 
-def test_a_lightning_checkpoint_loads_weight_by_weight(tmp_path: Path) -> None:
-    loaded = load_weights(write_gcd(tmp_path))
-    assert_same_weights(loaded.networks, filled())
-    assert loaded.networks.config == SMALL_GCD
-    assert (loaded.name, loaded.trained) == ("kubric_gradual_max90", True)
+def plain_diffusers(folder: Path) -> Path:
+    return write_diffusers(folder / "m", configs=False)
 
 
-def test_the_base_model_loads_weight_by_weight(tmp_path: Path) -> None:
-    loaded = load_weights(write_svd(tmp_path))
-    assert_same_weights(loaded.networks, filled(fixed_view(SMALL_GCD)))
-    config = loaded.networks.config
-    assert (config.height, config.width, config.sampling.guidance) == (576, 1024, (1.0, 2.5))
-    assert (config.unet, config.vae, config.camera) == (fixed_view(SMALL_GCD).unet, SMALL_GCD.vae, "none")
+def sharded(folder: Path) -> Path:
+    return split_in_shards(write_diffusers(folder / "m") / "unet").parent
 
 
-@pytest.mark.parametrize("configs", [True, False], ids=["with config.json", "without"])
-def test_a_diffusers_folder_loads_weight_by_weight(tmp_path: Path, configs: bool) -> None:
-    loaded = load_weights(write_diffusers(tmp_path / "model", configs=configs))
-    assert_same_weights(loaded.networks, filled(shared_vae(SMALL_GCD)))
-    assert loaded.networks.config == shared_vae(SMALL_GCD)
-    assert loaded.networks.condition_encoder is loaded.networks.target_encoder
-
-
-def test_a_sharded_part_is_put_together(tmp_path: Path) -> None:
-    folder = split_in_shards(write_diffusers(tmp_path / "model") / "unet")
-    assert_same_weights(load_weights(folder.parent).networks, filled(shared_vae(SMALL_GCD)))
-
-
-def test_a_part_written_as_a_pickle_loads_too(tmp_path: Path) -> None:
-    folder = write_diffusers(tmp_path / "model")
-    whole = folder / "vae" / "diffusion_pytorch_model.safetensors"
+def with_a_pickle(folder: Path) -> Path:
+    whole = write_diffusers(folder / "m") / "vae" / "diffusion_pytorch_model.safetensors"
     torch.save(load_file(whole), whole.with_suffix(".bin"))
     whole.unlink()
-    assert_same_weights(load_weights(folder).networks, filled(shared_vae(SMALL_GCD)))
+    return folder / "m"
+
+
+FIXED, SHARED = fixed_view(SMALL_GCD), shared_vae(SMALL_GCD)
+
+
+@pytest.mark.parametrize(
+    ("write", "config"),
+    [
+        (write_gcd, SMALL_GCD),
+        (write_svd, FIXED),
+        (lambda folder: write_diffusers(folder / "m"), SHARED),
+        (plain_diffusers, SHARED),
+        (sharded, SHARED),
+        (with_a_pickle, SHARED),
+    ],
+)
+def test_every_layout_loads_weight_by_weight_and_never_guesses_heads(
+    tmp_path: Path, write: Callable[[Path], Path], config: ModelConfig
+) -> None:
+    path = write(tmp_path)
+    loaded = load(path)
+    assert_same_weights(loaded.networks, filled(config))
+    assert isinstance(loaded.networks, Networks)
+    found = loaded.networks.config
+    assert (found.unet, found.vae, found.image_encoder) == (config.unet, config.vae, config.image_encoder)
+    assert (found.camera, found.frames) == (config.camera, config.frames)
+    assert (loaded.networks.condition_encoder is loaded.networks.target_encoder) == config.vae.shared
+    if not (path / "unet" / "config.json").exists():
+        for told in ({}, {"head_width": 64}, {"image_heads": 16}):
+            with pytest.raises(CheckpointError, match="--head-width" if "head_width" not in told else "--image-heads"):
+                load_weights(path, **told)
+
+
+def test_the_base_model_has_its_own_size_and_guidance(tmp_path: Path) -> None:
+    config = load(write_svd(tmp_path)).networks.config
+    assert (config.height, config.width, config.sampling.guidance) == (576, 1024, (1.0, 2.5))
 
 
 def test_the_layout_is_told_by_content_not_by_suffix(tmp_path: Path) -> None:
     path = write_svd(tmp_path).rename(tmp_path / "blob-without-suffix")
-    assert inspect_weights(path).layout == "sgm-safetensors"
-    assert inspect_weights(write_gcd(tmp_path).rename(tmp_path / "other")).layout == "gcd-ckpt"
+    assert inspect(path).layout == "sgm-safetensors"
+    assert inspect(write_gcd(tmp_path).rename(tmp_path / "other")).layout == "gcd-ckpt"
 
 
 def test_config_json_tells_heads_frames_and_scale(tmp_path: Path) -> None:
@@ -104,7 +122,7 @@ def test_loading_takes_no_memory_of_its_own(tmp_path: Path) -> None:
     del state
     gc.collect()
     before = private_bytes()
-    loaded = load_weights(path)
+    loaded = load(path)
     assert private_bytes() - before < weights / 10
     assert sum(parameter.nbytes for parameter in loaded.networks.parameters()) > 0.9 * weights
 
@@ -112,48 +130,33 @@ def test_loading_takes_no_memory_of_its_own(tmp_path: Path) -> None:
 def test_writing_into_loaded_weights_leaves_the_file_alone(tmp_path: Path) -> None:
     path = write_gcd(tmp_path)
     before = digest((path,))
-    loaded = load_weights(path)
+    loaded = load(path)
     with torch.no_grad():
         for parameter in loaded.networks.parameters():
             parameter.zero_()
     assert digest((path,)) == before
 
 
-def drop(state: dict[str, Tensor], names: list[str]) -> None:
-    for name in names:
-        del state[name]
+def changed(folder: Path, drop: str, put: dict[str, Tensor] | None = None) -> str:
+    """What a checkpoint without the weights of that beginning, and with others, is refused with."""
+    state = {name: tensor for name, tensor in gcd_state(filled()).items() if not name.startswith(drop)}
+    return refused(write_lightning(folder / "a.ckpt", state | (put or {})))
 
 
-def changed(tmp_path: Path, change: Callable[[dict[str, Tensor]], None]) -> Path:
-    state = gcd_state(filled())
-    change(state)
-    return write_lightning(tmp_path / "a.ckpt", state)
-
-
-def test_missing_weights_are_counted_and_the_first_five_named(tmp_path: Path) -> None:
-    names = [name for name in gcd_state(filled()) if f"{UNET}.output_blocks.1." in name]
-    message = refused(changed(tmp_path, lambda state: drop(state, names)))
-    assert len(names) > 5
+def test_all_that_does_not_fit_is_counted_and_the_first_five_named(tmp_path: Path) -> None:
+    block = f"{UNET}.output_blocks.1."
+    names = [name for name in gcd_state(filled()) if name.startswith(block)]
     total = len(filled().state_dict())
-    assert message.startswith(f"{len(names)} of {total} weights are missing, first: {', '.join(names[:5])}. Nothing")
-
-
-def test_all_that_does_not_fit_is_said_at_once(tmp_path: Path) -> None:
-    def change(state: dict[str, Tensor]) -> None:
-        state[CONV.replace("weight", "extra")] = state.pop(CONV)
-        state[f"{UNET}.out.0.bias"] = torch.zeros(3)
-
-    message = refused(changed(tmp_path, change))
-    assert all(word in message for word in ("1 of", "missing", "misshapen", "1 unexpected names"))
-
-
-def test_a_missing_weight_that_tells_the_architecture_is_named(tmp_path: Path) -> None:
-    name = f"{UNET}.out.2.weight"
-    assert name in refused(changed(tmp_path, lambda state: drop(state, [name])))
+    missing = f"{len(names)} of {total} weights are missing, first: {', '.join(names[:5])}"
+    assert changed(tmp_path, block).startswith(f"{missing}. Nothing")
+    message = changed(tmp_path, block, {f"{UNET}.extra": torch.zeros(2), f"{UNET}.out.0.bias": torch.zeros(3)})
+    assert message.startswith(f"{missing}; 1 of {total} weights are misshapen, first: {UNET}.out.0.bias")
+    assert f"1 unexpected names, first: {UNET}.extra" in message
+    assert f"{UNET}.out.2.weight" in changed(tmp_path, f"{UNET}.out.2.weight")  # without it nothing can be compared
 
 
 def test_leftovers_are_recognised_and_counted(tmp_path: Path) -> None:
-    report = inspect_weights(write_gcd(tmp_path))
+    report = inspect(write_gcd(tmp_path))
     assert {leftover.kind: leftover.tensors for leftover in report.leftovers} == {
         "CLIP text tower": 3,
         "decoder of the condition VAE": 2,

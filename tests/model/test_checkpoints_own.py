@@ -7,13 +7,24 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from published import SMALL_GCD, assert_same_weights, filled, refused, write_diffusers, write_gcd, write_svd
+from published import (
+    SMALL_GCD,
+    assert_same_weights,
+    convert,
+    filled,
+    inspect,
+    load,
+    refused,
+    write_diffusers,
+    write_gcd,
+    write_svd,
+)
 from safetensors.torch import save_file
 
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import Provenance, combined, told_by_name, told_by_yaml
-from gcd_model.weights.load import convert_weights, digest, inspect_weights, load_weights, save_weights
+from gcd_model.weights.load import digest, save_weights
 
 # --- the family ------------------------------------------------------------------------------------------------------
 
@@ -21,86 +32,91 @@ from gcd_model.weights.load import convert_weights, digest, inspect_weights, loa
 def test_the_family_follows_option_metadata_name_and_yaml_in_that_order(tmp_path: Path) -> None:
     path = write_gcd(tmp_path, "kubric_direct_max180.ckpt")
     path.with_suffix(".yaml").write_text("move_time: 13\ndelta_azimuth_range: [-90, 90]\n")
-    report = inspect_weights(path)
+    report = inspect(path)
     assert (report.family, report.told_by, report.move_time) == ("kubric180", "file name", 0)
-    report = inspect_weights(path, family="kubric90")
+    report = inspect(path, family="kubric90")
     assert (report.family, report.told_by, report.move_time) == ("kubric90", "option", 0)
     other = path.rename(tmp_path / "mine.ckpt")
     other.with_suffix(".yaml").write_text("move_time: 5\ndelta_azimuth_range: [-90, 90]\n")
-    report = inspect_weights(other)
+    report = inspect(other)
     assert (report.family, report.told_by, report.move_time) == ("kubric90", "yaml", 5)
     card = Card(name="small", config=SMALL_GCD, family="kubric180", move_time=7)
     save_weights(filled(), tmp_path / "kubric_gradual_max90.safetensors", card)
-    report = inspect_weights(tmp_path / "kubric_gradual_max90.safetensors")
+    report = inspect(tmp_path / "kubric_gradual_max90.safetensors")
     assert (report.family, report.told_by, report.move_time) == ("kubric180", "metadata", 7)
 
 
 def test_an_unknown_family_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = write_gcd(tmp_path, "mine.ckpt")
     with caplog.at_level(logging.WARNING):
-        loaded = load_weights(path)
+        loaded = load(path)
     assert loaded.family is None
-    assert loaded.move_time == 13
+    assert loaded.card.move_time == 13
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "--motion-bucket" in caplog.text
     caplog.clear()
-    load_weights(path, family="kubric90")
+    load(path, family="kubric90")
     assert caplog.records == []
 
 
 def test_a_family_against_the_camera_of_the_weights_or_an_unknown_one_is_refused(tmp_path: Path) -> None:
     for family, error in (("driving", CheckpointError), ("svd", CheckpointError), ("kubric", OptionError)):
         with pytest.raises(error):
-            load_weights(write_gcd(tmp_path), family=family)
+            load(write_gcd(tmp_path), family=family)
 
 
 def test_an_early_goal_stays_within_the_frames(tmp_path: Path) -> None:
-    assert inspect_weights(write_gcd(tmp_path), frames=5).move_time == 4
+    assert inspect(write_gcd(tmp_path), frames=5).move_time == 4
     with pytest.raises(OptionError):
-        inspect_weights(write_gcd(tmp_path), frames=1)
+        inspect(write_gcd(tmp_path), frames=1)
 
 
 @pytest.mark.parametrize("write", [write_gcd, write_svd, lambda folder: write_diffusers(folder / "m")])
 def test_conversion_keeps_every_weight_and_every_fact(tmp_path: Path, write: Callable[[Path], Path]) -> None:
-    path, steps = write(tmp_path), list[tuple[int, int]]()
-    report = convert_weights(path, tmp_path / "ours.safetensors", progress=lambda *step: steps.append(step))
-    before, after = load_weights(path), load_weights(tmp_path / "ours.safetensors")
+    path = write(tmp_path)
+    report = convert(path, tmp_path / "ours.safetensors")
+    convert(path, tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "ours.safetensors").read_bytes()
+    before, after = load(path), load(tmp_path / "ours.safetensors")
     assert_same_weights(after.networks, before.networks)
     assert after.networks.config == before.networks.config
-    assert (after.family, after.move_time, after.name) == (before.family, before.move_time, before.name)
+    assert (after.family, after.card.move_time, after.name) == (before.family, before.card.move_time, before.name)
     assert (report.layout, report.leftovers, report.optimizer_size) == ("gcd-node", (), 0)
-    assert steps[-1] == (steps[-1][1],) * 2
-    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
 
 
 def test_a_stored_precision_is_kept_unless_asked(tmp_path: Path) -> None:
-    report = convert_weights(write_diffusers(tmp_path / "m", half=True), tmp_path / "ours.safetensors")
+    report = convert(write_diffusers(tmp_path / "m", half=True), tmp_path / "ours.safetensors")
     assert {network.dtypes for network in report.networks} == {("float16",)}
-    report = convert_weights(tmp_path / "ours.safetensors", tmp_path / "wide.safetensors", dtype="float32")
+    report = convert(tmp_path / "ours.safetensors", tmp_path / "wide.safetensors", dtype="float32")
     assert {network.dtypes for network in report.networks} == {("float32",)}
 
 
-def test_nothing_is_overwritten_unasked_and_nothing_half_written_stays(tmp_path: Path) -> None:
+def test_nothing_is_overwritten_unasked_and_nothing_half_written_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source, out = write_gcd(tmp_path), tmp_path / "ours.safetensors"
     out.write_bytes(b"precious")
     with pytest.raises(OptionError):
-        convert_weights(source, out)
+        convert(source, out)
     assert out.read_bytes() == b"precious"
 
-    def fail(_done: int, _total: int) -> None:
+    def half(_state: object, partial: Path, _metadata: object) -> None:
+        partial.write_bytes(b"half")
         raise KeyboardInterrupt
 
+    monkeypatch.setattr("gcd_model.weights.save.save_file", half)
     with pytest.raises(KeyboardInterrupt):
-        convert_weights(source, out, overwrite=True, progress=fail)
+        convert(source, out, overwrite=True)
+    monkeypatch.undo()
     assert out.read_bytes() == b"precious"
     assert sorted(file.name for file in tmp_path.iterdir()) == [source.name, out.name]
-    assert convert_weights(source, out, overwrite=True).layout == "gcd-node"
+    assert convert(source, out, overwrite=True).layout == "gcd-node"
 
 
 @pytest.mark.parametrize("out", ["ours.ckpt", "absent/ours.safetensors"])
 def test_an_impossible_output_is_refused(tmp_path: Path, out: str) -> None:
     with pytest.raises(OptionError):
-        convert_weights(write_gcd(tmp_path), tmp_path / out)
+        convert(write_gcd(tmp_path), tmp_path / out)
 
 
 def own_file(tmp_path: Path, **metadata: str) -> Path:

@@ -13,6 +13,8 @@ from published import (
     assert_same_weights,
     filled,
     gcd_state,
+    inspect,
+    load,
     refused,
     split_in_shards,
     write_diffusers,
@@ -21,8 +23,6 @@ from published import (
     write_svd,
 )
 from torch import Tensor
-
-from gcd_model.weights.load import inspect_weights, load_weights
 
 UNET = "model.diffusion_model"
 CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
@@ -58,8 +58,8 @@ def test_foreign_objects_beside_the_weights_do_not_matter(tmp_path: Path, monkey
     entries = {"callbacks": {"best": callback}, "loops": [listed, {1, 2}, Path("a/b")], "hyper_parameters": callback}
     path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()), **entries)
     monkeypatch.undo()
-    assert_same_weights(load_weights(path).networks, filled())
-    assert set(entries) < set(inspect_weights(path).other_entries)
+    assert_same_weights(load(path).networks, filled())
+    assert set(entries) < set(inspect(path).other_entries)
 
 
 def test_a_foreign_object_among_the_weights_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,7 +74,7 @@ def test_a_foreign_object_among_the_weights_is_refused_by_name(tmp_path: Path, m
 def test_hostile_code_beside_the_weights_never_runs(tmp_path: Path, place: str) -> None:
     trace = tmp_path / "trace"
     path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()), **{place: [Hostile(trace)]})
-    assert_same_weights(load_weights(path).networks, filled())
+    assert_same_weights(load(path).networks, filled())
     assert not trace.exists()
     pickle.loads(pickle.dumps(Hostile(trace)))
     assert trace.exists(), "the attack must work on pickle itself, else this test shows nothing"

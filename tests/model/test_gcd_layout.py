@@ -9,8 +9,11 @@ import torch
 from published import (
     SMALL_GCD,
     assert_same_weights,
+    convert,
     filled,
     fixed_view,
+    inspect,
+    load,
     manifest,
     write_diffusers,
     write_gcd,
@@ -25,7 +28,7 @@ from gcd_model.networks import Networks, empty_networks
 from gcd_model.weights.adapter import CAMERA
 from gcd_model.weights.card import Card
 from gcd_model.weights.infer import LEFTOVERS
-from gcd_model.weights.load import convert_weights, inspect_weights, load_weights
+from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state, write_published
 
 NARROW_HEADS = msgspec.structs.replace(SMALL_GCD, unet=msgspec.structs.replace(SMALL_GCD.unet, head_width=32))
@@ -66,11 +69,11 @@ def test_names_and_shapes_at_full_size_are_those_of_the_released_file_and_of_the
 @pytest.mark.parametrize("config", [SMALL_GCD, fixed_view(SMALL_GCD)], ids=["steered", "fixed view"])
 def test_what_is_written_and_read_again_is_the_same_bit_for_bit(tmp_path: Path, config: ModelConfig) -> None:
     family = "driving" if config.camera == "none" else "kubric90"
-    loaded = load_weights(written(tmp_path / "mine.ckpt", filled(config), family))
+    loaded = load(written(tmp_path / "mine.ckpt", filled(config), family))
     assert_same_weights(loaded.networks, filled(config))
     assert loaded.networks.config == config
     assert loaded.family is not None
-    assert (loaded.name, loaded.family.name, loaded.move_time, loaded.layout) == ("mine", family, 7, "gcd-ckpt")
+    assert (loaded.name, loaded.family.name, loaded.card.move_time, loaded.layout) == ("mine", family, 7, "gcd-ckpt")
 
 
 def test_it_is_a_lightning_checkpoint_of_plain_containers(tmp_path: Path) -> None:
@@ -79,24 +82,24 @@ def test_it_is_a_lightning_checkpoint_of_plain_containers(tmp_path: Path) -> Non
     assert wanted <= set(root)
     assert root["global_step"] == 10
     assert root["optimizer_states"] == []
-    assert inspect_weights(tmp_path / "mine.ckpt").optimizer_size == 0
+    assert inspect(tmp_path / "mine.ckpt").optimizer_size == 0
 
 
 def test_leftovers_of_the_file_it_came_from_are_carried_over(tmp_path: Path) -> None:
     source = write_gcd(tmp_path)
-    loaded = load_weights(source)
+    loaded = load(source)
     assert "lpips.lin0.model.1.weight" in loaded.carried
     assert not any(name.startswith("model_ema.") for name in loaded.carried)
-    convert_weights(source, tmp_path / "again.ckpt", layout="gcd-ckpt")
+    convert(source, tmp_path / "again.ckpt", layout="gcd-ckpt")
     state = root_of(tmp_path / "again.ckpt")["state_dict"]
     assert isinstance(state, dict)
     for name, tensor in loaded.carried.items():
         assert torch.equal(state[name], tensor), name
-    assert_same_weights(load_weights(tmp_path / "again.ckpt").networks, filled())
+    assert_same_weights(load(tmp_path / "again.ckpt").networks, filled())
 
 
 def test_the_base_model_converts_too_and_half_precision_spares_the_decoder(tmp_path: Path) -> None:
-    report = convert_weights(write_svd(tmp_path), tmp_path / "half.ckpt", layout="gcd-ckpt", dtype="float16")
+    report = convert(write_svd(tmp_path), tmp_path / "half.ckpt", layout="gcd-ckpt", dtype="float16")
     assert (report.layout, report.family) == ("gcd-ckpt", "svd")
     precisions = {network.name: network.dtypes for network in report.networks}
     assert precisions["unet"] == ("float16",)
@@ -105,8 +108,8 @@ def test_the_base_model_converts_too_and_half_precision_spares_the_decoder(tmp_p
 
 def test_one_encoder_for_all_frames_becomes_two_that_compute_the_same(tmp_path: Path) -> None:
     folder = write_diffusers(tmp_path / "model")
-    convert_weights(folder, tmp_path / "two.ckpt", layout="gcd-ckpt")
-    one, two = load_weights(folder).networks, load_weights(tmp_path / "two.ckpt").networks
+    convert(folder, tmp_path / "two.ckpt", layout="gcd-ckpt")
+    one, two = load(folder).networks, load(tmp_path / "two.ckpt").networks
     assert two.config == fixed_view(SMALL_GCD)
     frames = draw(2, 3, 32, 32)
     with torch.no_grad():

@@ -3,7 +3,7 @@
 import kornia
 import pytest
 import torch
-from naming import diffusers_state, levels_of
+from naming import diffusers_state
 from small_models import draw, randomise, relative_error
 from torch.testing import assert_close
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
@@ -29,7 +29,7 @@ def test_the_image_token_equals_transformers() -> None:
             hidden_act="gelu",
         )
     ).eval()
-    theirs.load_state_dict(diffusers_state(ours, "image_encoder", "image_encoder/", levels_of(tower=TOWER)))
+    theirs.load_state_dict(diffusers_state(ours, "image_encoder", "image_encoder/"))
     pixels = draw(3, 3, 28, 28)
     with torch.inference_mode():
         expected, result = theirs(pixels).image_embeds, ours(pixels)

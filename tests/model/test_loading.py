@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from published import SMALL_GCD, filled, write_diffusers, write_gcd
+from published import HEADS, SMALL_GCD, convert, filled, write_diffusers, write_gcd
 from small_models import synthesize
 from torch import Tensor
 
@@ -19,7 +19,7 @@ from gcd_model.loading import load_synthesizer
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
-from gcd_model.weights.load import convert_weights, save_weights
+from gcd_model.weights.load import save_weights
 
 
 def view(synthesizer: Synthesizer, height: int = 16, width: int = 24) -> View:
@@ -40,8 +40,10 @@ def dtypes(synthesizer: Synthesizer) -> dict[str, set[torch.dtype]]:
 
 def test_a_converted_checkpoint_gives_the_same_view(tmp_path: Path) -> None:
     published = write_gcd(tmp_path)
-    convert_weights(published, tmp_path / "ours.safetensors")
-    first, second = (view(load_synthesizer(path, device="cpu")) for path in (published, tmp_path / "ours.safetensors"))
+    convert(published, tmp_path / "ours.safetensors")
+    first, second = (
+        view(load_synthesizer(path, device="cpu", **HEADS)) for path in (published, tmp_path / "ours.safetensors")
+    )
     assert first.video.std() > 0.01, "a constant picture would show nothing"
     torch.testing.assert_close(first.latents, second.latents, rtol=0, atol=0)
     torch.testing.assert_close(first.video, second.video, rtol=0, atol=0)
@@ -57,7 +59,7 @@ def test_float32_on_the_cpu_stays_in_the_mapped_file(tmp_path: Path, monkeypatch
 
     real = loading.load_weights
     monkeypatch.setattr(loading, "load_weights", remembered)
-    synthesizer = load_synthesizer(write_gcd(tmp_path), device="cpu")
+    synthesizer = load_synthesizer(write_gcd(tmp_path), device="cpu", **HEADS)
     assert {name: tensor.data_ptr() for name, tensor in synthesizer.networks.state_dict().items()} == kept
 
 

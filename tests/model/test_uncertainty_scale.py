@@ -27,7 +27,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_scale_comes_with_the_weights(file: Path) -> None:
-    assert load_weights(file).uncertainty_scale == 1.75
+    assert load_weights(file).card.uncertainty_scale == 1.75
     assert inspect_weights(file).uncertainty_scale == 1.75
     assert load_synthesizer(file, device="cpu").traits.uncertainty_scale == 1.75
     assert tiny_traits().uncertainty_scale is None

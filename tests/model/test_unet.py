@@ -9,7 +9,7 @@ import pytest
 import torch
 from diffusers.models.transformers.transformer_temporal import TransformerSpatioTemporalModel
 from diffusers.models.unets.unet_spatio_temporal_condition import UNetSpatioTemporalConditionModel
-from naming import diffusers_state, levels_of, released_unet
+from naming import diffusers_state, released_unet
 from plain_unet import plain_unet
 from small_models import UNET, draw, give_published_epsilon, randomise, relative_error
 from torch import Tensor, nn
@@ -178,7 +178,7 @@ def small_diffusers_unet() -> UNetSpatioTemporalConditionModel:
 def test_the_u_net_equals_diffusers() -> None:
     ours, theirs = small_unet("none"), small_diffusers_unet()
     prepare(ours)
-    theirs.load_state_dict(diffusers_state(ours, "unet", "unet/", levels_of(unet=UNET)))
+    theirs.load_state_dict(diffusers_state(ours, "unet", "unet/"))
     ids = torch.tensor([[12.0, 127.0, 0.02], [6.0, 31.0, 0.1]])
     tokens, latents = draw(CLIPS, 1, 48), draw(CLIPS, FRAMES, 8, 8, 16)  # one token per clip: diffusers knows no other
     with torch.inference_mode():
@@ -195,7 +195,7 @@ def test_a_transformer_with_a_token_per_frame_equals_diffusers_which_takes_the_f
     randomise(ours)
     theirs = TransformerSpatioTemporalModel(2, 16, in_channels=32, cross_attention_dim=48)
     place = ("unet.down.0.stages.0.attention", "unet/down_blocks.0.attentions.0.")
-    theirs.load_state_dict(diffusers_state(ours, *place, levels_of(unet=UNET)))
+    theirs.load_state_dict(diffusers_state(ours, *place))
     x, tokens = draw(CLIPS * FRAMES, 32, 4, 6), draw(CLIPS * FRAMES, 48)
     with torch.inference_mode():
         expected = theirs(x, tokens[:, None], image_only_indicator=torch.zeros(CLIPS, FRAMES)).sample

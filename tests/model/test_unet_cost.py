@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import pytest
 import torch
-from naming import on_meta, released_unet
+from naming import released_unet
 from plain_unet import plain_unet
 from small_models import UNET, random_clip, tiny_synthesizer
 from torch import Tensor, nn
@@ -32,7 +32,7 @@ def _meta(*shape: int) -> Tensor:
 def _plain_flops(unet: VideoUNet) -> int:
     with FlopCounterMode(display=False) as counter:
         plain_unet(
-            on_meta(released_unet(unet)),
+            {name: weight.to("meta") for name, weight in released_unet(unet).items()},
             _meta(FULL_FRAMES, 8, FULL_HEIGHT, FULL_WIDTH),
             noise_label=_meta(FULL_FRAMES),
             vector=_meta(FULL_FRAMES, 768 + 128),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from diffusers.models.autoencoders.autoencoder_kl_temporal_decoder import AutoencoderKLTemporalDecoder
-from naming import diffusers_state, levels_of
+from naming import diffusers_state
 from small_models import draw, randomise, relative_error
 from torch import nn
 from torch.testing import assert_close
@@ -39,9 +39,8 @@ def theirs(ours: _Vae) -> AutoencoderKLTemporalDecoder:
         block_out_channels=VAE.widths,  # pyright: ignore[reportArgumentType]
         layers_per_block=VAE.blocks_per_level,
     ).eval()
-    levels = levels_of(vae=VAE)
-    encoder = diffusers_state(ours.encoder, "target_encoder", "vae/", levels)
-    model.load_state_dict(encoder | diffusers_state(ours.decoder, "decoder", "vae/", levels))
+    encoder = diffusers_state(ours.encoder, "target_encoder", "vae/")
+    model.load_state_dict(encoder | diffusers_state(ours.decoder, "decoder", "vae/"))
     return model
 
 

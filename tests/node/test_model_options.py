@@ -1,5 +1,6 @@
 """Adapters beside their weights, exports and engines: what is taken, and what is refused before anything runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,6 @@ from tiny_weights import write_tiny
 
 from gcd_model.errors import CheckpointError
 from gcd_model.weights.adapter import Adapter, base_digest
-from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import write_adapter
 from gcd_node.cli.main import run_app
@@ -38,8 +38,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     ).removesuffix(".weight")
     width = state[f"{layer}.weight"].shape[0]
     factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
-    assert loaded.family is not None
-    card = Card(name="adapted", config=loaded.networks.config, family=loaded.family.name, move_time=loaded.move_time)
+    card = replace(loaded.card, name="adapted", trained=True, origin="")
     for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
         adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)
         write_adapter(folder / f"{name}.safetensors", adapter, overwrite=False)
@@ -63,7 +62,7 @@ def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(
 def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
     assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64
-    assert "exists; give another name, or allow an export to be overwritten" in capsys.readouterr().err
+    assert "exists; give another name, or allow weights or an export to be overwritten" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("change", ["model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'])

@@ -10,7 +10,7 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from itertools import chain, compress
 from pathlib import Path
@@ -29,7 +29,7 @@ from gcd_model.small_files import decode_json, read_small
 from gcd_model.unet import VideoUNet
 from gcd_model.weights.card import FULL_PRECISION, Card
 from gcd_model.weights.load import digest
-from gcd_model.weights.save import whole_folder
+from gcd_model.weights.save import whole
 
 MANIFEST = "manifest.json"
 """The file that makes a folder an export."""
@@ -216,7 +216,8 @@ def export_onnx(
     require_onnx()
     networks = _at_size(loaded, height, width)
     records: dict[str, tuple[FileRecord, ...]] = {}
-    with whole_folder(Path(out), is_ours=_is_export_of_ours if overwrite else None) as folder:
+    with whole(Path(out), replaces=overwrite and _is_export_of_ours(Path(out))) as folder:
+        folder.mkdir()
         wanted = list(graphs(networks))
         for graph in wanted:
             if progress is not None:
@@ -225,7 +226,7 @@ def export_onnx(
             records[graph.name] = write_graph(graph, folder, own, apart_above=apart_above)
         manifest = Manifest(
             format=FORMAT,
-            card=loaded.card.to_metadata(),
+            card=replace(loaded.card, config=networks.config).to_metadata(),
             source=loaded.sha256_12,
             precision=precision,
             opset=OPSET,

@@ -253,7 +253,6 @@ def save_live(
 
     Raises: OptionError if `path` exists and `overwrite` is not set; CheckpointError if it cannot be written.
     """
-    state: dict[str, Tensor] = networks.state_dict()
+    halves: dict[str, Tensor] = {name: weight.half() for name, weight in networks.state_dict().items()}
     card = Card(name=name, config=networks.config, family=LIVE.name, move_time=0, trained=trained)
-    halves = dict.fromkeys(state, torch.float16)
-    write_safetensors(Path(path), state, card.to_metadata(), dtypes=halves, overwrite=overwrite)
+    write_safetensors(Path(path), halves, card.to_metadata(), overwrite=overwrite)

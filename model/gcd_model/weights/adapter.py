@@ -18,8 +18,7 @@ from gcd_model.errors import CheckpointError, FileError
 from gcd_model.networks import Networks, empty_networks, weights_digest
 from gcd_model.small_files import decode_json
 from gcd_model.weights.card import ADAPTER_KEY, Card
-from gcd_model.weights.infer import NO_LEVELS, match_weights, shapes_of
-from gcd_model.weights.names import own_source
+from gcd_model.weights.infer import match_weights, shapes_of
 
 DOWN, UP = ".down", ".up"
 """Endings of an adapted layer's two factors, after the layer's own name."""
@@ -90,36 +89,27 @@ def adapted(networks: Networks, adapter: Adapter) -> Networks:
             "trained from"
         )
     config = adapter.card.diffusion
-    base = carried_over(networks, config)
-    state = merged(base.weights, adapter)
-    lacking = [name for name in base.fresh if name not in state]
-    if lacking:
-        raise CheckpointError(f"{len(lacking)} weights are neither in the base nor in the adapter, first: {lacking[0]}")
-    result = empty_networks(config)
-    result.load_state_dict(state, assign=True, strict=True)
-    return result
-
-
-def merged(weights: Mapping[str, Tensor], adapter: Adapter) -> dict[str, Tensor]:
-    """Plain weights: the factors added in float32, whole weights put in place. Raises CheckpointError as `adapted`."""
-    state, tensors = dict(weights), adapter.tensors
-    known = shapes_of(empty_networks(adapter.card.diffusion).state_dict())
+    result, base = empty_networks(config), carried_over(networks, config)
+    state, tensors, known = dict(base.weights), adapter.tensors, shapes_of(result.state_dict())
     for name, tensor in tensors.items():
-        if name.endswith((UP, DOWN)):
-            continue
-        if known.get(name) != tensor.shape:
-            raise CheckpointError(f"the adapter holds {name} {list(tensor.shape)}, which the model does not have")
-        state[name] = tensor
+        if not name.endswith((UP, DOWN)):
+            if known.get(name) != tensor.shape:
+                raise CheckpointError(f"the adapter holds {name} {list(tensor.shape)}, which the model does not have")
+            state[name] = tensor
     for layer in {name.removesuffix(UP) for name in tensors if name.endswith(UP)}:
-        if f"{layer}.weight" not in weights or layer + DOWN not in tensors:
+        if f"{layer}.weight" not in base.weights or layer + DOWN not in tensors:
             raise CheckpointError(f"{layer} is not whole: the adapter does not belong to this model, or is damaged")
-        weight, up, down = weights[f"{layer}.weight"], tensors[layer + UP], tensors[layer + DOWN]
+        weight, up, down = base.weights[f"{layer}.weight"], tensors[layer + UP], tensors[layer + DOWN]
         if weight.shape != (up.shape[0], down.shape[1]) or up.shape[1] != down.shape[0]:
             raise CheckpointError(
                 f"{layer} is {list(weight.shape)}, its factors are {list(up.shape)} and {list(down.shape)}"
             )
         state[f"{layer}.weight"] = added(weight, up, down, adapter.alpha / adapter.rank)
-    return state
+    lacking = [name for name in base.fresh if name not in state]
+    if lacking:
+        raise CheckpointError(f"{len(lacking)} weights are neither in the base nor in the adapter, first: {lacking[0]}")
+    result.load_state_dict(state, assign=True, strict=True)
+    return result
 
 
 def added(weight: Tensor, up: Tensor, down: Tensor, scale: float) -> Tensor:
@@ -135,8 +125,6 @@ CAMERA = ("camera.", "unet.embed_camera.")
 
 DIFFUSION = ("unet.", "camera.")
 """What the paper's "from scratch" leaves at random: the U-Net and the camera embedder."""
-
-_ENCODER, _SECOND_ENCODER, _QUANT = "target_encoder.", "own_condition_encoder.", "target_encoder.quant."
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +154,7 @@ def carried_over(networks: Networks, config: ModelConfig, *, anew: tuple[str, ..
     weights = {name: tensor for name, tensor in given.items() if not name.startswith(anew)}
     expected = {name: shape for name, shape in shapes_of(wanted).items() if name not in fresh}
     try:
-        match_weights(expected, shapes_of(weights), own_source, NO_LEVELS)
+        match_weights({name: (name,) for name in expected}, expected, shapes_of(weights))
     except CheckpointError as error:
         raise CheckpointError(f"holds another model than is wanted: {error}") from error
     return CarriedOver(weights, fresh)
@@ -175,22 +163,15 @@ def carried_over(networks: Networks, config: ModelConfig, *, anew: tuple[str, ..
 def unshared(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Weights of a model whose one encoder serves all frames, as those of a model with two; the same functions.
 
-    The published target encoder has no 1x1 convolution at its end: it is multiplied into the last one before it. The
-    condition encoder keeps it.
+    The published target encoder has no 1x1 convolution at its end: it is multiplied into the last one before it, in
+    double precision. The condition encoder keeps it.
     """
-    encoder = {name: tensor for name, tensor in weights.items() if name.startswith(_ENCODER)}
-    others = {name: tensor for name, tensor in weights.items() if name not in encoder}
-    second = {name.replace(_ENCODER, _SECOND_ENCODER, 1): tensor for name, tensor in encoder.items()}
-    target = {name: tensor for name, tensor in encoder.items() if not name.startswith(_QUANT)}
-    target |= _folded(encoder)
-    return others | target | second
-
-
-def _folded(encoder: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The encoder's last convolution and the 1x1 convolution after it, as one; multiplied in double precision."""
-    names = [f"{_ENCODER}conv_out.{leaf}" for leaf in ("weight", "bias")]
-    weight, bias = (encoder[name] for name in names)
-    mix, shift = (encoder[f"{_QUANT}{leaf}"].double() for leaf in ("weight", "bias"))
+    own, quant = "target_encoder.", "target_encoder.quant."
+    second = {n.replace(own, "own_condition_encoder.", 1): w for n, w in weights.items() if n.startswith(own)}
+    target = {name: tensor for name, tensor in weights.items() if not name.startswith(quant)}
+    weight, bias = (f"{own}conv_out.{leaf}" for leaf in ("weight", "bias"))
+    mix, shift = (weights[f"{quant}{leaf}"].double() for leaf in ("weight", "bias"))
     mix = mix[:, :, 0, 0]
-    folded = torch.einsum("om,mihw->oihw", mix, weight.double())
-    return {names[0]: folded.to(weight.dtype), names[1]: (mix @ bias.double() + shift).to(bias.dtype)}
+    target[weight] = torch.einsum("om,mihw->oihw", mix, weights[weight].double()).to(weights[weight].dtype)
+    target[bias] = (mix @ weights[bias].double() + shift).to(weights[bias].dtype)
+    return target | second

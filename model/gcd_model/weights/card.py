@@ -9,7 +9,7 @@ import msgspec
 import torch
 
 from gcd_model.config import ModelConfig
-from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.errors import CheckpointError, FileError, OptionError
 from gcd_model.live.config import LiveConfig
 from gcd_model.small_files import decode_json
 
@@ -18,6 +18,9 @@ CONFIG_KEY, ADAPTER_KEY = "gcd.config", "gcd.adapter"
 """Metadata that our weight files have, and those of adapters alone."""
 NOTES = "gcd_node"
 """Where in the hyper-parameters of a `.ckpt` our card stands."""
+_PACKED = "gcd"
+"""The one entry of a safetensors file that holds all of ours, as JSON: the library writes several in an order of the
+moment, and the same weights must be the same bytes. Files of before have them apart."""
 NO_DIFFUSION = "is the live model, which has no U-Net and no VAE: this is for diffusion models"
 _SCALE_KEY = "gcd.uncertainty_scale"
 
@@ -30,6 +33,19 @@ PRECISIONS: dict[str, torch.dtype] = {
 
 FULL_PRECISION = ("decoder",)
 """Networks that compute in float32 whatever --dtype says: what they make is looked at."""
+
+
+def packed(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Metadata as our files hold it."""
+    return {_PACKED: msgspec.json.encode(metadata).decode()}
+
+
+def unpacked(metadata: Mapping[str, str]) -> dict[str, str]:
+    """The inverse of `packed`. Raises CheckpointError if it is damaged."""
+    try:
+        return {**metadata, **decode_json(metadata.get(_PACKED, "{}"), dict[str, str])}
+    except FileError as error:
+        raise CheckpointError(f"its metadata {error}; convert the weights again") from error
 
 
 def precision(name: str) -> torch.dtype:
@@ -92,9 +108,10 @@ class Card:
                 f"its format is {metadata['gcd.format']!r}, this version reads {FORMAT!r}; install a newer gcd-node"
             )
         try:
+            config = metadata[CONFIG_KEY]
             return cls(
                 name=metadata.get("gcd.name", ""),
-                config=_config(metadata[CONFIG_KEY]),
+                config=decode_json(config, LiveConfig if decode_json(config, _Kind).kind == "live" else ModelConfig),
                 family=metadata.get("gcd.family") or None,
                 move_time=int(metadata["gcd.move_time"]),
                 trained=metadata.get("gcd.trained", "true") != "false",
@@ -107,10 +124,6 @@ class Card:
 
 class _Kind(msgspec.Struct):
     kind: str = ""
-
-
-def _config(text: str) -> ModelConfig | LiveConfig:
-    return decode_json(text, LiveConfig if decode_json(text, _Kind).kind == "live" else ModelConfig)
 
 
 # --- what can be said about a checkpoint without loading it ----------------------------------------------------------

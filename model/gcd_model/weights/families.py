@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import msgspec
 
-from gcd_model.config import CameraControl, ModelConfig, SamplingConfig
+from gcd_model.config import CameraControl, ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.geometry import Interpolation, Spherical
 from gcd_model.live.config import LiveConfig
@@ -54,7 +54,8 @@ class Family:
     camera: control the checkpoints have; relative poses may stand in for angles and radius.
     rates: trained frames per second, empty if any. fps: the default label.
     hfov_deg: trained horizontal field of view. height, width: trained size in pixels.
-    motion_bucket: the constant the network was told, None where the formula gives it.
+    motion_bucket: the constant the network was told, None where the formula gives it. guidance: of the first and the
+    last frame, as published.
     """
 
     name: FamilyName
@@ -69,6 +70,7 @@ class Family:
     motion_bucket: float | None = None
     pose_units: Literal["m", "scene"] = "scene"
     output: Literal["rgb", "semantic"] = "rgb"
+    guidance: tuple[float, float] = (1.0, 1.5)
 
 
 KUBRIC90 = Family(
@@ -101,18 +103,18 @@ MANIPULATION = Family(
     pose_units="m",
 )
 """Ours: a camera anywhere about a robot's cell, told as a rigid transform."""
-SVD = Family(name="svd", camera="none", rates=(), fps=7.0, hfov_deg=None, height=576, width=1024, motion_bucket=127.0)
-LIVE = Family(
-    name="live",
-    camera="relative_pose",
+SVD = Family(
+    name="svd",
+    camera="none",
     rates=(),
-    fps=10.0,
+    fps=7.0,
     hfov_deg=None,
-    height=128,
-    width=192,
+    height=576,
+    width=1024,
     motion_bucket=127.0,
-    pose_units="m",
+    guidance=(1.0, 2.5),
 )
+LIVE = replace(MANIPULATION, name="live", height=128, width=192)
 """Ours: see `gcd_model.live`; any rigid pose, any lens of LIVE_LENS_DEG."""
 LIVE_LENS_DEG = (40.0, 120.0)
 """Horizontal fields of view of the live model's training."""
@@ -132,8 +134,6 @@ def family_named(name: str) -> Family:
 # --- the family of a checkpoint, by its name or the yaml beside it ---------------------------------------------------
 
 
-SVD_GUIDANCE = (1.0, 2.5)
-"""Guidance of the first and last frame Stable Video Diffusion was published with; GCD uses 1.0 to 1.5."""
 _LONGEST_LINE = 1000
 
 
@@ -150,25 +150,24 @@ class Provenance:
     told_by: str | None = None
 
 
-_PUBLISHED: tuple[tuple[str, Provenance], ...] = (
-    (r"kubric_gradual_max90", Provenance(family="kubric90", move_time=13)),
-    (r"kubric_direct_max90", Provenance(family="kubric90", move_time=0)),
-    (r"kubric_gradual_max180", Provenance(family="kubric180", move_time=13)),
-    (r"kubric_direct_max180", Provenance(family="kubric180", move_time=0)),
-    (r"pardom_gradual_rgb", Provenance(family="driving", move_time=13)),
-    (r"pardom_direct_rgb", Provenance(family="driving", move_time=0)),
-    (r"pardom_gradual_semantic", Provenance(family="driving-semantic", move_time=13)),
-    (r"pardom_direct_semantic", Provenance(family="driving-semantic", move_time=0)),
-    (r"^(svd|stable-video-diffusion-img2vid)$", Provenance(family="svd")),
-    (r"^(svd_xt|stable-video-diffusion-img2vid-xt)$", Provenance(family="svd", frames=25)),
-)
+_GCD = re.compile(r"(?:kubric_(gradual|direct)_(max90|max180)|pardom_(gradual|direct)_(rgb|semantic))(?!\d)")
+_GCD_FAMILIES: dict[str, FamilyName] = {
+    "max90": "kubric90",
+    "max180": "kubric180",
+    "rgb": "driving",
+    "semantic": "driving-semantic",
+}
+_SVD = re.compile(r"svd(_xt)?|stable-video-diffusion-img2vid(-xt)?")
 
 
 def told_by_name(stem: str) -> Provenance:
     """Family of a published file name without suffix, also with something added; the base models' names only whole."""
-    for pattern, told in _PUBLISHED:
-        if re.search(pattern + r"(?!\d)", stem.lower()):
-            return replace(told, told_by="file name")
+    if found := _GCD.search(stem.lower()):
+        pace, kind = filter(None, found.groups())
+        move_time = 13 if pace == "gradual" else 0
+        return Provenance(family=_GCD_FAMILIES[kind], move_time=move_time, told_by="file name")
+    if found := _SVD.fullmatch(stem.lower()):
+        return Provenance(family="svd", frames=25 if any(found.groups()) else None, told_by="file name")
     return Provenance()
 
 
@@ -180,22 +179,19 @@ def told_by_yaml(text: str) -> Provenance:
     lines = (line.rstrip() for line in text.splitlines())  # searching takes the square of a line's length, or of a gap
     text = "\n".join(line for line in lines if 0 < len(line) <= _LONGEST_LINE)
     move_time = re.search(r"^[ \t-]*move_time\s*:\s*(\d{1,4})\s*(#.*)?$", text, re.MULTILINE)
-    family = _family_of_ranges(text) or _family_of_views(text)
+    angles = _largest_difference(text, "azimuth"), _largest_difference(text, "elevation")
+    families: dict[tuple[float | None, float | None], FamilyName] = {
+        (90.0, 30.0): "kubric90",
+        (90.0, None): "kubric90",
+        (180.0, 60.0): "kubric180",
+        (180.0, None): "kubric180",
+    }
+    family = families.get(angles) or _family_of_views(text)
     return Provenance(
         family=family,
         move_time=None if move_time is None else int(move_time[1]),
         told_by=None if family is None else "yaml",
     )
-
-
-def _family_of_ranges(text: str) -> FamilyName | None:
-    """By the largest azimuth difference; the elevation must not speak against it."""
-    azimuth, elevation = _largest_difference(text, "azimuth"), _largest_difference(text, "elevation")
-    families: dict[float, tuple[FamilyName, float]] = {90.0: ("kubric90", 30.0), 180.0: ("kubric180", 60.0)}
-    if azimuth not in families:
-        return None
-    family, expected = families[azimuth]
-    return family if elevation in (None, expected) else None
 
 
 def _largest_difference(text: str, angle: str) -> float | None:
@@ -222,24 +218,21 @@ def _family_of_views(text: str) -> FamilyName | None:
 
 def combined(*told: Provenance) -> Provenance:
     """Each fact from the first that knows it; who names the family first is named."""
-    nothing = Provenance()
-    named = next((each for each in told if each.family is not None), nothing)
+    named = next((each for each in told if each.family is not None), Provenance())
     move_time = next((each.move_time for each in told if each.move_time is not None), None)
     frames = next((each.frames for each in told if each.frames is not None), None)
     return Provenance(family=named.family, move_time=move_time, frames=frames, told_by=named.told_by)
 
 
-def checked_family(told: Provenance, config: ModelConfig | LiveConfig) -> Family | None:
-    """The family, if it can be: steered weights need a steered family, fixed ones a fixed one, the live model its own.
+def require_family(told: Provenance, config: ModelConfig | LiveConfig) -> None:
+    """Whether the family can be: steered weights need a steered family, fixed ones a fixed one, the live model its own.
 
-    Relative poses may stand in for angles and radius.
-    Raises: CheckpointError on a contradiction, OptionError for an unknown name.
+    Relative poses may stand in for angles and radius. Raises: CheckpointError on a contradiction.
     """
     if told.family is None:
-        return None
-    family = family_named(told.family)
-    live = family is LIVE, isinstance(config, LiveConfig)
-    if live[0] != live[1]:
+        return
+    family = FAMILIES[told.family]
+    if (family is LIVE) != isinstance(config, LiveConfig):
         raise CheckpointError(
             f"family {family.name} (told by: {told.told_by}) and these weights do not belong together: one is the live "
             "model, the other is not; leave --family out"
@@ -249,17 +242,12 @@ def checked_family(told: Provenance, config: ModelConfig | LiveConfig) -> Family
             f"family {family.name} (told by: {told.told_by}) wants camera control {family.camera!r}, "
             f"the weights have {config.camera!r}; name another with --family"
         )
-    return family
 
 
-def at_trained_size(config: ModelConfig, family: Family | None) -> ModelConfig:
+def at_trained_size(config: ModelConfig, told: Provenance) -> ModelConfig:
     """The config of published weights with the size and guidance of their family."""
-    if family is None:
+    if told.family is None:
         return config
-    guidance = SVD_GUIDANCE if family.name == "svd" else SamplingConfig().guidance
-    return msgspec.structs.replace(
-        config,
-        height=family.height,
-        width=family.width,
-        sampling=msgspec.structs.replace(config.sampling, guidance=guidance),
-    )
+    family = FAMILIES[told.family]
+    sampling = msgspec.structs.replace(config.sampling, guidance=family.guidance)
+    return msgspec.structs.replace(config, height=family.height, width=family.width, sampling=sampling)

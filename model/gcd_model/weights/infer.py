@@ -1,29 +1,40 @@
 """From the names and shapes of published weights to a config, and each of our parameters to its place among them.
 
-Pure: tensors are never looked into.
+Pure: tensors are never looked into. What names and shapes do not tell (heads) is told or refused, never guessed.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
-from gcd_model.config import CAMERA_FEATURES, CameraControl, ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
+from gcd_model.config import (
+    CAMERA_FEATURES,
+    SVD_14,
+    CameraControl,
+    ImageEncoderConfig,
+    ModelConfig,
+    UNetConfig,
+    VAEConfig,
+)
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.weights.names import GCD_CONDITION_VAE, GCD_IMAGE, GCD_UNET, GCD_VAE, IMAGE, Levels, Source, assembled
+from gcd_model.weights.names import (
+    GCD_CONDITION_VAE,
+    GCD_IMAGE,
+    GCD_UNET,
+    GCD_VAE,
+    IMAGE,
+    Levels,
+    Naming,
+    published_names,
+    published_shape,
+)
 
 Shapes = Mapping[str, tuple[int, ...]]
-"""Published names and their shapes."""
+"""Names and their shapes."""
 
-Naming = Callable[[str, Levels], Source | None]
-"""Where a layout keeps a parameter of ours: `gcd_source` or `diffusers_source`."""
-
-NO_LEVELS = Levels(attention=(), unet_blocks=0, vae_levels=0, vae_blocks=0, image_layers=0)
-"""For names that no block numbers stand in."""
-
-PUBLISHED_GROUPS, PUBLISHED_HEAD_WIDTH, PUBLISHED_IMAGE_HEADS, PUBLISHED_FRAMES = 32, 64, 16, 14
+_PUBLISHED_GROUPS = 32  # of every group norm
 
 
 def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
@@ -33,7 +44,7 @@ def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Hints:
-    """What neither names nor shapes tell; None means as published.
+    """What neither names nor shapes tell; None where nobody says.
 
     head_width: channels of an attention head of the U-Net; or heads: their number, one for all levels or one each.
     image_heads: attention heads of the image tower. frames: T. latent_scale: see `VAEConfig.scale`.
@@ -52,51 +63,47 @@ class Hints:
                 raise OptionError(f"{name} must be at least {least}, got {value}")
 
 
-def gcd_levels(names: Iterable[str]) -> Levels:
-    """The counts behind Stability's block numbers. Attention is not known yet: see `infer_config`."""
+RELEASED = Hints(head_width=SVD_14.unet.head_width, image_heads=16)
+"""What the released code builds, whatever the widths."""
+
+
+def levels_of(names: Iterable[str], naming: Naming) -> Levels:
+    """The counts behind a layout's block numbers. Attention is not known yet: see `infer_config`."""
     names = list(names)
-    inputs, vae = rf"{re.escape(GCD_UNET)}\.input_blocks\.", rf"{re.escape(GCD_VAE)}\.encoder\.down\."
-    downs = sorted(_numbers(names, inputs + r"(\d+)\.0\.op\."))
-    blocks = (downs[0] if downs else len(_numbers(names, inputs + r"(\d+)\."))) - 1
+
+    def count(pattern: str) -> int:  # distinct numbers, so that a made-up huge number counts once
+        return len({match[1] for match in map(re.compile(pattern).match, names) if match is not None})
+
+    if naming == "diffusers":
+        levels, blocks = count(r"unet/down_blocks\.(\d+)\."), count(r"unet/down_blocks\.0\.resnets\.(\d+)\.")
+        vae, res, tower = r"vae/encoder\.down_blocks", "resnets", rf"{re.escape(IMAGE)}\.encoder\.layers"
+    else:
+        inputs = rf"{re.escape(GCD_UNET)}\.input_blocks\.(\d+)\."
+        levels = 1 + count(rf"{inputs}0\.op\.")
+        blocks = max(1, count(inputs) // levels - 1)  # each level has one more: the stem, then the resampling before it
+        vae, res = rf"{re.escape(GCD_VAE)}\.encoder\.down", "block"
+        tower = rf"{re.escape(GCD_IMAGE)}\.transformer\.resblocks"
     return Levels(
-        attention=(False,) * (len(downs) + 1),
-        unet_blocks=max(blocks, 1),
-        vae_levels=len(_numbers(names, vae + r"(\d+)\.")),
-        vae_blocks=len(_numbers(names, vae + r"0\.block\.(\d+)\.")),
-        image_layers=len(_numbers(names, rf"{re.escape(GCD_IMAGE)}\.transformer\.resblocks\.(\d+)\.")),
+        attention=(False,) * levels,
+        unet_blocks=blocks,
+        vae_levels=count(rf"{vae}\.(\d+)\."),
+        vae_blocks=count(rf"{vae}\.0\.{res}\.(\d+)\."),
+        image_layers=count(rf"{tower}\.(\d+)\."),
     )
 
 
-def diffusers_levels(names: Iterable[str]) -> Levels:
-    """The same for a diffusers folder."""
-    names = list(names)
-    return Levels(
-        attention=(False,) * len(_numbers(names, r"unet/down_blocks\.(\d+)\.")),
-        unet_blocks=len(_numbers(names, r"unet/down_blocks\.0\.resnets\.(\d+)\.")),
-        vae_levels=len(_numbers(names, r"vae/encoder\.down_blocks\.(\d+)\.")),
-        vae_blocks=len(_numbers(names, r"vae/encoder\.down_blocks\.0\.resnets\.(\d+)\.")),
-        image_layers=len(_numbers(names, rf"{re.escape(IMAGE)}\.encoder\.layers\.(\d+)\.")),
-    )
-
-
-def _numbers(names: Iterable[str], pattern: str) -> set[int]:
-    """Distinct numbers at the pattern's group, so that a made-up huge number counts once."""
-    return {int(match[1]) for match in map(re.compile(pattern).match, names) if match is not None}
-
-
-def infer_config(shapes: Shapes, naming: Naming, levels: Levels, hints: Hints) -> ModelConfig:
+def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
     """The config of published weights, at the size of GCD's checkpoints.
 
-    Args:
-        levels: from `gcd_levels` or `diffusers_levels`.
     Raises:
-        CheckpointError: a weight the architecture hangs on is missing, or the published rules do not give one.
+        CheckpointError: a weight the architecture hangs on is missing, the published rules do not give one, or nobody
+            tells the number of heads.
     """
-    probe = _Probe(shapes, naming, levels)
+    probe = _Probe(shapes, naming, levels_of(shapes, naming))
     try:
         unet = _unet(probe, hints)
         return ModelConfig(
-            frames=hints.frames or PUBLISHED_FRAMES,
+            frames=hints.frames or SVD_14.frames,
             camera=_camera_control(probe, unet.camera_width),
             unet=unet,
             vae=_vae(probe, hints),
@@ -115,27 +122,25 @@ class _Probe:
     levels: Levels
 
     def optional(self, name: str, axis: int) -> int | None:
-        """One side of our parameter; None where it is absent."""
-        source = self.naming(name, self.levels)
-        if source is None or any(each not in self.shapes for each in source.names):
-            return None
-        shape = assembled([torch.empty(self.shapes[each], device="meta") for each in source.names], source.form).shape
+        """One side of a published tensor; None where it is absent."""
+        published = published_names(name, self.naming, self.levels)
+        shape = self.shapes.get(published[0], ()) if published else ()
         return shape[axis] if axis < len(shape) and shape[axis] > 0 else None
 
     def size(self, name: str, axis: int) -> int:
         """The same, of one that must be there."""
         found = self.optional(name, axis)
         if found is None:
-            source = self.naming(name, self.levels) or Source((name,))
-            raise CheckpointError(f"1 weight that tells the architecture is missing or misshapen: {source.names[0]}")
+            place = published_names(name, self.naming, self.levels)[0]
+            raise CheckpointError(f"1 weight that tells the architecture is missing or misshapen: {place}")
         return found
 
 
 def _multipliers(what: str, width: int, widths: tuple[int, ...]) -> tuple[int, ...]:
-    if any(level % width for level in widths) or width % PUBLISHED_GROUPS:
+    if any(level % width for level in widths) or width % _PUBLISHED_GROUPS:
         raise CheckpointError(
             f"{what} has level widths {list(widths)} over {width}; published layouts have multiples of "
-            f"{PUBLISHED_GROUPS}, the groups of every group norm. Use our own format for other networks"
+            f"{_PUBLISHED_GROUPS}, the groups of every group norm. Use our own format for other networks"
         )
     return tuple(level // width for level in widths)
 
@@ -157,29 +162,28 @@ def _unet(probe: _Probe, hints: Hints) -> UNetConfig:
         context_width=probe.optional("unet.middle.0.attention.spatial.token.value.weight", 1),
         vector_width=probe.size("unet.embed_vector.0.weight", 1),
         camera_width=probe.optional("unet.embed_camera.0.weight", 1) or 0,
-        norm_groups=PUBLISHED_GROUPS,
+        norm_groups=_PUBLISHED_GROUPS,
     )
 
 
 def _head_width(attends: tuple[bool, ...], widths: tuple[int, ...], hints: Hints) -> int:
-    """The given head width, or the published one. The middle, as wide as the deepest level, always attends."""
-    there = [level for level, attending in enumerate((*attends[:-1], True)) if attending]
-    head_width = hints.head_width or PUBLISHED_HEAD_WIDTH
-    if hints.head_width is None and hints.heads is not None:
+    """The given head width, or the published one of published widths."""
+    if hints.head_width is not None:
+        return hints.head_width
+    if hints.heads is not None:
         heads = (hints.heads,) * len(widths) if isinstance(hints.heads, int) else hints.heads
-        if len(heads) != len(widths) or min(heads) < 1:
-            raise CheckpointError(f"config.json gives heads {heads} for {len(widths)} levels")
-        found = {widths[level] / heads[level] for level in there}
-        if len(found) > 1 or not all(width.is_integer() for width in found):
-            raise CheckpointError(f"heads {heads} over widths {widths} are not all of one width; give --head-width")
-        head_width = int(found.pop())
-    for level in there:
-        if widths[level] % head_width:
-            raise CheckpointError(
-                f"an attention level is {widths[level]} wide, no multiple of the head width {head_width}, which the "
-                "weights do not tell; give --head-width"
-            )
-    return head_width
+        if len(heads) == len(widths) and min(heads) > 0:
+            there = zip(widths, heads, (*attends[:-1], True), strict=True)  # the middle, as the deepest level, attends
+            found = {width / number for width, number, attending in there if attending}
+            if len(found) == 1 and (head_width := found.pop()).is_integer():
+                return int(head_width)
+        raise CheckpointError(f"config.json's heads {heads} over widths {widths} are not of one width; {_GIVE_WIDTH}")
+    if widths == SVD_14.unet.widths:
+        return SVD_14.unet.head_width
+    raise CheckpointError(f"a U-Net of widths {list(widths)} does not tell its attention heads; {_GIVE_WIDTH}")
+
+
+_GIVE_WIDTH = "give the width of one with --head-width"
 
 
 def _camera_control(probe: _Probe, camera_width: int) -> CameraControl:
@@ -203,32 +207,33 @@ def _vae(probe: _Probe, hints: Hints) -> VAEConfig:
         width=width,
         multipliers=_multipliers("the VAE", width, widths),
         blocks_per_level=probe.levels.vae_blocks,
-        norm_groups=PUBLISHED_GROUPS,
+        norm_groups=_PUBLISHED_GROUPS,
         scale=VAEConfig().scale if hints.latent_scale is None else hints.latent_scale,
-        shared=probe.naming("target_encoder.quant.weight", probe.levels) is not None,
+        shared=probe.naming == "diffusers",
     )
 
 
 def _image_encoder(probe: _Probe, context_width: int | None, hints: Hints) -> ImageEncoderConfig | None:
     """None only for a U-Net without cross-attention: a tower that is wanted and absent is found missing later."""
+    if context_width is None:
+        return None
     tokens = probe.optional("image_encoder.positions", 0)
     if tokens is None:
-        return None if context_width is None else ImageEncoderConfig(output_width=context_width)
+        return ImageEncoderConfig(output_width=context_width)
     patch, width = probe.size("image_encoder.patches.weight", 2), probe.size("image_encoder.patches.weight", 0)
-    heads = hints.image_heads or PUBLISHED_IMAGE_HEADS
-    if width % heads:
+    published = ImageEncoderConfig()
+    if hints.image_heads is None and width != published.width:
         raise CheckpointError(
-            f"the image tower is {width} wide, no multiple of its {heads} heads, which the weights do not tell; "
-            "give --image-heads"
+            f"an image tower {width} wide does not tell its attention heads; give their number with --image-heads"
         )
     return ImageEncoderConfig(
         image_size=round((tokens - 1) ** 0.5) * patch,
         patch=patch,
         width=width,
         layers=probe.levels.image_layers,
-        heads=heads,
+        heads=hints.image_heads or published.heads,
         hidden_width=probe.size("image_encoder.layers.0.expand.weight", 0),
-        output_width=probe.size("image_encoder.projection", 1),
+        output_width=context_width,
     )
 
 
@@ -237,12 +242,9 @@ def _image_encoder(probe: _Probe, context_width: int | None, hints: Hints) -> Im
 
 _FIRST = 5  # names an error lists
 
-_TEXT_TOWER = (
-    r"positional_embedding|text_projection|logit_scale|attn_mask|token_embedding\.weight"
-    r"|ln_final\.(weight|bias)|transformer\..+"
-)
 LEFTOVERS = {
-    "CLIP text tower": rf"conditioner\.embedders\.0\.open_clip\.model\.({_TEXT_TOWER})",
+    "CLIP text tower": r"conditioner\.embedders\.0\.open_clip\.model\.(positional_embedding|text_projection|logit_scale"
+    r"|attn_mask|token_embedding\.weight|ln_final\.(weight|bias)|transformer\..+)",
     "decoder of the condition VAE": rf"{re.escape(GCD_CONDITION_VAE)}\.(decoder|post_quant_conv)\..+",
     "LPIPS": r"lpips\..+",
     "EMA": r"model_ema\..+",
@@ -252,29 +254,25 @@ LEFTOVERS = {
 """Published weights that inference does not use, by the whole name. Anything else that is left over is an error."""
 
 
-@dataclass(frozen=True, slots=True)
-class Match:
-    """Where every parameter comes from, and what stays behind.
-
-    sources: our names. leftovers: the kinds of LEFTOVERS that occur, each with its published names.
-    """
-
-    sources: dict[str, Source]
-    leftovers: dict[str, list[str]]
-
-
-def match_weights(expected: Shapes, shapes: Shapes, naming: Naming, levels: Levels) -> Match:
-    """Pair our parameters with published weights.
+def match_weights(sources: Mapping[str, tuple[str, ...]], expected: Shapes, shapes: Shapes) -> dict[str, list[str]]:
+    """Whether a file holds exactly what is expected of it.
 
     Args:
-        expected: our names and shapes. shapes: those of the file.
+        sources: for each of our names, the file's; see `published_names`. expected: our names and shapes.
+        shapes: those of the file.
+    Returns:
+        Names that stay behind, by the kinds of LEFTOVERS that occur.
     Raises:
         CheckpointError: says how many weights are missing, unknown and misshapen, and the first five of each.
     """
-    sources = {name: naming(name, levels) or Source((name,)) for name in expected}
-    used = {published for source in sources.values() for published in source.names}
-    missing = [published for source in sources.values() for published in source.names if published not in shapes]
-    misshapen = [line for name, source in sources.items() for line in _misfit(expected[name], source, shapes)]
+    missing = [each for names in sources.values() for each in names if each not in shapes]
+    misshapen: list[str] = []
+    for name, names in sources.items():
+        given = [shapes[each] for each in names if each in shapes]
+        published = published_shape(names, expected[name], len(given[0]) if given else 0)
+        if len(given) == len(names) and any(shape != published for shape in given):
+            misshapen.append(f"{names[0]} wants {list(published)}, got {list(given[0])}")
+    used = {each for names in sources.values() for each in names}
     leftovers: dict[str, list[str]] = {}
     unknown: list[str] = []
     for name in (name for name in shapes if name not in used):
@@ -291,19 +289,4 @@ def match_weights(expected: Shapes, shapes: Shapes, naming: Naming, levels: Leve
     ]
     if faults:
         raise CheckpointError(f"{'; '.join(faults)}. Nothing was loaded: it is damaged, or of another architecture")
-    return Match(sources, leftovers)
-
-
-def _misfit(wanted: tuple[int, ...], source: Source, shapes: Shapes) -> list[str]:
-    """One line if the published tensors do not make ours; none if they do or are missing anyway."""
-    given = [shapes[name] for name in source.names if name in shapes]
-    published = wanted
-    if source.form == "stacked":
-        published = (wanted[0] // len(source.names), *wanted[1:])
-    elif source.form == "transposed":
-        published = wanted[::-1]
-    elif source.form == "pixelwise" and given[:1] != [wanted]:  # some converters keep the 1x1 convolution
-        published = wanted[:2]
-    if len(given) < len(source.names) or all(shape == published for shape in given):
-        return []
-    return [f"{source.names[0]} wants {list(published)}, got {list(given[0])}"]
+    return leftovers

@@ -6,7 +6,7 @@ Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffu
 
 import hashlib
 import logging
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -33,29 +33,19 @@ from gcd_model.weights.card import (
 )
 from gcd_model.weights.families import (
     FAMILIES,
-    Family,
+    FamilyName,
     Provenance,
     at_trained_size,
-    checked_family,
     combined,
     family_named,
+    require_family,
     told_by_name,
     told_by_yaml,
 )
-from gcd_model.weights.infer import (
-    NO_LEVELS,
-    Hints,
-    Match,
-    Naming,
-    diffusers_levels,
-    gcd_levels,
-    infer_config,
-    match_weights,
-    shapes_of,
-)
-from gcd_model.weights.names import Levels, assembled, diffusers_source, gcd_source, own_source
+from gcd_model.weights.infer import Hints, infer_config, match_weights, shapes_of
+from gcd_model.weights.names import Levels, Naming, assembled, published_names
 from gcd_model.weights.read import WeightsFile, read_file, read_weights
-from gcd_model.weights.save import CARRIED, Report, write_published, write_safetensors
+from gcd_model.weights.save import CARRIED, write_published, write_safetensors
 
 _log = logging.getLogger(__name__)
 
@@ -63,18 +53,18 @@ _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
 _USABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 _NAMINGS: dict[Layout, Naming] = {
-    "gcd-ckpt": gcd_source,
-    "sgm-safetensors": gcd_source,
-    "diffusers": diffusers_source,
-    "gcd-node": own_source,
+    "gcd-ckpt": "gcd",
+    "sgm-safetensors": "gcd",
+    "diffusers": "diffusers",
+    "gcd-node": "own",
 }
 
 
 class Told(TypedDict, total=False):
     """What a caller says of a checkpoint; None leaves it to the file.
 
-    family: its name, instead of what metadata, file name or a yaml beside the file tell. head_width, image_heads,
-    frames: what published weights do not tell, instead of the published values.
+    family: its name, instead of what metadata, file name or a yaml beside the file tell. head_width, image_heads: what
+    weights of other than the published widths do not tell. frames: instead of the published number.
     """
 
     family: str | None
@@ -89,29 +79,22 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
     Args:
         ask_family: warn where the family is not known; False for those who only want the weights. told: see `Told`.
     Raises:
-        CheckpointError: the file is missing, damaged, hostile or of another architecture.
+        CheckpointError: the file is missing, damaged, hostile, of another architecture, or its heads are not known.
         OptionError: an option is unknown or contradicts the file.
     """
     with _about(path):
         examined = _examined(Path(path), told)
-        state = {name: examined.tensor(name) for name in examined.match.sources}
-        examined.networks.load_state_dict(state, assign=True, strict=True)
-        if ask_family and examined.family is None:
+        examined.networks.load_state_dict(examined.state(), assign=True, strict=True)
+        if ask_family and examined.card.family is None:
             _log.warning(
                 "the family of %s is not known: no limits are checked and --motion-bucket must be given; "
                 "name it with --family %s",
                 path,
                 "|".join(FAMILIES),
             )
-        card = examined.card
         return LoadedWeights(
-            name=card.name,
+            card=replace(examined.card, origin=digest(examined.file.files)[:12]),
             networks=examined.networks,
-            family=examined.family,
-            move_time=card.move_time,
-            trained=card.trained,
-            sha256_12=digest(examined.file.files)[:12],
-            uncertainty_scale=card.uncertainty_scale,
             layout=examined.file.layout,
             carried=examined.carried,
         )
@@ -119,27 +102,26 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
 
 def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
     """A base and what was trained on it, as one. Raises CheckpointError as `adapted`; OptionError for its family."""
-    card = adapter.card
+    if adapter.card.family is not None:
+        family_named(adapter.card.family)
+    weights = {f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}
     return replace(
         base,
-        name=card.name,
+        card=replace(
+            adapter.card,
+            trained=base.card.trained and adapter.card.trained,
+            uncertainty_scale=None,
+            origin=weights_digest(weights),
+        ),
         networks=adapted(base.diffusion, adapter),
-        family=None if card.family is None else family_named(card.family),
-        move_time=card.move_time,
-        trained=base.trained and card.trained,
-        uncertainty_scale=None,
-        sha256_12=weights_digest({f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}),
     )
 
 
 def read_adapter(path: str | Path) -> Adapter:
     """Map an adapter's file. Raises CheckpointError if it is missing, damaged or no adapter."""
-    path = Path(path)
     with _about(path):
-        if not path.exists():
-            raise CheckpointError("there is no such file; check the path")
-        held, metadata = read_file(path)
-        return Adapter.of_file(metadata or {}, held.tensors)
+        contents = read_file(Path(path))
+        return Adapter.of_file({} if contents.is_pickle else contents.metadata, contents.tensors)
 
 
 def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpack[Told]) -> WeightsReport:
@@ -151,19 +133,19 @@ def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpa
     """
     with _about(path):
         examined = _examined(Path(path), told)
-        file, card = examined.file, examined.card
+        file, contents = examined.file, examined.file.contents
         return WeightsReport(
-            **{each.name: getattr(card, each.name) for each in fields(card)},
+            **{each.name: getattr(examined.card, each.name) for each in fields(examined.card)},
             path=str(path),
             layout=file.layout,
             told_by=examined.told_by,
             networks=_network_reports(examined),
             leftovers=tuple(
-                Leftover(kind=kind, tensors=len(names), size=sum(file.tensors[name].nbytes for name in names))
-                for kind, names in examined.match.leftovers.items()
+                Leftover(kind=kind, tensors=len(names), size=sum(contents.tensors[name].nbytes for name in names))
+                for kind, names in examined.leftovers.items()
             ),
-            optimizer_size=file.optimizer_size,
-            other_entries=file.other_entries,
+            optimizer_size=contents.optimizer_size,
+            other_entries=contents.other_entries,
             size=sum(part.stat().st_size for part in file.files),
             digest=digest(file.files, full=full_digest),
         )
@@ -171,19 +153,19 @@ def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpa
 
 def _network_reports(examined: "_Examined") -> tuple[NetworkReport, ...]:
     """Counts, precisions and stored bytes of every network."""
-    shapes, reports = examined.networks.state_dict(), list[NetworkReport]()
-    for network in dict.fromkeys(name.partition(".")[0] for name in examined.match.sources):
-        dtypes = {name: examined.dtype(name) for name in examined.match.sources if name.partition(".")[0] == network}
-        reports.append(
-            NetworkReport(
-                name=network,
-                parameters=sum(shapes[name].numel() for name in dtypes),
-                tensors=len(dtypes),
-                dtypes=tuple(sorted({str(dtype).removeprefix("torch.") for dtype in dtypes.values()})),
-                size=sum(shapes[name].numel() * dtype.itemsize for name, dtype in dtypes.items()),
-            )
+    networks: dict[str, list[tuple[int, torch.dtype]]] = {}
+    for name, tensor in examined.networks.state_dict().items():
+        networks.setdefault(name.partition(".")[0], []).append((tensor.numel(), examined.dtype(name)))
+    return tuple(
+        NetworkReport(
+            name=network,
+            parameters=sum(count for count, _ in tensors),
+            tensors=len(tensors),
+            dtypes=tuple(sorted({str(dtype).removeprefix("torch.") for _, dtype in tensors})),
+            size=sum(count * dtype.itemsize for count, dtype in tensors),
         )
-    return tuple(reports)
+        for network, tensors in networks.items()
+    )
 
 
 def convert_weights(
@@ -194,17 +176,16 @@ def convert_weights(
     dtype: str | None = None,
     uncertainty_scale: float | None = None,
     overwrite: bool = False,
-    progress: Report | None = None,
     **told: Unpack[Told],
 ) -> WeightsReport:
-    """Write a checkpoint of any layout as our own `.safetensors`, tensor by tensor, or as GCD's `.ckpt`.
+    """Write a checkpoint of any layout as our own `.safetensors`, or as GCD's `.ckpt`.
 
     Args:
         layout: "gcd-node" leaves behind what inference does not use; "gcd-ckpt" is for the released code, see
-            `gcd_state`, and holds all weights in memory where `dtype` changes them.
-        dtype: store in this precision; else as it is. What computes in float32 (the decoder) is never narrowed.
+            `gcd_state`.
+        dtype: store in this precision, which holds all weights that change in memory; else as it is. What computes in
+            float32 (the decoder) is never narrowed.
         uncertainty_scale: what was measured, instead of what the file says; see `Traits`.
-        progress: called with (bytes written, bytes).
     Returns:
         The report of the new file.
     Raises: as `load_weights`; OptionError if `out` exists and `overwrite` is not set, or the layout cannot hold it.
@@ -213,23 +194,20 @@ def convert_weights(
     with _about(path):
         examined = _examined(Path(path), told)
         card = replace(examined.card, origin=digest(examined.file.files)[:12])
+        state = {name: _stored_as(name, tensor, wanted) for name, tensor in examined.state().items()}
     if uncertainty_scale is not None:
         card = replace(card, uncertainty_scale=uncertainty_scale)
-    state = {name: examined.tensor(name) for name in examined.match.sources}
-    dtypes = {name: _written_dtype(name, examined.dtype(name), wanted) for name in state}
     if layout == "gcd-ckpt":
-        state = {name: tensor.to(dtypes[name]) for name, tensor in state.items()}
         write_published(Path(out), state, card, carried=examined.carried, overwrite=overwrite)
     else:
-        metadata = card.to_metadata()
-        write_safetensors(Path(out), state, metadata, dtypes=dtypes, overwrite=overwrite, report=progress)
+        write_safetensors(Path(out), state, card.to_metadata(), overwrite=overwrite)
     return inspect_weights(out)
 
 
-def _written_dtype(name: str, stored: torch.dtype, wanted: torch.dtype | None) -> torch.dtype:
-    """The precision asked for; what computes in float32 is only ever widened."""
-    narrows = wanted is not None and name.partition(".")[0] in FULL_PRECISION and wanted.itemsize < stored.itemsize
-    return stored if wanted is None or narrows else wanted
+def _stored_as(name: str, tensor: Tensor, wanted: torch.dtype | None) -> Tensor:
+    """In the precision asked for; what computes in float32 is only ever widened."""
+    narrows = wanted is not None and name.partition(".")[0] in FULL_PRECISION and wanted.itemsize < tensor.itemsize
+    return tensor if wanted is None or narrows else tensor.to(wanted)
 
 
 def save_weights(networks: Networks | LiveNetworks, out: str | Path, card: Card, *, overwrite: bool = False) -> None:
@@ -281,48 +259,55 @@ def _about(path: str | Path) -> Generator[None]:
 class _Examined:
     """A checkpoint whose every weight has its place; `networks` is still empty.
 
-    card: what it says of itself, or what was worked out. told_by: who named the family.
+    card: what it says of itself, or what was worked out. told_by: who named the family. sources: for each of our
+    names, the file's. leftovers: by kind.
     """
 
     file: WeightsFile
     card: Card
     told_by: str | None
-    family: Family | None
     networks: Networks | LiveNetworks
-    match: Match
+    sources: dict[str, tuple[str, ...]]
+    leftovers: dict[str, list[str]]
 
-    def tensor(self, name: str) -> Tensor:
-        """Our parameter of that name, made of mapped tensors."""
-        source = self.match.sources[name]
-        return assembled([self.file.tensors[published] for published in source.names], source.form)
+    def state(self) -> dict[str, Tensor]:
+        """Our parameters, made of mapped tensors."""
+        held, axes = self.file.contents.tensors, {n: each.ndim for n, each in self.networks.state_dict().items()}
+        return {name: assembled(names, [held[n] for n in names], axes[name]) for name, names in self.sources.items()}
 
     def dtype(self, name: str) -> torch.dtype:
         """Precision our parameter of that name is stored in."""
-        return self.file.tensors[self.match.sources[name].names[0]].dtype
+        return self.file.contents.tensors[self.sources[name][0]].dtype
 
     @property
     def carried(self) -> dict[str, Tensor]:
         """Leftovers that its next owner may want."""
-        leftovers = self.match.leftovers
-        return {name: self.file.tensors[name] for kind in CARRIED for name in leftovers.get(kind, ())}
+        return {name: self.file.contents.tensors[name] for kind in CARRIED for name in self.leftovers.get(kind, ())}
 
 
 def _examined(path: Path, told: Told) -> _Examined:
     """Raises CheckpointError: the file does not fit, name by name. OptionError: what is told is impossible."""
     hints = Hints(**{key: told.get(key) for key in ("head_width", "image_heads", "frames")})
-    named = told.get("family")
-    option = Provenance(family=None if named is None else family_named(named).name, told_by="option")
+    option, metadata = Provenance(family=_family_name(told.get("family")), told_by="option"), Provenance()
     file = read_weights(path)
-    stated = Card.from_metadata(file.metadata) if CONFIG_KEY in file.metadata else None
-    known = combined(option, _told_by_card(stated), told_by_name(file.name), told_by_yaml(file.yaml))
-    config = _inferred(file, known, hints) if stated is None else _with_frames(stated.config, hints)
-    family = checked_family(known, config)
-    if stated is None and isinstance(config, ModelConfig):
-        config = at_trained_size(config, family)
+    naming, shapes = _NAMINGS[file.layout], shapes_of(file.contents.tensors)
+    stated = Card.from_metadata(file.contents.metadata) if CONFIG_KEY in file.contents.metadata else None
+    if stated is not None:
+        metadata = Provenance(family=_family_name(stated.family), move_time=stated.move_time, told_by="metadata")
+    known = combined(option, metadata, told_by_name(file.name), told_by_yaml(file.yaml))
+    if stated is None:
+        every = {each.name: getattr(hints, each.name) or getattr(file.hints, each.name) for each in fields(Hints)}
+        hints = Hints(**every | {"frames": every["frames"] or known.frames})
+        config = at_trained_size(infer_config(shapes, naming, hints), known)
+    else:
+        config = _with_frames(stated.config, hints)
+    require_family(known, config)
     networks = _empty(config)
-    levels = Levels.of(config) if isinstance(config, ModelConfig) else NO_LEVELS
-    match = match_weights(shapes_of(networks.state_dict()), shapes_of(file.tensors), _NAMINGS[file.layout], levels)
-    _require_usable(file, match)
+    expected = shapes_of(networks.state_dict())
+    levels = Levels.of(config) if isinstance(config, ModelConfig) else Levels()
+    sources = {name: published_names(name, naming, levels) or (name,) for name in expected}
+    leftovers = match_weights(sources, expected, shapes)
+    _require_usable({name: file.contents.tensors[name].dtype for names in sources.values() for name in names})
     last = config.frames - 1
     card = Card(
         name=file.name if stated is None or not stated.name else stated.name,
@@ -332,23 +317,13 @@ def _examined(path: Path, told: Told) -> _Examined:
         trained=stated is None or stated.trained,
         uncertainty_scale=None if stated is None else stated.uncertainty_scale,
     )
-    return _Examined(file=file, card=card, told_by=known.told_by, family=family, networks=networks, match=match)
+    return _Examined(
+        file=file, card=card, told_by=known.told_by, networks=networks, sources=sources, leftovers=leftovers
+    )
 
 
-def _told_by_card(card: Card | None) -> Provenance:
-    if card is None:
-        return Provenance()
-    family = None if card.family is None else family_named(card.family).name
-    return Provenance(family=family, move_time=card.move_time, told_by="metadata")
-
-
-def _inferred(file: WeightsFile, known: Provenance, hints: Hints) -> ModelConfig:
-    """What is told counts, then what stands beside the weights, then what the name says."""
-    names = ("head_width", "heads", "image_heads", "frames", "latent_scale")
-    every = {name: getattr(hints, name) or getattr(file.hints, name) for name in names}
-    hints = Hints(**every | {"frames": every["frames"] or known.frames})
-    levels = diffusers_levels(file.tensors) if file.layout == "diffusers" else gcd_levels(file.tensors)
-    return infer_config(shapes_of(file.tensors), _NAMINGS[file.layout], levels, hints)
+def _family_name(name: str | None) -> FamilyName | None:
+    return None if name is None else family_named(name).name
 
 
 def _with_frames(config: ModelConfig | LiveConfig, hints: Hints) -> ModelConfig | LiveConfig:
@@ -371,10 +346,9 @@ def _empty(config: ModelConfig | LiveConfig) -> Networks | LiveNetworks:
         raise CheckpointError(f"describes networks that cannot be built ({error}); it is damaged") from error
 
 
-def _require_usable(file: WeightsFile, match: Match) -> None:
+def _require_usable(dtypes: Mapping[str, torch.dtype]) -> None:
     """Quantised weights have the right names and shapes and mean nothing without their scales."""
-    used = [(name, file.tensors[name].dtype) for source in match.sources.values() for name in source.names]
-    bad = {name: str(dtype).removeprefix("torch.") for name, dtype in used if dtype not in _USABLE}
+    bad = {name: str(dtype).removeprefix("torch.") for name, dtype in dtypes.items() if dtype not in _USABLE}
     if bad:
         raise CheckpointError(
             f"{len(bad)} weights are stored as {', '.join(sorted(set(bad.values())))}, first: "

@@ -1,24 +1,42 @@
-"""A pickle reader that can rebuild tensors and nothing else.
+"""A torch zip read by a pickle reader that can rebuild tensors and nothing else.
 
-A checkpoint of somebody else may name any function of any module and ask to have it called. Here only tensor
-rebuilding is real; every other name becomes an inert placeholder, which takes whatever the file does to it and
-keeps none of it. So foreign classes (a trainer's callbacks, an option container) do not stop us, and nothing runs.
+A checkpoint of somebody else may name any function of any module and ask to have it called. Here only tensors are
+real, and made by our own code; every other name becomes an inert placeholder, which takes whatever the file does to it
+and keeps none of it. So foreign classes (a trainer's callbacks, an option container) do not stop us, and nothing runs.
 """
 
 import functools
 import io
 import pickle
+import struct
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, cast
 
 import torch
-from torch import Tensor
+from torch import UntypedStorage
 
 from gcd_model.errors import CheckpointError
-from gcd_model.weights.card import NOTES
+
+_LARGEST_PICKLE = 16 * 2**20
+"""Of a torch zip, in bytes; the pickle of a full-size training with its optimizer has two million."""
+SAVE_AGAIN = "load it where it was made and write it again with torch.save (torch 1.6 or newer)"
+_STORAGES = {
+    "DoubleStorage": torch.float64,
+    "FloatStorage": torch.float32,
+    "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16,
+    "LongStorage": torch.int64,
+    "IntStorage": torch.int32,
+    "ShortStorage": torch.int16,
+    "CharStorage": torch.int8,
+    "BoolStorage": torch.bool,
+    "ComplexFloatStorage": torch.complex64,
+    "ComplexDoubleStorage": torch.complex128,
+}
+"""What torch's typed storages hold; bytes for all others."""
 
 
 class Placeholder:
@@ -47,195 +65,103 @@ class Placeholder:
     __setstate__ = __setitem__ = append = extend = add = forget
 
 
-def _sealed(function: Callable[..., object]) -> object:
-    """The function as an object without attributes, which a pickle can call but not change."""
-
-    class Sealed:
-        __slots__ = ()
-
-        def __call__(self, *arguments: object) -> object:
-            return function(*arguments)
-
-    return Sealed()
-
-
-class UntypedBytes(Placeholder):
-    """The storage class of the newest dtypes, of which torch asks the dtype only."""
-
-    __slots__ = ()
-    dtype = torch.uint8
-
-
-def _data_of(data: object, *_rest: object) -> object:
-    """A parameter counts as its tensor."""
-    return data
-
-
-_DTYPES = (
-    *("float64", "float32", "float16", "bfloat16", "float8_e4m3fn", "float8_e5m2"),
-    *("int64", "int32", "int16", "int8", "uint8", "bool", "complex64", "complex128"),
-)
-_ALLOWED: dict[tuple[str, str], object] = {
-    ("collections", "OrderedDict"): OrderedDict,
-    ("torch", "Size"): torch.Size,
-    ("torch", "device"): torch.device,
-    ("torch._utils", "_rebuild_parameter"): _sealed(_data_of),
-    ("torch._utils", "_rebuild_parameter_with_state"): _sealed(_data_of),
-    ("torch.storage", "UntypedStorage"): UntypedBytes,
-    ("torch", "UntypedStorage"): UntypedBytes,
-    **{("torch", name): getattr(torch, name) for name in _DTYPES},
-}
-_REBUILDING = {("torch._utils", "_rebuild_tensor_v2"), ("torch._utils", "_rebuild_tensor_v3")}
-
-
-class RestrictedUnpickler(pickle.Unpickler):
-    """Unpickler whose names are tensor rebuilding or placeholders. torch itself adds the storages."""
-
-    def find_class(self, module_name: str, global_name: str, /) -> object:
-        """What a name of the file stands for. torch's own rebuilding is the only code that is looked up."""
-        if (module_name, global_name) in _REBUILDING:
-            return _sealed(super().find_class(module_name, global_name))
-        allowed = _ALLOWED.get((module_name, global_name))
-        return _placeholder_class(f"{module_name}.{global_name}") if allowed is None else allowed
-
-
-class RestrictedPickle:
-    """What `torch.load` takes as its pickle module."""
-
-    Unpickler = RestrictedUnpickler
-
-
-class _Census(pickle.Unpickler):
-    """Reads a pickle for nothing but the bytes it says its storages have, by key; every name is a placeholder."""
-
-    def __init__(self, pickled: bytes) -> None:
-        super().__init__(io.BytesIO(pickled))
-        self.claims: dict[str, int] = {}
-
-    def find_class(self, module_name: str, global_name: str, /) -> object:
-        """A placeholder."""
-        return _placeholder_class(global_name)
-
-    def persistent_load(self, pid: object) -> object:
-        """Takes down a storage: kind, class, key, place, number of elements."""
-        if isinstance(pid, tuple) and len(pid) == 5 and isinstance(pid[4], int):
-            width = _STORAGE_BYTES.get(getattr(pid[1], "origin", ""), 1)
-            self.claims[str(pid[2])] = max(self.claims.get(str(pid[2]), 0), width * pid[4])
-        return Placeholder()
-
-
-def check_storages(archive: zipfile.ZipFile) -> None:
-    """Whether every record of an open torch zip holds what its pickle claims: a short one would be read past its end.
-
-    Raises: CheckpointError if not; whatever a damaged pickle raises.
-    """
-    entries = {entry.filename: entry.file_size for entry in archive.infolist()}
-    pickled = next(name for name in entries if name.endswith("/data.pkl"))
-    if entries[pickled] > _LARGEST_PICKLE:
-        raise CheckpointError(f"its pickle has {entries[pickled]} bytes, more than {_LARGEST_PICKLE}: refused")
-    census = _Census(archive.read(pickled))
-    census.load()
-    for key, claimed in census.claims.items():
-        there = entries.get(f"{pickled.removesuffix('data.pkl')}data/{key}", 0)
-        if there < claimed:
-            raise CheckpointError(
-                f"tensor record {key} should hold {claimed} bytes and holds {there}: damaged, refused"
-            )
-
-
-_LARGEST_PICKLE = 16 * 2**20
-"""Of a torch zip, in bytes; the pickle of a full-size training with its optimizer has two million."""
-_STORAGE_BYTES = {
-    **dict.fromkeys(("DoubleStorage", "LongStorage", "ComplexFloatStorage"), 8),
-    **dict.fromkeys(("FloatStorage", "IntStorage"), 4),
-    **dict.fromkeys(("HalfStorage", "BFloat16Storage", "ShortStorage"), 2),
-    "ComplexDoubleStorage": 16,
-}
-"""Bytes per element of torch's typed storages; 1 for all others."""
-
-
 @functools.lru_cache(maxsize=4096)
 def _placeholder_class(origin: str) -> type[Placeholder]:
     return type("Placeholder", (Placeholder,), {"__slots__": (), "origin": origin})
 
 
-# --- what a Lightning checkpoint holds -------------------------------------------------------------------------------
-
-
-_WEIGHTS, _OPTIMIZER, _FACTS = "state_dict", "optimizer_states", "hyper_parameters"
-
-
 @dataclass(frozen=True, slots=True)
-class Contents:
-    """tensors: by published name. optimizer_size: bytes. other_entries: names of further top-level entries.
+class _Storage:
+    content: UntypedStorage
+    dtype: torch.dtype
 
-    notes: what `gcd_layout` left among the hyper-parameters, empty in files of others.
+
+class _Rebuild:
+    """What the names of torch's rebuilding stand for; without attributes, so that a pickle can call but not change it.
+
+    Called with a storage and its tensor's place, shape and strides it gives the tensor; with a tensor, that tensor.
     """
 
-    tensors: dict[str, Tensor]
-    optimizer_size: int = 0
-    other_entries: tuple[str, ...] = ()
-    notes: dict[str, str] = field(default_factory=dict[str, str])
+    __slots__ = ()
+
+    def __call__(
+        self, held: object, start: int = 0, shape: tuple[int, ...] = (), strides: tuple[int, ...] = (), *more: object
+    ) -> object:
+        if not isinstance(held, _Storage):
+            return held  # a parameter counts as its tensor
+        dtype = next((each for each in more if isinstance(each, torch.dtype)), held.dtype)
+        return torch.empty(0, dtype=dtype).set_(held.content, start, shape, strides)
 
 
-def contents(root: object) -> Contents:
-    """Sort out what a checkpoint file holds at its root: `state_dict` and companions, or tensors alone.
+class _Reader(pickle.Unpickler):
+    """Reads the pickle of an open torch zip; storages are views of one private mapping of the file."""
 
-    Raises:
-        CheckpointError: no weights, or something else than tensors among them. Elsewhere anything may stand.
-    """
-    if not isinstance(root, dict):
-        raise CheckpointError(f"holds {_what(root)}, wanted a dictionary with the entry {_WEIGHTS!r}")
-    entries = cast("dict[object, object]", root)
-    if _WEIGHTS not in entries:
-        if not any(isinstance(value, Tensor) for value in entries.values()):
-            names = ", ".join(str(key) for key in list(entries)[:5])
-            raise CheckpointError(f"has no entry {_WEIGHTS!r} (found: {names}); it holds no weights")
-        return Contents(_weights(entries))
-    others = tuple(str(key) for key in entries if key not in (_WEIGHTS, _OPTIMIZER))
-    size = sum(tensor.numel() * tensor.element_size() for tensor in _tensors(entries.get(_OPTIMIZER), set()))
-    return Contents(_weights(entries[_WEIGHTS]), size, others, _notes(entries.get(_FACTS)))
+    def __init__(self, path: Path, file: BinaryIO, archive: zipfile.ZipFile, folder: str) -> None:
+        super().__init__(io.BytesIO(archive.read(f"{folder}data.pkl")))
+        self._file, self._archive, self._folder = file, archive, folder
+        self._bytes = UntypedStorage.from_file(str(path), shared=False, nbytes=path.stat().st_size)
+        self._storages: dict[str, UntypedStorage] = {}
 
+    def find_class(self, module_name: str, global_name: str, /) -> object:
+        """What a name of the file stands for; nothing is looked up but torch's dtypes."""
+        if (module_name, global_name) == ("collections", "OrderedDict"):
+            return OrderedDict
+        if module_name == "torch._utils" and global_name in _REBUILDING:
+            return _Rebuild()
+        dtype = vars(torch).get(global_name) if module_name == "torch" else None
+        return dtype if isinstance(dtype, torch.dtype) else _placeholder_class(f"{module_name}.{global_name}")
 
-def _notes(facts: object) -> dict[str, str]:
-    """Our notes, if they are what we write: text to text."""
-    noted = cast("dict[object, object]", facts).get(NOTES) if isinstance(facts, dict) else None
-    texts = cast("dict[object, object]", noted).items() if isinstance(noted, dict) else ()
-    return {key: value for key, value in texts if isinstance(key, str) and isinstance(value, str)}
+    def persistent_load(self, pid: object) -> object:
+        """A storage, by (kind, class, key, device, number of elements)."""
+        match pid:
+            case ("storage", kind, str(key), _, int(count)):
+                name = str(getattr(kind, "origin", "")).rpartition(".")[2]
+                dtype = _STORAGES.get(name, torch.uint8)
+                return _Storage(self._mapped(key, dtype.itemsize * count), dtype)
+            case _:
+                raise CheckpointError(f"its pickle refers to {pid!r}, which is no tensor: refused")
 
-
-def _weights(state: object) -> dict[str, Tensor]:
-    if not isinstance(state, dict):
-        raise CheckpointError(f"its {_WEIGHTS} is {_what(state)}, wanted a dictionary of tensors")
-    found: dict[str, Tensor] = {}
-    for name, value in cast("dict[object, object]", state).items():
-        if not isinstance(name, str) or not isinstance(value, Tensor):
+    def _mapped(self, key: str, claimed: int) -> UntypedStorage:
+        """The record's bytes. A short one would be read past its end."""
+        if key not in self._storages:
+            entry = self._archive.getinfo(f"{self._folder}data/{key}")
+            self._file.seek(entry.header_offset)
+            name, extra = struct.unpack("<26x2H", self._file.read(30))
+            start = entry.header_offset + 30 + name + extra
+            self._storages[key] = cast(UntypedStorage, self._bytes[start : start + entry.file_size])
+        there = self._storages[key].nbytes()
+        if there < claimed:
             raise CheckpointError(
-                f"{_what(value)} stands among the weights, at {name!r}: refused; wanted are tensors only"
+                f"tensor record {key} should hold {claimed} bytes and holds {there}: damaged, refused"
             )
-        claimed, there = value.numel() * value.element_size(), value.untyped_storage().nbytes()
-        if claimed > there:  # a few bytes can claim to be a huge tensor by repeating themselves; real weights do not
-            raise CheckpointError(f"{name} claims {claimed} bytes and stores {there}: refused")
-        found[name] = value
-    return found
+        return self._storages[key]
 
 
-def _what(value: object) -> str:
-    if isinstance(value, Placeholder):
-        return f"an object of {value.origin}"
-    if isinstance(value, type):
-        return f"the class {getattr(value, 'origin', value.__name__)}"
-    return f"a {type(value).__name__}"
+_REBUILDING = (
+    "_rebuild_tensor_v2",
+    "_rebuild_tensor_v3",
+    "_rebuild_parameter",
+    "_rebuild_parameter_with_state",
+)
 
 
-def _tensors(value: object, seen: set[int]) -> Iterator[Tensor]:
-    """All in nested containers, each once."""
-    if id(value) in seen:
-        return
-    seen.add(id(value))
-    if isinstance(value, Tensor):
-        yield value
-    elif isinstance(value, Mapping | list | tuple):
-        items = value.values() if isinstance(value, Mapping) else value
-        for item in cast("Iterable[object]", items):
-            yield from _tensors(item, seen)
+def read_pickle(path: Path, file: BinaryIO) -> object:
+    """What stands at the root of a torch zip, which is open.
+
+    Raises: CheckpointError if it is no checkpoint that can be mapped; whatever a damaged zip or pickle raises.
+    """
+    with zipfile.ZipFile(file) as archive:
+        entries = {entry.filename: entry for entry in archive.infolist()}
+        if any(name.endswith("constants.pkl") for name in entries):
+            raise CheckpointError("is a TorchScript program, which would be executed; wanted are weights only")
+        pickled = next((name for name in entries if name.partition("/")[2] == "data.pkl"), None)
+        if pickled is None:
+            raise CheckpointError("is a zip without data.pkl, not a torch checkpoint; unpack it if it only wraps one")
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries.values()):
+            raise CheckpointError(f"is a zip whose tensors are compressed and cannot be mapped; {SAVE_AGAIN}")
+        if entries[pickled].file_size > _LARGEST_PICKLE:
+            raise CheckpointError(f"its pickle has {entries[pickled].file_size} bytes, more than {_LARGEST_PICKLE}")
+        folder = pickled.removesuffix("data.pkl")
+        if f"{folder}byteorder" in entries and archive.read(f"{folder}byteorder") != b"little":
+            raise CheckpointError(f"holds numbers with the large end first; {SAVE_AGAIN}")
+        return _Reader(path, file, archive, folder).load()

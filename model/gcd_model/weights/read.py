@@ -1,50 +1,61 @@
 """Weight files mapped and told apart by their content: the only place that opens checkpoints to read.
 
-Nothing in a file is ever executed, see `RestrictedPickle`.
+Nothing in a file is ever executed, see `pickle.py`.
 """
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import msgspec
-import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from gcd_model.errors import CheckpointError, FileError
 from gcd_model.small_files import decode_json, read_small
-from gcd_model.weights.card import ADAPTER_KEY, CONFIG_KEY, Layout
+from gcd_model.weights.card import ADAPTER_KEY, CONFIG_KEY, NOTES, Layout, unpacked
 from gcd_model.weights.infer import Hints
 from gcd_model.weights.names import GCD_UNET
-from gcd_model.weights.pickle import Contents, RestrictedPickle, check_storages, contents
+from gcd_model.weights.pickle import SAVE_AGAIN, Placeholder, read_pickle
 
 _LARGEST_YAML = 1 << 18
 _LARGEST_HEADER = 1 << 24  # SVD has 0.4 MB; the library takes 100 MB, and builds gigabytes from them
 _HEAD = 512
 _FETCH_AGAIN = "fetch it again and compare its size with the publisher's"
-_SAVE_AGAIN = "load it where it was made and write it again with torch.save (torch 1.6 or newer)"
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What a single file holds: mapped tensors by published name, and what comes with them.
+
+    metadata: our notes of a pickle, or a safetensors file's own. optimizer_size: bytes. other_entries: names of further
+    top-level entries of a pickle.
+    """
+
+    tensors: Mapping[str, Tensor]
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    is_pickle: bool = False
+    optimizer_size: int = 0
+    other_entries: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WeightsFile:
-    """A checkpoint as it lies on the disk: mapped tensors by published name, and what comes with them.
+    """A checkpoint as it lies on the disk.
 
     name: of the file, without suffix, or of the folder. files: all that hold weights. yaml: text of the
-    configuration beside it, or "". See `WeightsReport` for the others.
+    configuration beside it, or "".
     """
 
     name: str
     layout: Layout
     files: tuple[Path, ...]
-    tensors: Mapping[str, Tensor]
-    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    contents: Contents
     hints: Hints = field(default_factory=Hints)
     yaml: str = ""
-    optimizer_size: int = 0
-    other_entries: tuple[str, ...] = ()
 
 
 def read_weights(path: Path) -> WeightsFile:
@@ -53,63 +64,57 @@ def read_weights(path: Path) -> WeightsFile:
         raise CheckpointError("there is no such file or folder; check the path")
     if path.is_dir():
         return _read_folder(path)
-    held, metadata = read_file(path)
-    return WeightsFile(
-        name=path.stem,
-        layout=_layout_of(held.tensors, metadata),
-        files=(path,),
-        tensors=held.tensors,
-        metadata=held.notes if metadata is None else metadata,
-        yaml=_yaml_beside(path),
-        optimizer_size=held.optimizer_size,
-        other_entries=held.other_entries,
-    )
+    contents, yaml = read_file(path), path.with_suffix(".yaml")
+    text = ""
+    if yaml.is_file():  # the training configuration a published checkpoint comes with
+        with yaml.open("rb") as file:
+            text = file.read(_LARGEST_YAML).decode("utf-8", errors="replace")
+    return WeightsFile(name=path.stem, layout=_layout_of(contents), files=(path,), contents=contents, yaml=text)
 
 
-def _layout_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None) -> Layout:
-    """Layout of a single file; metadata: of safetensors, None for a pickle."""
-    if metadata is not None and ADAPTER_KEY in metadata:
+def _layout_of(contents: Contents) -> Layout:
+    """Layout of a single file."""
+    names = contents.tensors
+    if not contents.is_pickle and ADAPTER_KEY in contents.metadata:
         raise CheckpointError(
             "is an adapter, which is nothing without its base: give the base, and this as the adapter; or join them "
             "with `gcd-train lora merge`"
         )
-    if metadata is not None and CONFIG_KEY in metadata:
+    if not contents.is_pickle and CONFIG_KEY in contents.metadata:
         return "gcd-node"
-    if any(name.startswith(f"{GCD_UNET}.") for name in tensors):
-        return "gcd-ckpt" if metadata is None else "sgm-safetensors"
-    if any(name.startswith(("down_blocks.", "vision_model.", "encoder.down_blocks.")) for name in tensors):
+    if any(name.startswith(f"{GCD_UNET}.") for name in names):
+        return "gcd-ckpt" if contents.is_pickle else "sgm-safetensors"
+    if any(name.startswith(("down_blocks.", "vision_model.", "encoder.down_blocks.")) for name in names):
         raise CheckpointError(
             "is one part of a diffusers model; give the folder that holds unet, vae and image_encoder"
         )
-    first = ", ".join(list(tensors)[:5]) or "none"
     raise CheckpointError(
-        f"holds {len(tensors)} tensors of no layout known here, first: {first}; wanted are names of GCD or Stable "
-        f"Video Diffusion ({GCD_UNET}...), a diffusers folder or a file of `gcd-node weights convert`"
+        f"holds {len(names)} tensors of no layout known here, first: {', '.join(list(names)[:5]) or 'none'}; wanted "
+        f"are names of GCD or Stable Video Diffusion ({GCD_UNET}...), a diffusers folder or a file of "
+        "`gcd-node weights convert`"
     )
-
-
-def _yaml_beside(path: Path) -> str:
-    """Text of the training configuration a published checkpoint comes with, or "" """
-    yaml = path.with_suffix(".yaml")
-    if not yaml.is_file():
-        return ""
-    with yaml.open("rb") as file:
-        return file.read(_LARGEST_YAML).decode("utf-8", errors="replace")
 
 
 # --- a single file ---------------------------------------------------------------------------------------------------
 
 
-def read_file(path: Path) -> tuple[Contents, dict[str, str] | None]:
-    """What a single file holds, and the metadata if it is safetensors. Raises CheckpointError, OSError."""
-    if _is_zip(path):
-        return _read_zip(path), None
+def read_file(path: Path) -> Contents:
+    """What a single file holds. Raises CheckpointError, OSError."""
     try:
+        if _is_zip(path):
+            with path.open("rb") as opened:
+                return _contents(read_pickle(path, opened))
         with safe_open(path, framework="pt", device="cpu") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no dict
-            return Contents(tensors), file.metadata() or {}
+            return Contents(tensors, unpacked(file.metadata() or {}))
+    except (CheckpointError, OSError):
+        raise
     except SafetensorError as error:
         raise CheckpointError(f"is damaged or truncated safetensors ({error}); {_FETCH_AGAIN}") from error
+    except zipfile.BadZipFile as error:
+        raise CheckpointError(f"is a truncated or damaged torch zip ({error}); {_FETCH_AGAIN}") from error
+    except Exception as error:  # a damaged or hostile pickle can raise anything at all
+        raise CheckpointError(f"cannot be unpickled ({type(error).__name__}: {error}); {_FETCH_AGAIN}") from error
 
 
 def _is_zip(path: Path) -> bool:
@@ -119,16 +124,16 @@ def _is_zip(path: Path) -> bool:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    if size == 0:
-        raise CheckpointError(f"is empty (0 bytes); {_FETCH_AGAIN}")
     if head.startswith(b"PK\x03\x04"):
         return True
+    if size == 0:
+        raise CheckpointError(f"is empty (0 bytes); {_FETCH_AGAIN}")
     if head.startswith(b"version https://git-lfs"):
         raise CheckpointError("is a Git LFS pointer, not the weights themselves; run `git lfs pull` where it lies")
     if head.lstrip().lower().startswith((b"<!doctype", b"<html", b"<?xml")):
         raise CheckpointError("is a web page, not weights: the download needs another address or a login")
     if head.startswith((b"\x80\x02", b"\x80\x03", b"\x80\x04")) or head[257:262] == b"ustar":
-        raise CheckpointError(f"was written in torch's old format, before zip, and cannot be mapped; {_SAVE_AGAIN}")
+        raise CheckpointError(f"was written in torch's old format, before zip, and cannot be mapped; {SAVE_AGAIN}")
     if head[8:9] != b"{":
         raise CheckpointError(
             "is neither a torch zip (.ckpt) nor safetensors; wanted are GCD's .ckpt, svd.safetensors, a diffusers "
@@ -142,32 +147,58 @@ def _is_zip(path: Path) -> bool:
     return False
 
 
-def _read_zip(path: Path) -> Contents:
-    """Tensors of a torch zip: views of one private mapping of the file, whatever else stands in it."""
-    if path.suffix == ".safetensors":  # torch goes by the suffix
-        raise CheckpointError("is a torch zip under the name .safetensors; rename it to .ckpt")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            _check_archive(archive.infolist())
-            check_storages(archive)
-        reader = cast("Any", RestrictedPickle)
-        return contents(torch.load(str(path), map_location="cpu", mmap=True, weights_only=False, pickle_module=reader))
-    except CheckpointError:
-        raise
-    except zipfile.BadZipFile as error:
-        raise CheckpointError(f"is a truncated or damaged torch zip ({error}); {_FETCH_AGAIN}") from error
-    except Exception as error:  # a damaged or hostile pickle can raise anything at all
-        raise CheckpointError(f"cannot be unpickled ({type(error).__name__}: {error}); {_FETCH_AGAIN}") from error
+_WEIGHTS, _OPTIMIZER = "state_dict", "optimizer_states"
 
 
-def _check_archive(entries: Sequence[zipfile.ZipInfo]) -> None:
-    """Whether a zip is a checkpoint torch can map. Raises CheckpointError if not."""
-    if any(entry.filename.endswith("constants.pkl") for entry in entries):
-        raise CheckpointError("is a TorchScript program, which would be executed; wanted are weights only")
-    if "data.pkl" not in {entry.filename.partition("/")[2] for entry in entries}:
-        raise CheckpointError("is a zip without data.pkl, not a torch checkpoint; unpack it if it only wraps one")
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-        raise CheckpointError(f"is a zip whose tensors are compressed and cannot be mapped; {_SAVE_AGAIN}")
+def _contents(root: object) -> Contents:
+    """Sort out what a pickle holds at its root: `state_dict` and companions, or tensors alone.
+
+    Raises:
+        CheckpointError: no weights, or something else than tensors among them. Elsewhere anything may stand.
+    """
+    if not isinstance(root, dict):
+        raise CheckpointError(f"holds {_what(root)}, wanted a dictionary with the entry {_WEIGHTS!r}")
+    entries = cast("dict[object, object]", root)
+    if _WEIGHTS not in entries:
+        if not any(isinstance(value, Tensor) for value in entries.values()):
+            names = ", ".join(str(key) for key in list(entries)[:5])
+            raise CheckpointError(f"has no entry {_WEIGHTS!r} (found: {names}); it holds no weights")
+        return Contents(_weights(entries), is_pickle=True)
+    moments = {id(leaf): leaf for leaf in pytree.tree_leaves(entries.get(_OPTIMIZER)) if isinstance(leaf, Tensor)}
+    facts = entries.get("hyper_parameters")
+    notes = cast("dict[object, object]", facts).get(NOTES) if isinstance(facts, dict) else None
+    texts = cast("dict[object, object]", notes).items() if isinstance(notes, dict) else ()
+    return Contents(
+        _weights(entries[_WEIGHTS]),
+        metadata={key: value for key, value in texts if isinstance(key, str) and isinstance(value, str)},
+        is_pickle=True,
+        optimizer_size=sum(tensor.nbytes for tensor in moments.values()),
+        other_entries=tuple(str(key) for key in entries if key not in (_WEIGHTS, _OPTIMIZER)),
+    )
+
+
+def _weights(state: object) -> dict[str, Tensor]:
+    if not isinstance(state, dict):
+        raise CheckpointError(f"its {_WEIGHTS} is {_what(state)}, wanted a dictionary of tensors")
+    found: dict[str, Tensor] = {}
+    for name, value in cast("dict[object, object]", state).items():
+        if not isinstance(name, str) or not isinstance(value, Tensor):
+            raise CheckpointError(
+                f"{_what(value)} stands among the weights, at {name!r}: refused; wanted are tensors only"
+            )
+        there = value.untyped_storage().nbytes()
+        if value.nbytes > there:  # a few bytes can claim to be a huge tensor by repeating themselves; real ones do not
+            raise CheckpointError(f"{name} claims {value.nbytes} bytes and stores {there}: refused")
+        found[name] = value
+    return found
+
+
+def _what(value: object) -> str:
+    if isinstance(value, Placeholder):
+        return f"an object of {value.origin}"
+    if isinstance(value, type):
+        return f"the class {getattr(value, 'origin', value.__name__)}"
+    return f"a {type(value).__name__}"
 
 
 # --- a diffusers folder ----------------------------------------------------------------------------------------------
@@ -179,19 +210,12 @@ _PARTS = ("unet", "vae", "image_encoder")
 """The folders that hold weights; the others are not needed."""
 
 
-class _UNetFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """Of unet/config.json, which has many more entries: what weights do not tell."""
+class _Config(msgspec.Struct, frozen=True, kw_only=True):
+    """Of the three config.json, which have many more entries: what weights do not tell."""
 
     num_attention_heads: int | tuple[int, ...] | None = None
     num_frames: int | None = None
-
-
-class _VAEFacts(msgspec.Struct, frozen=True, kw_only=True):
     scaling_factor: float | None = None
-
-
-class _ImageFacts(msgspec.Struct, frozen=True, kw_only=True):
-    num_attention_heads: int | None = None
     hidden_act: str = "gelu"
 
 
@@ -209,12 +233,22 @@ def _read_folder(path: Path) -> WeightsFile:
         for file in _part_files(path / part):
             files.append(file)
             try:
-                tensors |= {f"{part}/{name}": tensor for name, tensor in read_file(file)[0].tensors.items()}
+                tensors |= {f"{part}/{name}": tensor for name, tensor in read_file(file).tensors.items()}
             except CheckpointError as error:
                 raise CheckpointError(f"its file {part}/{file.name} {error}") from error
-    return WeightsFile(
-        name=path.resolve().name, layout="diffusers", files=tuple(files), tensors=tensors, hints=_folder_hints(path)
+    unet, vae, tower = (_facts(path / part / "config.json", _Config) for part in _PARTS)
+    if tower.hidden_act != "gelu":
+        raise CheckpointError(f"its image tower has activation {tower.hidden_act!r}; supported is 'gelu'")
+    if not isinstance(tower.num_attention_heads, int | None):
+        raise CheckpointError("its image_encoder/config.json gives heads of several levels, wanted is one number")
+    hints = Hints(
+        heads=unet.num_attention_heads,
+        image_heads=tower.num_attention_heads,
+        frames=unet.num_frames,
+        latent_scale=vae.scaling_factor,
     )
+    name = path.resolve().name
+    return WeightsFile(name=name, layout="diffusers", files=tuple(files), contents=Contents(tensors), hints=hints)
 
 
 def _part_files(folder: Path) -> list[Path]:
@@ -249,21 +283,6 @@ def _part_files(folder: Path) -> list[Path]:
             f"its folder {folder.name} lacks {len(absent)} shards, first: {absent[0]}; {_FETCH_AGAIN}"
         )
     return [folder / shard for shard in shards]
-
-
-def _folder_hints(path: Path) -> Hints:
-    """What the three config.json files tell; each may be absent."""
-    unet = _facts(path / "unet" / "config.json", _UNetFacts)
-    vae = _facts(path / "vae" / "config.json", _VAEFacts)
-    tower = _facts(path / "image_encoder" / "config.json", _ImageFacts)
-    if tower.hidden_act != "gelu":
-        raise CheckpointError(f"its image tower has activation {tower.hidden_act!r}; supported is 'gelu'")
-    return Hints(
-        heads=unet.num_attention_heads,
-        image_heads=tower.num_attention_heads,
-        frames=unet.num_frames,
-        latent_scale=vae.scaling_factor,
-    )
 
 
 def _facts(file: Path, kind: type[Facts]) -> Facts:

@@ -1,5 +1,6 @@
 """Weights: adapters joined with their bases, and how the families of checkpoints were trained."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,7 +33,7 @@ def merge(
 ) -> None:
     """Join an adapter with its base to plain weights. OUT appears whole or not at all."""
     with errors_shown():
-        from gcd_model.weights.card import Card, precision
+        from gcd_model.weights.card import precision
         from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
         from gcd_model.weights.save import write_published
 
@@ -40,8 +41,7 @@ def merge(
         start = load_weights(base, ask_family=False)
         joined = load_adapted(start, read_adapter(adapter))
         networks = joined.diffusion if wanted is None else joined.diffusion.to(wanted)
-        family = None if joined.family is None else joined.family.name
-        card = Card(name=joined.name, config=networks.config, family=family, move_time=joined.move_time)
+        card = replace(joined.card, trained=True, origin="")
         if layout == "gcd-ckpt":
             write_published(out, networks.state_dict(), card, carried=start.carried, overwrite=overwrite)
         else:

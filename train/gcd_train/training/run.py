@@ -228,7 +228,7 @@ class Trainer:
             move_time=recipe.data.goal_frame(self._config.frames),
             updates=updates,
             recipe=recipe.export,
-            leftovers=lambda: carried_leftovers(recipe.model),
+            leftovers=lambda: carried_leftovers(recipe.model, self._config),
             adapter=self._adapter if recipe.model.train == "lora" else None,
         )
         export(networks, self._folder, job, self._validation())

@@ -80,9 +80,9 @@ def run_config(recipe: Recipe) -> ModelConfig:
     if teacher.family not in (None, family):
         raise RecipeError(f"{weights} is of the family {teacher.family.name}; set model.family to it")
     goal = recipe.data.goal_frame(config.frames)
-    if teacher.move_time != goal:
+    if teacher.card.move_time != goal:
         raise RecipeError(
-            f"{weights} is at its goal in frame {teacher.move_time}, the recipe's [data] says frame {goal}; set "
+            f"{weights} is at its goal in frame {teacher.card.move_time}, the recipe's [data] says frame {goal}; set "
             "data.path, or data.move_time"
         )
     return student_config(config, student)
@@ -273,7 +273,7 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     if ":" not in recipe.weights and not Path(recipe.weights).exists():
         raise RecipeError(f"model.weights, {recipe.weights}, is not there; give its place: --set model.weights=FILE")
     networks = fresh_networks(config, seed)
-    loaded = loaded_base(recipe.weights)
+    loaded = loaded_base(recipe.weights, config)
     try:
         over = carried_over(loaded.diffusion, config, anew=DIFFUSION if recipe.scratch else ())
     except CheckpointError as error:
@@ -284,11 +284,17 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     return networks
 
 
-def carried_leftovers(recipe: ModelRecipe) -> Mapping[str, Tensor]:
+def carried_leftovers(recipe: ModelRecipe, config: ModelConfig) -> Mapping[str, Tensor]:
     """Weights of the file training started from that nothing here uses; see gcd_model.weights.save."""
-    return {} if recipe.weights is None else loaded_base(recipe.weights).carried
+    return {} if recipe.weights is None else loaded_base(recipe.weights, config).carried
 
 
-def loaded_base(path: str) -> LoadedWeights:
-    """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError."""
-    return load_weights(weights_path(path), ask_family=False)
+def loaded_base(path: str, config: ModelConfig | None = None) -> LoadedWeights:
+    """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError.
+
+    config: what it is to be, for heads, which published layouts do not tell.
+    """
+    if config is None:
+        return load_weights(weights_path(path), ask_family=False)
+    heads = None if config.image_encoder is None else config.image_encoder.heads
+    return load_weights(weights_path(path), ask_family=False, head_width=config.unet.head_width, image_heads=heads)
