@@ -18,8 +18,7 @@ from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_train.data.batches import EncodedBatches, SampleBatches
-from gcd_train.data.latents import LatentClips, LatentRows
-from gcd_train.data.latents_writer import LatentsJob, encode_clips
+from gcd_train.data.latents import Encodings, LatentClips, LatentRows
 from gcd_train.data.loader import LoadedBatch
 from gcd_train.data.open import DataPlaces, RunData, open_data
 from gcd_train.data.sample import Clips, MadeClips, Sample, collate, to_network
@@ -28,7 +27,7 @@ from gcd_train.errors import DataError, Interrupted
 from gcd_train.recipe import ClassWeightsName, Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
 from gcd_train.stop import StopSignal
-from gcd_train.training.conditioner import Conditioner, mirrored_path
+from gcd_train.training.conditioner import mirrored_path
 from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.monitor import RunFolder
@@ -216,20 +215,17 @@ KINDS = {
 def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
     """Latents of clips by a random autoencoder."""
     config = model_config(recipe.model)
-    assert recipe.latents is not None
-    job = LatentsJob(
-        folder=path,
-        networks=random_networks(config, seed=5),
-        clips=clips,
-        recipe=recipe.latents,
-        conditioner=Conditioner(config, recipe.unet, PRECISION, FAMILIES[recipe.model.family]),
-        class_weights=COLOUR_WEIGHTS[recipe.unet.loss.class_weights],
+    work = Encodings(
+        recipe=msgspec.structs.replace(recipe, seed=1),
+        config=config,
+        family=FAMILIES[recipe.model.family],
         precision=PRECISION,
-        seed=1,
-        identity="test",
+        clips=clips,
+        folder=path,
+        shared=None,
         stop=Never(),
     )
-    encode_clips(job)
+    work.encode(random_networks(config, seed=5))
     return LatentClips.open(path)
 
 
