@@ -154,7 +154,7 @@ def test_batches_tell_each_clip_its_own_frame_rate(folder: Path) -> None:
 
 def test_a_job_travels_to_another_process(tmp_path: Path) -> None:
     write_driving(tmp_path, 3, frames=2)
-    data = ParallelDomain4D.open(tmp_path, cameras=tuple(DRIVING_POSES))
+    data = ParallelDomain4D(tmp_path, cameras=tuple(DRIVING_POSES))
     pictures = DrivingPictures(data, CLIP, PictureOptions(size=(WIDTH, HEIGHT)))
     job = CacheJob(folder=tmp_path, pictures=pictures, choice=CHOICE, identity=tiny_identity())
     arrived = pickle.loads(pickle.dumps(job))
@@ -281,7 +281,7 @@ def ran(*arguments: object) -> tuple[int, str]:
 def test_the_command_caches_a_set_in_the_published_layout_and_then_has_nothing_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ParallelDomain4D.open.__func__, "__kwdefaults__", _three_cameras())
+    monkeypatch.setattr(ParallelDomain4D.__init__, "__kwdefaults__", _three_cameras())
     scene = write_driving(tmp_path / "set", 3, frames=16)
     broken = scene / "rgb" / "camera0" / f"{10 * 0 + 5:018d}.png"
     broken.write_bytes(broken.read_bytes()[:40])
@@ -315,7 +315,7 @@ def test_the_command_caches_a_set_in_the_published_layout_and_then_has_nothing_t
 
 
 def _three_cameras() -> dict[str, object]:
-    told = dict(ParallelDomain4D.open.__func__.__kwdefaults__)
+    told = dict(ParallelDomain4D.__init__.__kwdefaults__)
     return told | {"cameras": tuple(DRIVING_POSES)}
 
 

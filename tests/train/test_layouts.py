@@ -12,9 +12,8 @@ import torch
 from box_world import HFOV_DEG, box_scene
 
 from gcd_model.geometry import Intrinsics, sphere_poses
-from gcd_train.errors import DataError
-from gcd_train.layouts import encodings, kubric4d, parallel_domain4d
-from gcd_train.layouts.encodings import (
+from gcd_train.data import encodings, kubric4d, parallel_domain4d
+from gcd_train.data.encodings import (
     FAR_M,
     NEAR_M,
     SKY_M,
@@ -25,7 +24,8 @@ from gcd_train.layouts.encodings import (
     stored_depth,
     with_sky,
 )
-from gcd_train.layouts.kubric4d import (
+from gcd_train.data.files import SceneFiles
+from gcd_train.data.kubric4d import (
     InstanceTracks,
     Kubric4DWriter,
     camera_metadata,
@@ -34,8 +34,8 @@ from gcd_train.layouts.kubric4d import (
     segment_ids,
     view_metadata,
 )
-from gcd_train.layouts.manifest import SceneFiles
-from gcd_train.layouts.parallel_domain4d import ParallelDomain4DWriter, calibration, ontology
+from gcd_train.data.parallel_domain4d import ParallelDomain4DWriter, calibration, ontology
+from gcd_train.errors import DataError
 from gcd_train.scenes.description import rotations
 from gcd_train.scenes.driving import ONTOLOGY
 from gcd_train.scenes.driving.classes import Label
@@ -63,12 +63,12 @@ def picture(path: Path) -> Any:
 class TestNames:
     def test_kubric4d_as_published(self) -> None:
         scene = Path("data") / kubric4d.scene_name(42)
-        assert str(kubric4d.metadata_path(scene, 3)) == "data/scn00042/scn00042_p0_v3.json"
-        path = kubric4d.frame_path(scene, 15, "depth", 7)
+        assert str(kubric4d.metadata_path(scene, "view3")) == "data/scn00042/scn00042_p0_v3.json"
+        path = kubric4d.frame_path(scene, "view15", "depth", 7)
         assert str(path) == "data/scn00042/frames_p0_v15/depth_00007.tiff"
-        assert kubric4d.frame_path(scene, 0, "rgba", 59).name == "rgba_00059.png"
-        assert kubric4d.frame_path(scene, 0, "rgba", 59, compact=True).name == "rgba_00059.webp"
-        assert kubric4d.frame_path(scene, 0, "segmentation", 0).name == "segmentation_00000.png"
+        assert kubric4d.frame_path(scene, "view0", "rgba", 59).name == "rgba_00059.png"
+        assert kubric4d.frame_path(scene, "view0", "rgba", 59, compact=True).name == "rgba_00059.webp"
+        assert kubric4d.frame_path(scene, "view0", "segmentation", 0).name == "segmentation_00000.png"
 
     def test_parallel_domain4d_as_published(self) -> None:
         names = parallel_domain4d
@@ -179,8 +179,8 @@ class TestKubric4D:
             for camera in scene.cameras:
                 writer.add(time, camera, view)
         writer.finish()
-        colour = picture(kubric4d.frame_path(folder, 1, "rgba", 1, compact=compact))
-        depth = picture(kubric4d.frame_path(folder, 1, "depth", 1, compact=compact))
+        colour = picture(kubric4d.frame_path(folder, "view1", "rgba", 1, compact=compact))
+        depth = picture(kubric4d.frame_path(folder, "view1", "depth", 1, compact=compact))
         if compact:
             assert np.abs(colour.astype(int) - view.rgb[..., ::-1]).mean() < 8
             np.testing.assert_allclose(np.asarray(stored_depth(depth)), with_sky(view.depth), rtol=6e-4)
@@ -199,7 +199,7 @@ class TestKubric4D:
             for camera in scene.cameras:
                 writer.add(time, camera, drawing(instance=9 if time == 0 else 0))
         writer.finish()
-        told = json.loads(kubric4d.metadata_path(folder, 0).read_text())
+        told = json.loads(kubric4d.metadata_path(folder, "view0").read_text())
         assert set(told) == {"scene", "camera", "instances", "dome", "random_seed", "collisions"}
         assert told["scene"]["resolution"] == [48, 32]
         assert (told["scene"]["frame_rate"], told["scene"]["num_frames"], told["random_seed"]) == (24.0, 2, 7)
@@ -216,7 +216,7 @@ class TestKubric4D:
         assert np.shape(red["positions"]) == np.shape(red["velocities"]) == (2, 3)
         assert np.shape(red["quaternions"]) == (2, 4)
         assert np.shape(red["image_positions"]) == (2, 2)
-        assert "collisions" not in json.loads(kubric4d.metadata_path(folder, 1).read_text())
+        assert "collisions" not in json.loads(kubric4d.metadata_path(folder, "view1").read_text())
 
     def test_physics_is_told_in_the_scenes_own_units(self) -> None:
         pytest.importorskip("mujoco", reason="needs the extra `scenes`")

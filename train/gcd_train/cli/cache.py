@@ -99,7 +99,7 @@ def _dataset(
     from gcd_train.data.parallel_domain4d import ParallelDomain4D
     from gcd_train.data.splits import present, read_split
 
-    data = ParallelDomain4D.open(root, classes=semantic)
+    data = ParallelDomain4D(root, classes=semantic)
     if (split is None) != (split_file is None):
         raise RecipeError("a part of the set is named with both --split and --split-file; give both or neither")
     scenes = data.scenes

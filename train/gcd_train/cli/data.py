@@ -9,9 +9,9 @@ from rich.console import Console
 
 from gcd_model import printable
 from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
+from gcd_train.data import kubric4d, parallel_domain4d
+from gcd_train.data.files import MANIFEST, faults
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.layouts.manifest import MANIFEST, faults
 
 data = typer.Typer(no_args_is_help=True, help="Downloaded data sets: repacking.")
 export = typer.Typer(no_args_is_help=True, help="Write data in other programs' formats.")
@@ -45,8 +45,8 @@ def compact(
 
     A scene appears when all of it was read again and compared. Stopped at any point, the same line goes on.
     """
+    from gcd_train.data.compact import Compaction
     from gcd_train.files import remove_leftovers
-    from gcd_train.layouts.compact import Compaction
     from gcd_train.parallel import map_items, one_thread_each
 
     stop_as_by_ctrl_c()

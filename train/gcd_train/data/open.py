@@ -9,10 +9,11 @@ import torch
 
 from gcd_model import Family, ModelConfig
 from gcd_model.networks import Networks
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.batches import CachedBatches, SampleBatches
 from gcd_train.data.cache import CachedLatents
 from gcd_train.data.dataset4d import Dataset4D, Ontology
-from gcd_train.data.files import Skips
+from gcd_train.data.files import MANIFEST, Skips, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips, data_folders
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
@@ -22,8 +23,6 @@ from gcd_train.data.sample import Bytes, Clips, MadeClips, Sample, Samples, Vide
 from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.layouts.manifest import MANIFEST, read_manifest
 from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import DataRecipe
@@ -179,11 +178,11 @@ class _Opening:
 
     def _kubric(self, root: Path) -> Kubric4D:
         cameras = self._data.cameras or kubric4d.CAMERAS
-        return Kubric4D.open(root, cameras=cameras, published=self._data.published)
+        return Kubric4D(root, cameras=cameras, published=self._data.published)
 
     def _driving(self, root: Path) -> ParallelDomain4D:
         cameras = self._data.cameras or parallel_domain4d.CAMERAS
-        return ParallelDomain4D.open(root, cameras=cameras, classes=self._data.modality == "semantic")
+        return ParallelDomain4D(root, cameras=cameras, classes=self._data.modality == "semantic")
 
     def _parts(self, whole: Set) -> tuple[Set, Set]:
         """What to learn from, and what to measure on."""

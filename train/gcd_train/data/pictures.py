@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose
 from gcd_train.data.dataset4d import VOID, Dataset4D, Ontology
-from gcd_train.data.files import FileFault, Recent
-from gcd_train.data.paths import Draw, Sampling
+from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_manifest
+from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
-from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RenderError
-from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility
 
 if TYPE_CHECKING:

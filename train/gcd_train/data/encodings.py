@@ -1,4 +1,4 @@
-"""Pictures, depth and rotations as the published files have them, and as the compact ones do."""
+"""Pictures, depth and rotations as the published files have them and as the compact ones do, written and read."""
 
 import colorsys
 import io
@@ -7,17 +7,21 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
+import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_train.data.files import FileFault, read, read_npz
 from gcd_train.errors import DataError, RenderError
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+Number = TypeVar("Number", bound=np.generic)
 
 NEAR_M, FAR_M = 0.05, 30_000.0
 """The range that depth codes keep; the farthest code also stands for the sky."""
@@ -35,7 +39,9 @@ _FAST_PNG = _png_options(1, cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_STRATEGY
 _DEPTH_PNG = _png_options(6, cv2.IMWRITE_PNG_FILTER_PAETH, cv2.IMWRITE_PNG_STRATEGY_FILTERED)
 # only what changes from row to row, in runs: a third of the time of searching for repetitions
 _ID_PNG = _png_options(1, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_STRATEGY_RLE)
-_PALETTE_KIND = 3  # of a PNG
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_PALETTE, _PNG_GREY = 3, 0  # kinds of a PNG
+_MOST_PIXELS = 1 << 27
 _PLAIN_TIFF = [cv2.IMWRITE_TIFF_COMPRESSION, 1]  # not compressed: every reader can
 _WEBP_EFFORT = 2  # half the time of OpenCV's effort, which is 4, for 3 % more bytes
 
@@ -175,7 +181,7 @@ def packed_id_png(ids: Bytes) -> bytes:
 def indexed_png(ids: Bytes, palette: Sequence[tuple[int, int, int]]) -> bytes:
     """[H, W] as a palette PNG: the pixels are the ids, a viewer shows their colours (OpenCV writes no palettes)."""
     grey = _encoded(".png", ids, _ID_PNG)
-    header = grey[12:25] + bytes([_PALETTE_KIND]) + grey[26:29]
+    header = grey[12:25] + bytes([_PNG_PALETTE]) + grey[26:29]
     colours = bytes(channel for colour in palette for channel in colour)
     return grey[:8] + _chunk(header[:4], header[4:]) + _chunk(b"PLTE", colours) + grey[33:]
 
@@ -216,3 +222,139 @@ def _encoded(suffix: str, picture: NDArray[np.generic], options: list[int]) -> b
     if not done:
         raise DataError(f"OpenCV could not write a {suffix} of {picture.dtype} {list(picture.shape)}")
     return data.tobytes()
+
+
+def read_colour(path: Path) -> Bytes:
+    """RGB picture of a PNG, WebP or JPEG file, u8 [H, W, 3]; alpha is dropped. Raises FileFault."""
+    picture = decoded(path, read(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def read_depth(path: Path, key: str = "data") -> Floats:
+    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a PNG of ours (`DepthCode`).
+
+    0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
+    Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known or within those.
+    """
+    match path.suffix:
+        case ".npz":
+            metres = _npz(path, key)
+        case ".png":
+            metres = _depth_png(path)
+        case _:
+            metres = _float_tiff(path)
+    if not float(metres.min()) >= 0:  # NaN is the least of all
+        bad = int(np.count_nonzero(~(metres >= 0)))
+        raise FileFault(path, f"has {bad} of {metres.size} depths that are NaN or negative")
+    farthest = float(metres.max())
+    if farthest == 0:
+        raise FileFault(path, "has no depth above 0 in any pixel")
+    if float(metres.min()) > FAR_M:
+        raise FileFault(path, f"has depths beyond {FAR_M:g} m in every pixel: no scene is so far away")
+    return np.minimum(metres, np.float32(FAR_M)) if farthest > FAR_M else metres
+
+
+def read_ids(path: Path) -> NDArray[np.int32]:
+    """Ids, i32 [H, W], of a PNG that stores them as R + 256 G + 65536 B. Raises FileFault."""
+    content = read(path)
+    _require_whole_png(path, content)
+    picture = decoded(path, content, cv2.IMREAD_COLOR)
+    ids = cv2.extractChannel(picture, 2).astype(np.int32)
+    for channel, unit in ((1, 256), (0, 65536)):
+        more = cv2.extractChannel(picture, channel)
+        if cv2.countNonZero(more):  # mostly there is nothing in them
+            ids += more.astype(np.int32) * unit
+    return ids
+
+
+def read_palette_indices(path: Path) -> Bytes:
+    """Indices, u8 [H, W], of a palette PNG; of a grey one its values. Raises FileFault.
+
+    OpenCV would give the palette's colours. A palette picture without its palette is a grey picture, though, so the
+    header is rewritten to say that before it is decoded.
+    """
+    content = read(path)
+    _require_whole_png(path, content)
+    depth, kind = content[24], content[25]
+    if kind == _PNG_PALETTE:
+        content = _as_grey(content)
+    elif kind != _PNG_GREY:
+        raise FileFault(path, "holds colours, not a palette: instance numbers cannot be told from it")
+    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
+    if picture.dtype != np.uint8 or picture.ndim != 2:
+        raise FileFault(path, f"should hold 8-bit indices, got {picture.dtype} {list(picture.shape)}")
+    step = 255 // (2**depth - 1) if depth < 8 else 1  # fewer bits are spread over 0..255 when they are decoded
+    return np.ascontiguousarray(picture // step, dtype=np.uint8)
+
+
+def sized(path: Path, picture: NDArray[Number], height: int, width: int, other: str) -> NDArray[Number]:
+    """The picture. Raises FileFault if it has another size than `other` says."""
+    if picture.shape[:2] != (height, width):
+        got = f"{picture.shape[1]} x {picture.shape[0]}"
+        raise FileFault(path, f"is {got} where {other} says {width} x {height}: sizes are mixed")
+    return picture
+
+
+def decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
+    """The picture in a file's content, as OpenCV decodes it with these flags. Raises FileFault."""
+    try:
+        width, height = imagesize.get(io.BytesIO(content), exif_rotation=False)
+    except Exception as error:  # of any kind, where a header is damaged
+        raise FileFault(path, f"is damaged: its size cannot be read ({error})") from error
+    if width * height > _MOST_PIXELS:
+        raise FileFault(path, f"states {width} x {height} pixels, more than {_MOST_PIXELS}")
+    try:
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise FileFault(path, f"cannot be decoded ({error.err or error})") from error
+    if picture is None:  # pyright: ignore[reportUnnecessaryComparison]  the stub does not tell
+        raise FileFault(path, f"is damaged: its {len(content)} bytes hold no whole picture")
+    return picture  # pyright: ignore[reportReturnType]
+
+
+def _float_tiff(path: Path) -> Floats:
+    picture = decoded(path, read(path), cv2.IMREAD_UNCHANGED)
+    if picture.dtype.kind != "f" or picture.size != picture.shape[0] * picture.shape[1]:
+        raise FileFault(path, f"should hold float32 depth, got {picture.dtype} {list(picture.shape)}")
+    return picture.reshape(picture.shape[:2]).astype(np.float32, copy=False)
+
+
+def _npz(path: Path, key: str) -> Floats:
+    array = read_npz(path).get(key)
+    if array is None:
+        raise FileFault(path, f"lacks its array `{key}`")
+    if array.dtype.kind != "f" or array.ndim < 2 or array.size == 0 or array.size != array.shape[0] * array.shape[1]:
+        raise FileFault(path, f"should hold float depth [H, W], got {array.dtype} {list(array.shape)}")
+    return array.reshape(array.shape[:2]).astype(np.float32, copy=False)
+
+
+def _depth_png(path: Path) -> Floats:
+    content = read(path)
+    _require_whole_png(path, content)
+    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
+    metres = stored_depth(picture)
+    if metres is None:
+        got = f"{picture.dtype} {list(picture.shape)}"
+        raise FileFault(path, f"should hold 16-bit depth codes, or their low bytes above their high ones, got {got}")
+    return metres
+
+
+def _require_whole_png(path: Path, content: bytes) -> None:
+    """Some versions of libpng fill what is cut off with zeros; those would be ids."""
+    if not content.startswith(_PNG_SIGNATURE) or len(content) < 33:
+        raise FileFault(path, "is damaged: it is no PNG")
+    if content[-8:-4] != b"IEND":
+        raise FileFault(path, f"is damaged: it is cut off after {len(content)} bytes")
+
+
+def _as_grey(content: bytes) -> bytes:
+    """A palette PNG as a grey PNG of its indices."""
+    header = content[12:25] + bytes([_PNG_GREY]) + content[26:29]
+    rebuilt = [content[:12], header, struct.pack(">I", zlib.crc32(header))]
+    at = 33
+    while at + 8 <= len(content):
+        length, name = struct.unpack_from(">I4s", content, at)
+        if name not in (b"PLTE", b"tRNS", b"bKGD", b"sBIT", b"hIST"):  # mean something else, or nothing, in grey
+            rebuilt.append(content[at : at + 12 + length])
+        at += 12 + length
+    return b"".join(rebuilt)
