@@ -141,7 +141,7 @@ def lerobot(
     """Tabletop episodes as a LeRobot data set (v3.0) with calibrated cameras (extras `scenes` and `lerobot`)."""
     if width % 2 or height % 2:
         raise typer.BadParameter(f"H.264 wants an even width and height, got {width} x {height}")
-    from gcd_train.lerobot.tabletop_export import TabletopExport, export_tabletop
+    from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
 
     wanted = TabletopExport(
         seeds=range(first_seed, first_seed + episodes),
@@ -168,13 +168,13 @@ def lerobot_command(
     seed: Annotated[int, typer.Option(min=0, help="Draws the cameras and windows.")] = 0,
 ) -> None:
     """Read pairs of cameras of a LeRobot data set as training would, and say what was left out."""
-    from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
+    from gcd_train.data.lerobot import LeRobotPairs
 
     tell = Console(highlight=False, soft_wrap=True).print
     with errors_shown():
-        pairs = LeRobotPairs(folder, seed, LeRobotOptions(frames=frames, fps=fps, calibration=calibration))
-        rate = pairs.folder.info.fps
-        tell(f"{len(pairs.folder.episodes)} episodes at {rate:g} frames per second, cameras {', '.join(pairs.cameras)}")
+        pairs = LeRobotPairs(folder, seed, frames=frames, fps=fps, calibration=calibration)
+        rate = pairs.info.fps
+        tell(f"{len(pairs.episodes)} episodes at {rate:g} frames per second, cameras {', '.join(pairs.cameras)}")
         for index in range(samples):
             sample = pairs.sample(index)
             apart = float(np.linalg.norm(sample.source_from_target[:, :3, 3], axis=-1).mean())

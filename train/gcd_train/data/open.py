@@ -15,6 +15,7 @@ from gcd_train.data.cache import CachedLatents
 from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.files import MANIFEST, Skips, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.pairs import PairedClips, data_folders
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling, Sampling
@@ -23,7 +24,6 @@ from gcd_train.data.sample import Bytes, Clips, MadeClips, Sample, Samples, Vide
 from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import DataRecipe
 from gcd_train.training.objective import BatchMaker, BatchSource
@@ -261,18 +261,19 @@ class _Opening:
         return batches
 
     def _episodes(self, folder: Path, episodes: tuple[int, int | None]) -> LeRobotPairs:
-        told = self._data.lerobot
-        options = LeRobotOptions(
+        options = self._data.lerobot
+        return LeRobotPairs(
+            folder,
+            self.recipe.seed,
             frames=self.config.frames,
             fps=self.recipe.unet.fps,
             size=(self.config.width, self.config.height),
-            tolerance_s=told.tolerance_s,
-            cameras=told.cameras,
-            calibration=None if told.calibration is None else Path(told.calibration),
+            tolerance_s=options.tolerance_s,
+            cameras=options.cameras,
+            calibration=None if options.calibration is None else Path(options.calibration),
             repeats=self._data.repeats,
             episodes=episodes,
         )
-        return LeRobotPairs(folder, self.recipe.seed, options)
 
     def _valid_folder(self, why: str) -> Path:
         if self.places.valid is None:

@@ -287,28 +287,6 @@ def trained_lens(lens: Intrinsics, width: int, height: int) -> Intrinsics:
     return lens.cropped(*center_crop_box(lens.width, lens.height, width / height)).resized(width, height)
 
 
-def seen_through(picture: Bytes, own: Intrinsics, lens: Intrinsics, size: tuple[int, int]) -> Bytes:
-    """A camera's picture as if taken through another lens, cropped about its middle and resized: u8 [H, W, 3].
-
-    own: of the picture. lens: the other one; what it shows beyond the picture is black. size: width and height.
-    """
-    wide, high = size
-    if lens != own:
-        middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from a pixel's middle
-        to_lens = (lens.matrix @ own.matrix.inverse()).numpy()
-        warp = np.linalg.inv(middle) @ to_lens @ middle
-        picture = cv2.warpPerspective(picture, warp, (lens.width, lens.height)).astype(np.uint8, copy=False)
-    left, top, across, along = center_crop_box(lens.width, lens.height, wide / high)
-    kept = picture[top : top + along, left : left + across]
-    how = cv2.INTER_AREA if across >= wide else cv2.INTER_LINEAR
-    return cv2.resize(kept, size, interpolation=how).astype(np.uint8, copy=False)
-
-
-def narrower(one: Intrinsics, other: Intrinsics) -> Intrinsics:
-    """Of two lenses the one that shows less, which is within what the other shows."""
-    return max(one, other, key=lambda lens: lens.fx / lens.width)
-
-
 def _ontology_of(dataset: Dataset4D, options: PictureOptions) -> Ontology | None:
     """The classes that the options need. Raises DataError for a set that has none."""
     if options.modality == "rgb" and not options.class_ids:
