@@ -338,14 +338,6 @@ def test_a_folder_without_a_cache_is_refused(tmp_path: Path) -> None:
         CachedLatents.open(tmp_path)
 
 
-def test_a_plan_leaves_out_clips_with_missing_frames() -> None:
-    there = set(range(50)) - {20}
-    clips = ClipPlan().clips(50, there)
-    assert clips
-    assert all(20 not in ClipPlan().times(place) for place in clips)
-    assert len(clips) < 59
-
-
 def test_on_the_direct_path_every_target_is_seen_from_the_goal(folder: Path) -> None:
     cache = CachedLatents.open(folder)
     direct, gradual = (cache.clip("scene_000000", ClipPlace(2, 1), path) for path in ("direct", "gradual"))  # pyright: ignore

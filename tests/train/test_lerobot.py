@@ -146,39 +146,12 @@ def _apart(sample: Sample, between: np.ndarray) -> float:
     return min(float(np.abs(sample.source_from_target - way).max()) for way in (between, np.linalg.inv(between)))
 
 
-def test_a_sample_depends_on_seed_and_index_alone(made: Path) -> None:
-    first, again = _all(made, 5), _all(made, 5)
-    backwards = {index: again.sample(index) for index in reversed(range(4))}
-    for index in range(4):
-        sample = first.sample(index)
-        assert sample.frame_numbers == backwards[index].frame_numbers
-        np.testing.assert_array_equal(sample.target, backwards[index].target)
-    other = [_all(made, 6).sample(index).frame_numbers for index in range(4)]
-    assert other != [backwards[index].frame_numbers for index in range(4)]
-
-
 def test_a_lower_rate_takes_the_rows_nearest_in_time(made: Path) -> None:
     sample = _only(made, LEFT, RIGHT, fps=10.0).sample(0)
     assert set(np.diff(sample.frame_numbers)) == {2}
     assert sample.fps == 10.0
     with pytest.raises(DataError, match="30 frames per second were wanted"):
         _only(made, LEFT, RIGHT, fps=30.0)
-
-
-def test_of_two_lenses_both_sides_have_the_narrower_one(copied: Path) -> None:
-    same = _only(copied, LEFT, RIGHT).sample(0)
-    path = copied / CAMERA_FILE
-    told = json.loads(path.read_text())
-    told["cameras"][RIGHT].update(fx=120.0, fy=120.0)
-    path.write_text(json.dumps(told))
-    zoomed = _only(copied, LEFT, RIGHT).sample(0)
-
-    def ramps(sample: Sample) -> list[float]:
-        return sorted(float(np.ptp(side[0, HEIGHT // 2, :, 0].astype(int))) for side in (sample.source, sample.target))
-
-    assert ramps(same)[0] > 105
-    assert 50 < ramps(zoomed)[0] < 70
-    assert ramps(zoomed)[1] > 105
 
 
 def test_the_layout_is_that_of_version_three(made: Path) -> None:

@@ -17,18 +17,16 @@ from gcd_model.conditioning import micro_conditioning, spherical_features
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
-from gcd_train.data.batches import EncodedBatches, SampleBatches
+from gcd_train.data.batches import EncodedBatches
 from gcd_train.data.latents import Encodings, LatentClips, LatentRows
-from gcd_train.data.loader import LoadedBatch
 from gcd_train.data.open import DataPlaces, RunData, open_data
-from gcd_train.data.sample import Clips, MadeClips, Sample, collate, to_network
+from gcd_train.data.sample import Clips, MadeClips, Sample, to_network
 from gcd_train.data.sample import painted as painted_clips
 from gcd_train.errors import DataError, Interrupted
 from gcd_train.recipe import ClassWeightsName, Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
 from gcd_train.stop import StopSignal
 from gcd_train.training.conditioner import mirrored_path
-from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.run import RunInputs, Trainer
@@ -262,25 +260,6 @@ def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run
     assert path.delta is not None
     assert rows.control is not None
     assert torch.equal(rows.control[0], spherical_features(path.delta)[2])
-
-
-def test_batches_from_pixels_are_told_of_orbits_the_same(orbit_run: Path) -> None:
-    recipe = orbit_recipe()
-    unet = msgspec.structs.replace(recipe.unet, image_share=0.0)
-    networks = random_networks(model_config(recipe.model), seed=5)
-    batches = SampleBatches(TinyOrbits(), networks, unet, FAMILIES["kubric90"], PRECISION)
-    loaded = LoadedBatch(collate([TinyOrbits().sample(number) for number in (0, 1)]), (0, 1), 0.0)
-    batch = batches.batch(loaded, Draws(1, "test", 0, CPU))
-    encoded_rows = LatentClips.open(orbit_run / "latents").rows(
-        torch.tensor([0, 1]).repeat_interleave(FRAMES),
-        torch.arange(FRAMES).repeat(2),
-        torch.zeros(2 * FRAMES, dtype=torch.bool),
-        CPU,
-    )
-    assert batch.camera is not None
-    assert encoded_rows.control is not None
-    assert torch.equal(batch.camera, encoded_rows.control)
-    assert batch.condition.shape[1] == networks.config.unet.condition_channels
 
 
 @pytest.mark.parametrize(
