@@ -116,7 +116,7 @@ class DrivingPictures:
             start=None,
             deltas=None,
         )
-        made = self._pictures.make(scene, draw)
+        made = self._pictures.sample(scene, draw)
         if not self._options.exact:
             return made.source[0], made.target
         view = self.data.views(scene, time, [self.data.source_camera])[0]

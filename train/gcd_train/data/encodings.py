@@ -99,21 +99,6 @@ STREET_DEPTH = DepthCode(step=0.0025, bend_m=20.0)
 _STAGE_METRES, _STREET_METRES = STAGE_DEPTH.table(), STREET_DEPTH.table()
 
 
-def stored_depth(picture: NDArray[Any]) -> Floats | None:
-    """Metres [H, W] of a depth PNG as it is decoded, None if it can be neither a stage's nor a street's.
-
-    picture: u16 [H, W], codes of a stage, or u8 [2 H, W], codes of a street: low bytes above, high bytes below.
-    """
-    if picture.ndim != 2:
-        return None
-    if picture.dtype == np.uint16:
-        return _STAGE_METRES[picture]
-    if picture.dtype != np.uint8 or picture.shape[0] % 2:
-        return None
-    low, high = np.split(picture, 2)
-    return _STREET_METRES[low + high.astype(np.uint16) * 256]
-
-
 def with_sky(metres: Floats) -> Floats:
     """A drawn depth picture, 0 where there is only sky, with the sky as far as it is written."""
     return np.where(metres > 0, metres, np.float32(SKY_M))
@@ -238,20 +223,40 @@ def read_depth(path: Path, key: str = "data") -> Floats:
     """
     match path.suffix:
         case ".npz":
-            metres = _npz(path, key)
+            stored = read_npz(path).get(key)
+            if stored is None:
+                raise FileFault(path, f"lacks its array `{key}`")
         case ".png":
-            metres = _depth_png(path)
+            stored = _from_codes(path)
         case _:
-            metres = _float_tiff(path)
-    if not float(metres.min()) >= 0:  # NaN is the least of all
+            stored = decoded(path, read(path), cv2.IMREAD_UNCHANGED)
+    shape = stored.shape[:2]
+    if stored.dtype.kind != "f" or stored.ndim < 2 or stored.size == 0 or stored.size != shape[0] * shape[1]:
+        raise FileFault(path, f"should hold float32 depth [H, W], got {stored.dtype} {list(stored.shape)}")
+    metres = stored.reshape(shape).astype(np.float32, copy=False)
+    nearest, farthest = float(metres.min()), float(metres.max())
+    if not nearest >= 0:  # NaN is the least of all
         bad = int(np.count_nonzero(~(metres >= 0)))
         raise FileFault(path, f"has {bad} of {metres.size} depths that are NaN or negative")
-    farthest = float(metres.max())
     if farthest == 0:
         raise FileFault(path, "has no depth above 0 in any pixel")
-    if float(metres.min()) > FAR_M:
+    if nearest > FAR_M:
         raise FileFault(path, f"has depths beyond {FAR_M:g} m in every pixel: no scene is so far away")
     return np.minimum(metres, np.float32(FAR_M)) if farthest > FAR_M else metres
+
+
+def _from_codes(path: Path) -> Floats:
+    """Metres of a depth PNG: 16-bit codes of a stage, or of a street the low bytes above the high ones."""
+    content = read(path)
+    _require_whole_png(path, content)
+    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
+    if picture.ndim == 2 and picture.dtype == np.uint16:
+        return _STAGE_METRES[picture]
+    if picture.ndim != 2 or picture.dtype != np.uint8 or picture.shape[0] % 2:
+        got = f"{picture.dtype} {list(picture.shape)}"
+        raise FileFault(path, f"should hold 16-bit depth codes, or their low bytes above their high ones, got {got}")
+    low, high = np.split(picture, 2)
+    return _STREET_METRES[low + high.astype(np.uint16) * 256]
 
 
 def read_ids(path: Path) -> NDArray[np.int32]:
@@ -310,33 +315,6 @@ def decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
     if picture is None:  # pyright: ignore[reportUnnecessaryComparison]  the stub does not tell
         raise FileFault(path, f"is damaged: its {len(content)} bytes hold no whole picture")
     return picture  # pyright: ignore[reportReturnType]
-
-
-def _float_tiff(path: Path) -> Floats:
-    picture = decoded(path, read(path), cv2.IMREAD_UNCHANGED)
-    if picture.dtype.kind != "f" or picture.size != picture.shape[0] * picture.shape[1]:
-        raise FileFault(path, f"should hold float32 depth, got {picture.dtype} {list(picture.shape)}")
-    return picture.reshape(picture.shape[:2]).astype(np.float32, copy=False)
-
-
-def _npz(path: Path, key: str) -> Floats:
-    array = read_npz(path).get(key)
-    if array is None:
-        raise FileFault(path, f"lacks its array `{key}`")
-    if array.dtype.kind != "f" or array.ndim < 2 or array.size == 0 or array.size != array.shape[0] * array.shape[1]:
-        raise FileFault(path, f"should hold float depth [H, W], got {array.dtype} {list(array.shape)}")
-    return array.reshape(array.shape[:2]).astype(np.float32, copy=False)
-
-
-def _depth_png(path: Path) -> Floats:
-    content = read(path)
-    _require_whole_png(path, content)
-    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
-    metres = stored_depth(picture)
-    if metres is None:
-        got = f"{picture.dtype} {list(picture.shape)}"
-        raise FileFault(path, f"should hold 16-bit depth codes, or their low bytes above their high ones, got {got}")
-    return metres
 
 
 def _require_whole_png(path: Path, content: bytes) -> None:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
@@ -31,7 +30,6 @@ from gcd_train.training.setup import Precision, digest_of
 
 _FIXED_SEED = 0  # of the clips that are measured on: the same ones in every run
 _VIDEO_FAMILY = "svd"
-Set = TypeVar("Set", Kubric4D, ParallelDomain4D)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -115,8 +113,15 @@ class _Opening:
     def views(self) -> RunData:
         if self._data.kind == "kubric4d":
             self._require_family_covers_orbit()
-            return self._views(*self._parts(self._kubric(self.places.data)))
-        return self._views(*self._parts(self._driving(self.places.data)))
+        whole, valid = self._dataset(self.places.data), self.places.valid
+        learned, held = (whole, self._dataset(valid)) if valid is not None else self._parts(whole)
+        require_apart(_worlds_of(learned), _worlds_of(held))
+        sampling = sampling_of(self.recipe, self.config.frames)
+        return RunData(
+            clips=self._one_rate(learned, learned.fps, repeats=self._data.repeats),
+            valid=self._one_rate(held, held.fps),
+            batches=self._sampled(self._pairs(learned, sampling, self.recipe.seed, self._data.repeats)),
+        )
 
     def lerobot(self) -> RunData:
         held_out = 0 if self.places.valid else self._data.held_out
@@ -156,9 +161,9 @@ class _Opening:
             raise RecipeError("a latent cache is of a frozen autoencoder: leave out [vae] and [latents]")
         cache, valid = CachedLatents.open(self.places.data), self._valid_folder("a latent cache holds no pictures")
         self._require_drawn_as_cached(cache)
-        held = self._driving(valid)
+        held = self._dataset(valid)
         if self._data.split == "last" or self._data.split_file is not None:
-            held = held.only(self._part(held, "val"))
+            held = held.only(self._part(held.scenes, "val"))
         require_apart(dict.fromkeys(cache.scenes, ""), dict.fromkeys(held.scenes, ""))
         clips = self._one_rate(held, held.fps)
 
@@ -167,29 +172,16 @@ class _Opening:
 
         return RunData(clips=clips, valid=clips, batches=batches)
 
-    def _views(self, learned: Kubric4D | ParallelDomain4D, held: Kubric4D | ParallelDomain4D) -> RunData:
-        require_apart(_worlds_of(learned), _worlds_of(held))
-        sampling = sampling_of(self.recipe, self.config.frames)
-        return RunData(
-            clips=self._one_rate(learned, learned.fps, repeats=self._data.repeats),
-            valid=self._one_rate(held, held.fps),
-            batches=self._sampled(self._pairs(learned, sampling, self.recipe.seed, self._data.repeats)),
-        )
+    def _dataset(self, root: Path) -> Dataset4D:
+        cameras, published = self._data.cameras, self._data.published
+        if self._data.kind == "kubric4d":
+            return Kubric4D(root, cameras=cameras or kubric4d.CAMERAS, published=published)
+        classes = self._data.modality == "semantic"
+        return ParallelDomain4D(root, cameras=cameras or parallel_domain4d.CAMERAS, classes=classes)
 
-    def _kubric(self, root: Path) -> Kubric4D:
-        cameras = self._data.cameras or kubric4d.CAMERAS
-        return Kubric4D(root, cameras=cameras, published=self._data.published)
-
-    def _driving(self, root: Path) -> ParallelDomain4D:
-        cameras = self._data.cameras or parallel_domain4d.CAMERAS
-        return ParallelDomain4D(root, cameras=cameras, classes=self._data.modality == "semantic")
-
-    def _parts(self, whole: Set) -> tuple[Set, Set]:
-        """What to learn from, and what to measure on."""
-        if self.places.valid is not None:
-            held = self._kubric(self.places.valid) if isinstance(whole, Kubric4D) else self._driving(self.places.valid)
-            return whole, held  # pyright: ignore[reportReturnType]  # opened as the other one was
-        learned, held_out = (self._part(whole, part) for part in ("train", "val"))
+    def _parts(self, whole: Dataset4D) -> tuple[Dataset4D, Dataset4D]:
+        """What to learn from, and what to measure on, of one folder."""
+        learned, held_out = (self._part(whole.scenes, part) for part in ("train", "val"))
         if not learned or not held_out:
             raise DataError(
                 f"{self.places.data} has {len(whole.scenes)} scenes: {len(learned)} to learn from and {len(held_out)} "
@@ -197,12 +189,12 @@ class _Opening:
             )
         return whole.only(learned), whole.only(held_out)
 
-    def _part(self, whole: Kubric4D | ParallelDomain4D, part: Part) -> tuple[str, ...]:
-        data, scenes = self._data, tuple(whole.scenes)
+    def _part(self, scenes: tuple[str, ...], part: Part) -> tuple[str, ...]:
+        data = self._data
         if data.split == "last":
             first_held = max(len(scenes) - data.held_out, 0)
             return scenes[:first_held] if part == "train" else scenes[first_held:]
-        if isinstance(whole, Kubric4D):
+        if data.kind == "kubric4d":
             return kubric_split(scenes, part)
         if data.split_file is None:
             raise RecipeError(
