@@ -21,15 +21,15 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90
 from gcd_train.data.pictures import ViewPairs
-from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.parallel import one_thread_each
 from gcd_train.pointcloud import published_picture
+from gcd_train.scenes.scene_writer import SceneFormat, write_scene
 from gcd_train.scenes.worlds import SCENE_WORLDS
 
 PROCESS = psutil.Process()
 FIRST_SEED = 3_000_000  # in no data set
 CLIP_FRAMES, TARGETS, TIME_STEPS = 14, 7, 6
-WORLDS = {"drop": (Kubric4D.open, MAX90), "driving": (ParallelDomain4D.open, DRIVING)}
+WORLDS = {"drop": (Kubric4D, MAX90), "driving": (ParallelDomain4D, DRIVING)}
 EDITIONS = {"compact": {"compact": True, "oversample": 1}, "published": {"compact": False, "oversample": 2}}
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from gcd_model.geometry import sphere_poses
+from gcd_train.data.files import SceneManifest, faults, read_manifest
 from gcd_train.errors import DataError
-from gcd_train.layouts.manifest import SceneManifest, faults, read_manifest
 from gcd_train.scenes.description import Light, Part, Pattern, Scene, SceneObject, Sheet, upright
 from gcd_train.scenes.worlds import SceneWorld
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gcd_train.data.cache import CacheIdentity, ClipPlan
-from gcd_train.data.cache_writer import CacheJob, EncoderChoice, Encoders, cache_scenes, load_encoders
-from gcd_train.data.latents import only_writer
+from gcd_train.data.cache import CacheIdentity, ClipPlan, FrozenEncoders, SceneShard, only_writer
+from gcd_train.data.cache_writer import CacheJob, EncoderChoice, cache_scenes, load_encoders
 from gcd_train.errors import DataError
+from gcd_train.parallel import Outcome
 
 HEIGHT, WIDTH, FRAMES, CLIP = 32, 48, 7, 3
 PLAN = ClipPlan(clip_frames=CLIP)
@@ -46,13 +46,13 @@ def _picture(shade: int, hue: int) -> np.ndarray:
     return picture
 
 
-def tiny_encoders() -> Encoders:
-    return load_encoders(CHOICE)
+def tiny_encoders() -> FrozenEncoders:
+    return load_encoders(CHOICE)[0]
 
 
 def tiny_identity(**changes: object) -> CacheIdentity:
     told: dict[str, object] = {
-        "encoders": tiny_encoders().digest,
+        "encoders": load_encoders(CHOICE)[1],
         "dtype": "float32",
         "pictures": "fake",
         "fps": 10.0,
@@ -65,6 +65,14 @@ def tiny_identity(**changes: object) -> CacheIdentity:
         "scale": 0.18215,
     }
     return CacheIdentity(**(told | changes))  # pyright: ignore[reportArgumentType]
+
+
+def cached(folder: Path, pictures: FakePictures | None = None, **identity: object) -> list[Outcome[str, SceneShard]]:
+    """Make the cache of a set; what became of each scene."""
+    pictures = pictures or FakePictures()
+    job = CacheJob(folder=folder, pictures=pictures, choice=CHOICE, identity=tiny_identity(**identity))  # pyright: ignore[reportArgumentType]
+    with only_writer(folder):
+        return list(cache_scenes(job, pictures.scenes))
 
 
 # a child that kills itself at the n-th time something settles on the disk
@@ -99,8 +107,4 @@ def _run(folder: Path, kill_at: int) -> None:
         return moved
 
     Path.replace = replace  # type: ignore[method-assign]
-    pictures = FakePictures()
-    job = CacheJob(folder=folder, pictures=pictures, choice=CHOICE, identity=tiny_identity())
-    with only_writer(folder):
-        for _ in cache_scenes(job, pictures.scenes):
-            pass
+    cached(folder)

@@ -10,11 +10,11 @@ from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
+from gcd_train.data.compact import Compaction
+from gcd_train.data.encodings import DepthCode
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError
-from gcd_train.layouts.compact import Compaction
-from gcd_train.layouts.encodings import DepthCode
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 DRIVING = tuple(DRIVING_POSES)
@@ -44,7 +44,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_kubric_scenes_are_read_as_before_and_packed_once(source: Path, tmp_path: Path) -> None:
     code, lines = packed(source / "kubric", tmp_path)
     assert (code, lines[-1][:16]) == (0, "scenes: 2 packed")
-    each = [Kubric4D.open(root, cameras=VIEWS, instances=True) for root in (source / "kubric", tmp_path)]
+    each = [Kubric4D(root, cameras=VIEWS, instances=True) for root in (source / "kubric", tmp_path)]
     assert each[0].scenes == each[1].scenes
     before, after = (of.views("scn00007", 1) for of in each)
     for view, same in zip(before, after, strict=True):
@@ -65,7 +65,7 @@ def test_kubric_scenes_are_read_as_before_and_packed_once(source: Path, tmp_path
 def test_driving_scenes_keep_classes_and_instances_of_two_bytes(source: Path, tmp_path: Path) -> None:
     code, lines = packed(source / "driving", tmp_path)
     assert code == 0, lines
-    sets = [ParallelDomain4D.open(root, cameras=DRIVING, instances=True) for root in (source / "driving", tmp_path)]
+    sets = [ParallelDomain4D(root, cameras=DRIVING, instances=True) for root in (source / "driving", tmp_path)]
     most = 0
     for view, same in zip(*(of.views("scene_000005", 1) for of in sets), strict=True):
         assert view.classes is not None

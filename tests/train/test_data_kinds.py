@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from cached_sets import CHOICE, CLIP, HEIGHT, WIDTH, FakePictures, tiny_identity
+from cached_sets import CHOICE, CLIP, HEIGHT, WIDTH, cached
 from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from tiny_world import tiny_recipe
 
@@ -15,8 +15,6 @@ from gcd_model.config import ModelConfig
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.cache_writer import CacheJob, cache_scenes
-from gcd_train.data.latents import only_writer
 from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
 from gcd_train.data.paths import DrivingSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
@@ -123,10 +121,7 @@ def test_pairs_and_caches_want_something_to_measure_on(tmp_path: Path) -> None:
 
 
 def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path: Path) -> None:
-    pictures = FakePictures()
-    job = CacheJob(folder=tmp_path, pictures=pictures, choice=CHOICE, identity=tiny_identity())
-    with only_writer(tmp_path):
-        assert len(list(cache_scenes(job, pictures.scenes))) == 3
+    assert len(cached(tmp_path)) == 3
     data = msgspec.structs.replace(DRIVING, kind="cache", split="last", held_out=1)
     own = recipe(data, fps=10.0, source="cache", image_share=0.0, augmentation=0.02, loss=LossRecipe())
     model = msgspec.structs.replace(own.model, weights=CHOICE.weights)

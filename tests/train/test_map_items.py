@@ -72,18 +72,22 @@ def test_items_are_taken_as_workers_come_free() -> None:
     assert len(taken) <= 4
 
 
-def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> None:
-    code = (
-        "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
+def started(folder: Path, function: str, items: str) -> subprocess.Popen[bytes]:
+    """A script of its own that maps a function of `mapped_work`; `place` is the folder."""
+    script = folder.with_name(f"{folder.name}.py")
+    script.write_text(
+        f"import signal, sys; sys.path.insert(0, {str(HERE)!r}); place = {str(folder)!r}\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
-        "from mapped_work import wait_for_ever\n"
+        f"from mapped_work import {function}\n"
         "from gcd_train.parallel import map_items\n"
         "if __name__ == '__main__':\n"
-        "    list(map_items(wait_for_ever, [sys.argv[2]] * 3, workers=2))\n"
+        f"    list(map_items({function}, {items}, workers=2))\n"
     )
-    script = tmp_path / "run.py"
-    script.write_text(code)
-    running = subprocess.Popen([sys.executable, str(script), str(HERE), str(tmp_path)], stderr=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, str(script)], stderr=subprocess.DEVNULL)
+
+
+def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> None:
+    running = started(tmp_path, "wait_for_ever", "[place] * 3")
     pids = _wait_for(tmp_path, "begun-*", 2)
     running.send_signal(2)  # Ctrl-C
     running.wait(timeout=40)
@@ -92,23 +96,11 @@ def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> No
 
 
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
-    (tmp_path / "items").mkdir()
-    code = (
-        "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
-        "from mapped_work import mark_and_square\n"
-        "from gcd_train.parallel import map_items\n"
-        "if __name__ == '__main__':\n"
-        "    list(map_items(mark_and_square, [(sys.argv[2], n) for n in range(10_000)], workers=2))\n"
-    )
-    script = tmp_path / "run.py"
-    script.write_text(code)
-    place = tmp_path / "items"
-    running = subprocess.Popen([sys.executable, str(script), str(HERE), str(place)], stderr=subprocess.DEVNULL)
-    _wait_for(place, "*", 2)
+    running = started(tmp_path, "mark_and_square", "[(place, n) for n in range(10_000)]")
+    _wait_for(tmp_path, "*", 2)
     running.kill()
     running.wait(timeout=30)
-    pids = {path.name.split("-")[1] for path in place.iterdir()}
+    pids = {path.name.split("-")[1] for path in tmp_path.iterdir()}
     deadline = time.monotonic() + 30
     while any(_is_running(pid) for pid in pids) and time.monotonic() < deadline:
         time.sleep(0.1)

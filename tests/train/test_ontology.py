@@ -42,13 +42,6 @@ def test_decoding_finds_the_nearest_colour(
         assert number == min(distances, key=lambda i: (distances[i], i))
 
 
-def test_duplicate_colours_are_reported_and_merged() -> None:
-    known = made({4: (1, 2, 3), 7: (9, 9, 9), 2: (1, 2, 3)})
-    assert known.duplicates == ((2, 4),)
-    assert known.merged_names == ("class 2 (2), class 4 (4)",)
-    np.testing.assert_array_equal(known.decode(known.encode(np.array([2, 4, 7], np.uint8))), [2, 2, 7])
-
-
 def test_unlisted_ids_are_black_and_without_a_place() -> None:
     known = made({5: (10, 20, 30), 9: (1, 1, 1)})
     assert known.encode(np.array([6], np.uint8)).tolist() == [[0, 0, 0]]

@@ -77,14 +77,6 @@ def test_the_published_depth_is_off_by_up_to_half_a_percent() -> None:
     assert 0.004 < off.max() < 0.005
 
 
-def test_holes_far_from_anything_stay_black() -> None:
-    colour, covered = torch.zeros(60, 60, 3), torch.zeros(60, 60, dtype=torch.bool)
-    colour[5, 5], covered[5, 5] = 1.0, True
-    filled = fill_holes(colour, covered)
-    assert filled[14, 14].min() > 0.9  # ten pixels away at most, whatever the weight
-    assert not filled[17:, 17:].any()
-
-
 def test_filling_is_the_normalised_blur_of_opencv_too(room: list[SceneView]) -> None:
     made = splat(room, rig_poses([(40.0, 20.0)])[0], LENS, options=SplatOptions(radius=0))
     colour, held = made.colour.numpy().astype(np.float64), made.covered.numpy().astype(np.float64)
@@ -160,18 +152,6 @@ def test_points_of_whole_pixel_numbers_lie_half_a_pixel_up_and_left(room: list[S
     view = replace(room[0], world_from_camera=np.eye(4))
     step = (unproject(view) - unproject(view, published=True)) * [LENS.fx, LENS.fy, 1.0] / view.depth[..., None]
     np.testing.assert_allclose(step, np.broadcast_to([0.5, 0.5, 0.0], step.shape), atol=1e-4)
-
-
-def test_holes_are_filled_from_what_is_around_them() -> None:
-    colour = torch.full((40, 50, 3), 0.4)
-    covered = torch.ones(40, 50, dtype=torch.bool)
-    covered[10:14, 20:25] = False
-    filled = fill_holes(torch.where(covered[..., None], colour, 0.0), covered)
-    np.testing.assert_allclose(filled.numpy(), 0.4, atol=1e-6)
-
-
-def test_a_target_of_the_usual_size_is_drawn_at_420_by_280() -> None:
-    assert render_lens(LENS, round(384 * 1.09375), round(256 * 1.09375)) == LENS.resized(420, 280)
 
 
 def test_digits_are_cut_off_in_published_pictures_only() -> None:

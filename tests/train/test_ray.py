@@ -169,7 +169,7 @@ class TestTwoNodes:
         pytest.importorskip("moderngl", reason="needs the extra `scenes`")
         from box_world import box_world, checked
 
-        from gcd_train.layouts.scene_writer import SceneFormat, generate_scenes
+        from gcd_train.scenes.scene_writer import SceneFormat, generate_scenes
 
         second = cluster.add_node(num_cpus=2, object_store_memory=80 * 2**20)
         cluster.wait_for_nodes()

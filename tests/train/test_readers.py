@@ -23,11 +23,11 @@ from tiny_scenes4d import (
 )
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.data.files import FileFault, read_ids, read_palette_indices
+from gcd_train.data.encodings import STAGE_DEPTH, read_ids, read_palette_indices
+from gcd_train.data.files import FileFault
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError
-from gcd_train.layouts.encodings import STAGE_DEPTH
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CAMERAS = tuple(DRIVING_POSES)
@@ -64,11 +64,11 @@ def driving(driving_root: Path, tmp_path: Path) -> Path:
 
 
 def open_kubric(root: Path, **options: bool) -> Kubric4D:
-    return Kubric4D.open(root, cameras=VIEWS, **options)
+    return Kubric4D(root, cameras=VIEWS, **options)
 
 
 def open_driving(root: Path, **options: bool) -> ParallelDomain4D:
-    return ParallelDomain4D.open(root, cameras=CAMERAS, **options)
+    return ParallelDomain4D(root, cameras=CAMERAS, **options)
 
 
 def test_kubric_views_are_what_was_drawn(kubric_root: Path) -> None:
@@ -300,9 +300,9 @@ def test_a_frame_beyond_the_end_is_refused(kubric_root: Path, driving_root: Path
 @pytest.mark.parametrize("kind", [Kubric4D, ParallelDomain4D])
 def test_a_folder_without_scenes_is_refused(tmp_path: Path, kind: type[Kubric4D | ParallelDomain4D]) -> None:
     with pytest.raises(DataError, match="holds no"):
-        kind.open(tmp_path)
+        kind(tmp_path)
     with pytest.raises(DataError, match="cannot be read"):
-        kind.open(tmp_path / "nowhere")
+        kind(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("layer", ["rgb", "depth", "semantic_segmentation_2d", "kubric depth", "kubric segmentation"])

@@ -10,16 +10,16 @@ from headless import needs_egl
 from stage_world import STAGE, stage
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.encodings import SKY_M
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.errors import DataError
-from gcd_train.layouts.encodings import SKY_M
-from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.scenes.driving import class_ids, driving_drive
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.scene_writer import SceneFormat, write_scene
 from gcd_train.scenes.worlds import SCENE_WORLDS
 
 SEED, FRAMES, WIDTH, HEIGHT = 3, 2, 48, 36
@@ -43,7 +43,7 @@ def write_stage(root: Path, *, compact: bool = False) -> Path:
 @pytest.mark.parametrize("compact", [False, True])
 def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path, tmp_path: Path, compact: bool) -> None:
     stage_root = write_stage(tmp_path, compact=True) if compact else stage_root
-    dataset = Kubric4D.open(stage_root, instances=True)
+    dataset = Kubric4D(stage_root, instances=True)
     scene = stage(0, FRAMES)
     with Renderer(48, 32, oversample=1) as renderer:
         drawn = {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
@@ -62,7 +62,7 @@ def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path, tmp_path: Path
 
 
 def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
-    dataset, orbit = Kubric4D.open(stage_root), replace(MAX90, frames=CLIP)
+    dataset, orbit = Kubric4D(stage_root), replace(MAX90, frames=CLIP)
     exact = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), exact=True, visible=True)).sample(2)
     splatted = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), visible=True)).sample(2)
     assert exact.skipped == splatted.skipped == ()
@@ -72,11 +72,6 @@ def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
         assert np.abs(one.astype(int) - other).mean() < 12
     assert exact.visible is not None
     assert splatted.visible is not None
-
-
-def test_every_world_reaches_the_processes_that_make_its_scenes() -> None:
-    for world in SCENE_WORLDS.values():
-        assert pickle.loads(pickle.dumps(world)) == world
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +98,7 @@ def test_a_driving_scene_is_read_as_it_was_drawn(
     root: Path, drawn: dict[tuple[int, str], Rendering], tmp_path: Path, compact: bool
 ) -> None:
     root = write_drive(tmp_path, compact=True) if compact else root
-    dataset = ParallelDomain4D.open(root, instances=True)
+    dataset = ParallelDomain4D(root, instances=True)
     (scene,) = dataset.scenes
     assert any((root / scene / "rgb").rglob("*.webp")) == compact
     vehicle_from_camera = SCENE_WORLDS["driving"].vehicle_from_camera
@@ -125,13 +120,13 @@ def test_a_driving_scene_is_read_as_it_was_drawn(
 
 
 def test_the_driving_source_stands_where_the_path_starts(root: Path) -> None:
-    dataset = ParallelDomain4D.open(root)
+    dataset = ParallelDomain4D(root)
     draw = DRIVING.draw(generator(0, 0), 50, 10.0)
     np.testing.assert_allclose(dataset.pose(dataset.scenes[0], "yaw-0"), draw.world_from_source, atol=1e-6)
 
 
 def test_exact_pairs_start_with_the_same_picture(root: Path) -> None:
-    dataset = ParallelDomain4D.open(root)
+    dataset = ParallelDomain4D(root)
     sampling = replace(DRIVING, frames=CLIP)
     pairs = ViewPairs(dataset, sampling, 0, PictureOptions(size=(WIDTH, 24), exact=True, visible=True, class_ids=True))
     sample = pairs.sample(0)
@@ -151,7 +146,7 @@ def test_exact_pairs_start_with_the_same_picture(root: Path) -> None:
 
 
 def test_exact_pairs_of_a_damaged_geometry_are_left_out_by_name(root: Path, tmp_path: Path) -> None:
-    dataset = ParallelDomain4D.open(root)
+    dataset = ParallelDomain4D(root)
     geometry = dataset.folder(dataset.scenes[0]) / "geometry.npz"
     content = geometry.read_bytes()
     try:

@@ -44,20 +44,6 @@ def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
 
 
 @needs_egl
-def test_generation_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    write_partial = tmp_path / "shard-00000002-2.123.partial"
-    tmp_path.mkdir(exist_ok=True)
-    write_partial.write_bytes(b"cut off")
-    list(generate(tmp_path, TINY, range(2), workers=1))
-    first = shard_path(tmp_path, range(2))
-    written = first.stat().st_mtime_ns
-    seen = list(generate(tmp_path, TINY, range(4), workers=1))
-    assert seen == [2, 4]
-    assert first.stat().st_mtime_ns == written
-    assert len(PairedClips.open(tmp_path)) == 4
-
-
-@needs_egl
 def test_a_folder_of_another_world_is_refused(tmp_path: Path) -> None:
     list(generate(tmp_path, TINY, range(1), workers=1))
     with pytest.raises(DataError, match="choose another folder"):
@@ -85,29 +71,6 @@ def test_folders_without_data_are_refused(tmp_path: Path) -> None:
         PairedClips.open(tmp_path)
 
 
-@needs_egl
-def test_the_command_makes_clips(tmp_path: Path) -> None:
-    options = [
-        "--clips",
-        "1",
-        "--width",
-        "48",
-        "--height",
-        "32",
-        "--frames",
-        "2",
-        "--oversample",
-        "1",
-        "--workers",
-        "1",
-    ]
-    made = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path / "data"), *options])
-    assert made.exit_code == 0, made.output
-    again = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path / "data"), "--clips", "1"])
-    assert again.exit_code == 66
-    assert "choose another folder" in again.output
-
-
 def test_a_mount_that_is_no_number_is_refused(tmp_path: Path) -> None:
     made = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path), "--mount-height", "nan"])
     assert made.exit_code == 78
@@ -116,14 +79,16 @@ def test_a_mount_that_is_no_number_is_refused(tmp_path: Path) -> None:
 
 @needs_egl
 def test_growing_a_folder_makes_every_scene_once(tmp_path: Path) -> None:
-    list(generate(tmp_path, TINY, range(3), workers=1))
-    abandoned = tmp_path / "shard-00000009-2.1.partial"
-    abandoned.write_bytes(b"cut off")
+    assert list(generate(tmp_path, TINY, range(3), workers=1)) == [0, 2, 3]
+    abandoned, new = (tmp_path / f"shard-0000000{number}-2.1.partial" for number in (8, 9))
+    for path in (abandoned, new):
+        path.write_bytes(b"cut off")
     os.utime(abandoned, (0, 0))
-    list(generate(tmp_path, TINY, range(1, 6), workers=1))
-    clips = PairedClips.open(tmp_path)
-    assert list(clips.seeds) == [0, 1, 2, 3, 4, 5]
-    assert not abandoned.exists()
+    written = shard_path(tmp_path, range(2)).stat().st_mtime_ns
+    assert list(generate(tmp_path, TINY, range(1, 6), workers=1)) == [2, 4, 5]
+    assert list(PairedClips.open(tmp_path).seeds) == [0, 1, 2, 3, 4, 5]
+    assert shard_path(tmp_path, range(2)).stat().st_mtime_ns == written
+    assert (abandoned.exists(), new.exists()) == (False, True)
 
 
 @needs_egl

@@ -16,14 +16,13 @@ from tiny_scenes4d import write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
-from gcd_train.data.files import FileFault
+from gcd_train.data.files import GEOMETRY, FileFault
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.layouts.manifest import GEOMETRY
-from gcd_train.layouts.scene_writer import SceneFormat, write_scene
 from gcd_train.look.clip import SKY_M, UNSEEN, Footage
 from gcd_train.look.open_scene import ShowOptions, open_scene
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World
+from gcd_train.scenes.scene_writer import SceneFormat, write_scene
 
 FRAMES = 4
 

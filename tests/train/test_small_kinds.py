@@ -18,19 +18,16 @@ from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.batches import EncodedBatches, SampleBatches
-from gcd_train.data.latents import LatentClips, LatentRows
-from gcd_train.data.latents_writer import LatentsJob, encode_clips
-from gcd_train.data.loader import LoadedBatch
+from gcd_train.data.batches import EncodedBatches
+from gcd_train.data.latents import Encodings, LatentClips, LatentRows
 from gcd_train.data.open import DataPlaces, RunData, open_data
-from gcd_train.data.sample import Clips, MadeClips, Sample, collate, to_network
+from gcd_train.data.sample import Clips, MadeClips, Sample, to_network
 from gcd_train.data.sample import painted as painted_clips
 from gcd_train.errors import DataError, Interrupted
 from gcd_train.recipe import ClassWeightsName, Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
 from gcd_train.stop import StopSignal
-from gcd_train.training.conditioner import Conditioner, mirrored_path
-from gcd_train.training.draws import Draws
+from gcd_train.training.conditioner import mirrored_path
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.run import RunInputs, Trainer
@@ -217,20 +214,17 @@ KINDS = {
 def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
     """Latents of clips by a random autoencoder."""
     config = model_config(recipe.model)
-    assert recipe.latents is not None
-    job = LatentsJob(
-        folder=path,
-        networks=random_networks(config, seed=5),
-        clips=clips,
-        recipe=recipe.latents,
-        conditioner=Conditioner(config, recipe.unet, PRECISION, FAMILIES[recipe.model.family]),
-        class_weights=COLOUR_WEIGHTS[recipe.unet.loss.class_weights],
+    work = Encodings(
+        recipe=msgspec.structs.replace(recipe, seed=1),
+        config=config,
+        family=FAMILIES[recipe.model.family],
         precision=PRECISION,
-        seed=1,
-        identity="test",
+        clips=clips,
+        folder=path,
+        shared=None,
         stop=Never(),
     )
-    encode_clips(job)
+    work.encode(random_networks(config, seed=5))
     return LatentClips.open(path)
 
 
@@ -267,25 +261,6 @@ def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run
     assert path.delta is not None
     assert rows.control is not None
     assert torch.equal(rows.control[0], spherical_features(path.delta)[2])
-
-
-def test_batches_from_pixels_are_told_of_orbits_the_same(orbit_run: Path) -> None:
-    recipe = orbit_recipe()
-    unet = msgspec.structs.replace(recipe.unet, image_share=0.0)
-    networks = random_networks(model_config(recipe.model), seed=5)
-    batches = SampleBatches(TinyOrbits(), networks, unet, FAMILIES["kubric90"], PRECISION)
-    loaded = LoadedBatch(collate([TinyOrbits().sample(number) for number in (0, 1)]), (0, 1), 0.0)
-    batch = batches.batch(loaded, Draws(1, "test", 0, CPU))
-    encoded_rows = LatentClips.open(orbit_run / "latents").rows(
-        torch.tensor([0, 1]).repeat_interleave(FRAMES),
-        torch.arange(FRAMES).repeat(2),
-        torch.zeros(2 * FRAMES, dtype=torch.bool),
-        CPU,
-    )
-    assert batch.camera is not None
-    assert encoded_rows.control is not None
-    assert torch.equal(batch.camera, encoded_rows.control)
-    assert batch.condition.shape[1] == networks.config.unet.condition_channels
 
 
 @pytest.mark.parametrize(

@@ -122,12 +122,6 @@ def test_depth_and_colour_of_a_room_are_those_of_a_camera_that_stands_there(room
     assert np.median(np.abs(made.colour.numpy() - truth.rgb / 255)[seen]) < 0.05
 
 
-def test_nearer_points_win() -> None:
-    made = splat([wall(8.0, 200), wall(5.0, 50)], HERE, SOURCE)
-    np.testing.assert_allclose(made.colour.numpy(), 50 / 255, atol=1e-5)
-    np.testing.assert_allclose(made.depth.numpy(), 5.0)
-
-
 @pytest.mark.parametrize(("radius", "reached"), [(0, 1), (1, 4), (2, 9), (3, 16)])
 def test_a_single_point_shows_in_as_many_pixels_as_its_radius_says(radius: int, reached: int) -> None:
     depth = np.zeros((SOURCE.height, SOURCE.width), np.float32)
@@ -248,11 +242,6 @@ def test_a_gpu_draws_the_same(room: list[SceneView]) -> None:
     made, wanted = (splat(room, pose, TARGET, device=device) for device in ("cuda", "cpu"))
     assert psnr_db(replace(made, colour=made.colour.cpu()), wanted.colour.double().numpy()) >= 50.0
     assert (made.covered.cpu() == wanted.covered).float().mean() > 0.999
-
-
-def test_points_at_one_depth_are_averaged() -> None:
-    made = splat([wall(5.0, 200), wall(5.0, 50)], HERE, SOURCE, options=SplatOptions(radius=0))
-    np.testing.assert_allclose(made.colour.numpy(), 125 / 255, atol=1e-5)
 
 
 def test_sizes_may_differ_from_view_to_view(room: list[SceneView]) -> None:

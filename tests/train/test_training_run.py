@@ -10,7 +10,8 @@ import torch
 from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved, tiny_recipe
 
 from gcd_model import Clip, load_synthesizer
-from gcd_train.data.latents import LatentClips, write_index
+from gcd_train.data.cache import write_index
+from gcd_train.data.latents import LatentClips
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError

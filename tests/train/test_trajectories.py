@@ -15,13 +15,13 @@ from gcd_train.data.paths import (
     KUBRIC_FRAMES,
     MAX90,
     MAX180,
+    Control,
     Draw,
     DrivingSampling,
     FrameSampling,
     OrbitSampling,
     generator,
 )
-from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError
 
 SEEDS = st.integers(0, 2**31)

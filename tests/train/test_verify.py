@@ -8,10 +8,10 @@ from headless import needs_egl
 from typer.testing import CliRunner, Result
 
 from gcd_train.cli.main import app
+from gcd_train.data import kubric4d
+from gcd_train.data.files import MANIFEST
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d
-from gcd_train.layouts.manifest import MANIFEST
-from gcd_train.layouts.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.scene_writer import SceneFormat, write_scene
 
 
 def verified(*places: Path) -> Result:
@@ -37,7 +37,7 @@ def test_whole_scenes_are_counted(scenes: Path) -> None:
 
 @needs_egl
 def test_every_damaged_file_is_named(scenes: Path) -> None:
-    changed, missing = (kubric4d.frame_path(scenes / "scn00001", view, "depth", 0) for view in (0, 1))
+    changed, missing = (kubric4d.frame_path(scenes / "scn00001", view, "depth", 0) for view in ("view0", "view1"))
     changed.write_bytes(changed.read_bytes()[:-1] + b"x")
     missing.unlink()
     told = verified(scenes)

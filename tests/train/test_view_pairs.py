@@ -28,10 +28,9 @@ from gcd_model.geometry import SphericalDelta, to_pose
 from gcd_train.data.dataset4d import VOID
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
-from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
+from gcd_train.data.paths import DRIVING, MAX90, Control, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, ViewPairs, trained_lens, trained_picture
 from gcd_train.data.sample import Sample, collate
-from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RenderError
 from gcd_train.pointcloud import render_lens
 
@@ -67,11 +66,11 @@ def two_scenes(driving_root: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def kubric(kubric_root: Path) -> Kubric4D:
-    return Kubric4D.open(kubric_root, cameras=VIEWS)
+    return Kubric4D(kubric_root, cameras=VIEWS)
 
 
 def driving_pairs(root: Path, repeats: int = 400, **options: object) -> ViewPairs:
-    dataset, made = ParallelDomain4D.open(root, cameras=CAMERAS), PictureOptions(size=SIZE, **options)  # pyright: ignore
+    dataset, made = ParallelDomain4D(root, cameras=CAMERAS), PictureOptions(size=SIZE, **options)  # pyright: ignore
     return ViewPairs(dataset, PATH, 5, made, repeats=repeats)
 
 

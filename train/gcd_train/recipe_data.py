@@ -132,7 +132,7 @@ class LoaderRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class LeRobotRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Pairs of calibrated cameras, at unet.fps; see `lerobot.pairs.LeRobotOptions`."""
+    """Pairs of calibrated cameras, at unet.fps; see `data.lerobot.LeRobotPairs`."""
 
     cameras: tuple[str, ...] | None = None
     calibration: str | None = None

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
@@ -13,7 +12,8 @@ from gcd_train.cli.common import errors_shown
 from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
-    from gcd_train.data.cache_writer import CacheJob, CacheProgress
+    from gcd_train.data.cache import SceneShard
+    from gcd_train.data.cache_writer import CacheJob
     from gcd_train.data.dataset4d import Dataset4D
     from gcd_train.data.splits import Part
 
@@ -81,15 +81,14 @@ def cache(
 
     with errors_shown():
         choice = EncoderChoice(weights=weights, family=family, device=device, dtype=dtype, batch=batch)
-        encoders = load_encoders(choice)
-        config = encoders.networks.config
+        config = load_encoders(choice)[0].networks.config
         plan = ClipPlan(clip_frames=config.frames, paths=("gradual", "direct") if path == "both" else (path,))
         scenes = _dataset(data, split, split_file, limit, semantic)
         drawn = PictureOptions(
             size=(config.width, config.height), modality="classes" if semantic else "rgb", exact=exact
         )
         pictures = DrivingPictures(scenes, config.frames, drawn)
-        identity = identity_of(encoders, pictures, plan, copies=copies, seed=seed)
+        identity = identity_of(choice, pictures, plan, copies=copies, seed=seed)
         _run(CacheJob(folder=out, pictures=pictures, choice=choice, identity=identity), workers, ray)
 
 
@@ -100,7 +99,7 @@ def _dataset(
     from gcd_train.data.parallel_domain4d import ParallelDomain4D
     from gcd_train.data.splits import present, read_split
 
-    data = ParallelDomain4D.open(root, classes=semantic)
+    data = ParallelDomain4D(root, classes=semantic)
     if (split is None) != (split_file is None):
         raise RecipeError("a part of the set is named with both --split and --split-file; give both or neither")
     scenes = data.scenes
@@ -113,50 +112,36 @@ def _dataset(
 
 
 def _run(job: "CacheJob", workers: int, ray: str | None) -> None:
+    from gcd_train.data.cache import only_writer
     from gcd_train.data.cache_writer import cache_scenes
-    from gcd_train.data.latents import only_writer
 
-    folder, scenes = job.folder, job.pictures.scenes
+    folder, scenes, started = job.folder, job.pictures.scenes, time.perf_counter()
+    encoded, failed, total, there = 0, 0, 0, 0
     with only_writer(folder):
-        account = _Account(total=len(scenes))
-        for step in cache_scenes(job, scenes, workers=workers, ray_address=ray):
-            account = account.after(step)
-            _OUT.print(account.line(step), markup=False)
-    _close(folder, scenes, account)
+        there = len(_kept(folder, scenes))
+        for number, outcome in enumerate(cache_scenes(job, scenes, workers=workers, ray_address=ray), start=1):
+            entry = outcome.value
+            if entry is None:
+                failed += 1
+                _OUT.print(f"{outcome.item}  left out: {outcome.error}", markup=False)
+                continue
+            encoded, total = encoded + 1, total + entry.bytes
+            left_s = (time.perf_counter() - started) / number * (len(scenes) - there - number)
+            missing = f"  {len(entry.missing)} frames missing" if entry.missing else ""
+            _OUT.print(
+                f"{outcome.item}  {entry.bytes / 1e6:.2f} MB  {entry.seconds:.1f} s{missing}   {there + encoded} of "
+                f"{len(scenes)} scenes, all: {_size(total / encoded * len(scenes))}, {left_s / 60:.0f} min left",
+                markup=False,
+            )
+    _close(folder, scenes, failed)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Account:
-    """What a run did. encoded: scenes in this run. bytes, seconds: of these. started: clock of the run."""
+def _kept(folder: Path, scenes: Sequence[str]) -> "list[SceneShard]":
+    """Of these scenes those that the index has."""
+    from gcd_train.data.cache import CacheIndex, read_index
 
-    total: int
-    encoded: int = 0
-    failed: int = 0
-    bytes: int = 0
-    seconds: float = 0.0
-    started: float = field(default_factory=time.perf_counter)
-
-    def after(self, step: "CacheProgress") -> "_Account":
-        if step.entry is None:
-            return replace(self, failed=self.failed + 1)
-        return replace(
-            self,
-            encoded=self.encoded + 1,
-            bytes=self.bytes + step.entry.bytes,
-            seconds=self.seconds + step.entry.seconds,
-        )
-
-    def line(self, step: "CacheProgress") -> str:
-        """A scene's size and seconds, and what that makes for the whole set."""
-        if step.entry is None:
-            return f"{step.scene}  left out: {step.error}"
-        size, left = self.bytes / self.encoded, step.total - step.done - step.failed
-        pace = (time.perf_counter() - self.started) / (self.encoded + self.failed)
-        missing = f"  {len(step.entry.missing)} frames missing" if step.entry.missing else ""
-        return (
-            f"{step.scene}  {step.entry.bytes / 1e6:.2f} MB  {step.entry.seconds:.1f} s{missing}   {step.done} of "
-            f"{step.total} scenes, all: {_size(size * step.total)}, {pace * left / 60:.0f} min left"
-        )
+    index = read_index(folder, CacheIndex)
+    return [] if index is None else [index.scenes[name] for name in scenes if name in index.scenes]
 
 
 def _size(count: float) -> str:
@@ -164,21 +149,15 @@ def _size(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.2f} MB"
 
 
-def _close(folder: Path, scenes: Sequence[str], account: _Account) -> None:
-    from gcd_train.data.cache import CacheIndex
-    from gcd_train.data.latents import read_index
-
-    index = read_index(folder, CacheIndex)
-    kept = {} if index is None else {name: index.scenes[name] for name in scenes if name in index.scenes}
+def _close(folder: Path, scenes: Sequence[str], failed: int) -> None:
+    kept = _kept(folder, scenes)
     if kept:
-        size, seconds = (sum(numbers) for numbers in zip(*((e.bytes, e.seconds) for e in kept.values()), strict=True))
-        missing = sum(len(entry.missing) for entry in kept.values())
+        size, seconds = sum(entry.bytes for entry in kept), sum(entry.seconds for entry in kept)
+        missing = sum(len(entry.missing) for entry in kept)
         _OUT.print(
             f"{folder}: {len(kept)} scenes, {_size(size)}, {size / len(kept) / 1e6:.2f} MB and "
             f"{seconds / len(kept):.1f} s a scene, {missing} frames missing (named in index.json)",
             markup=False,
         )
-    if account.failed:
-        raise DataError(
-            f"{account.failed} of {len(scenes)} scenes could not be cached, see above; the others are whole"
-        )
+    if failed:
+        raise DataError(f"{failed} of {len(scenes)} scenes could not be cached, see above; the others are whole")

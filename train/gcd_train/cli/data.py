@@ -9,9 +9,9 @@ from rich.console import Console
 
 from gcd_model import printable
 from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
+from gcd_train.data import kubric4d, parallel_domain4d
+from gcd_train.data.files import MANIFEST, faults
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.layouts.manifest import MANIFEST, faults
 
 data = typer.Typer(no_args_is_help=True, help="Downloaded data sets: repacking.")
 export = typer.Typer(no_args_is_help=True, help="Write data in other programs' formats.")
@@ -45,8 +45,8 @@ def compact(
 
     A scene appears when all of it was read again and compared. Stopped at any point, the same line goes on.
     """
+    from gcd_train.data.compact import Compaction
     from gcd_train.files import remove_leftovers
-    from gcd_train.layouts.compact import Compaction
     from gcd_train.parallel import map_items, one_thread_each
 
     stop_as_by_ctrl_c()
@@ -141,7 +141,7 @@ def lerobot(
     """Tabletop episodes as a LeRobot data set (v3.0) with calibrated cameras (extras `scenes` and `lerobot`)."""
     if width % 2 or height % 2:
         raise typer.BadParameter(f"H.264 wants an even width and height, got {width} x {height}")
-    from gcd_train.lerobot.tabletop_export import TabletopExport, export_tabletop
+    from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
 
     wanted = TabletopExport(
         seeds=range(first_seed, first_seed + episodes),
@@ -168,13 +168,13 @@ def lerobot_command(
     seed: Annotated[int, typer.Option(min=0, help="Draws the cameras and windows.")] = 0,
 ) -> None:
     """Read pairs of cameras of a LeRobot data set as training would, and say what was left out."""
-    from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
+    from gcd_train.data.lerobot import LeRobotPairs
 
     tell = Console(highlight=False, soft_wrap=True).print
     with errors_shown():
-        pairs = LeRobotPairs(folder, seed, LeRobotOptions(frames=frames, fps=fps, calibration=calibration))
-        rate = pairs.folder.info.fps
-        tell(f"{len(pairs.folder.episodes)} episodes at {rate:g} frames per second, cameras {', '.join(pairs.cameras)}")
+        pairs = LeRobotPairs(folder, seed, frames=frames, fps=fps, calibration=calibration)
+        rate = pairs.info.fps
+        tell(f"{len(pairs.episodes)} episodes at {rate:g} frames per second, cameras {', '.join(pairs.cameras)}")
         for index in range(samples):
             sample = pairs.sample(index)
             apart = float(np.linalg.norm(sample.source_from_target[:, :3, 3], axis=-1).mean())

@@ -5,19 +5,18 @@ augmentation noise, and targets drawn from their posterior. From latents and a c
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gcd_model.conditioning import clip_pixels, micro_conditioning
 from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
 from gcd_model.weights.families import Family
-from gcd_train.data.cache import CachedClip, CachedLatents, PathKind, encoders_digest
+from gcd_train.data.cache import CachedClip, CachedLatents, FrozenEncoders, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader
 from gcd_train.data.sample import Samples, to_network
@@ -30,8 +29,6 @@ from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.objective import Batch, drop_streams
 from gcd_train.training.setup import Precision
 
-Made = TypeVar("Made")
-_AT_ONCE = 14  # frames; changes memory, not the result
 _WHOLE_CLIPS = 'unet.source "pixels" and a latent cache take whole clips only; set image_share to 0'
 
 
@@ -57,37 +54,18 @@ def encode_frames(
     The augmentation is noise on the pixels that the condition encoder sees, and on nothing else; the image tower sees
     clean frames. Source: Generative Camera Dolly, as released.
     """
+    encoders = FrozenEncoders(networks=networks)
     noisy = source + recipe.augmentation * draws.normal(*source.shape)
-    moments = [_in_kept_precision(networks.target_encoder, frames) for frames in target.split(_AT_ONCE)]
-    unit = draws.normal(target.shape[0], *moments[0].mean.shape[1:])
-    parts = zip(moments, unit.split(_AT_ONCE), strict=True)
-    latents = torch.cat([part.sample(noise).float() for part, noise in parts]) * networks.config.vae.scale
+    posterior = encoders.target(target)
+    latents = posterior.sample(draws.normal(*posterior.mean.shape)) * networks.config.vae.scale
     by_colour = COLOUR_WEIGHTS[recipe.loss.class_weights]
     size = (latents.shape[-2], latents.shape[-1])
     return EncodedFrames(
         target=latents,
-        source=_in_parts(lambda frames: _in_kept_precision(networks.condition_encoder, frames).mean, noisy),
-        tokens=_tokens(networks, source),
+        source=encoders.condition(noisy),
+        tokens=encoders.tokens(source),
         emphasis=class_emphasis(target, by_colour, size) if by_colour else None,
     )
-
-
-def _tokens(networks: Networks, source: Tensor) -> Tensor | None:
-    tower = networks.image_encoder
-    if tower is None:
-        return None
-    size = tower.config.image_size
-    return _in_parts(lambda frames: _in_kept_precision(tower, clip_pixels(frames, size)), source)
-
-
-def _in_parts(network: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
-    return torch.cat([network(part).float() for part in frames.split(_AT_ONCE)])
-
-
-def _in_kept_precision(network: Callable[[Tensor], Made], frames: Tensor) -> Made:
-    """What a network makes of frames in the precision its weights are kept in."""
-    assert isinstance(network, nn.Module), "weights are asked for their precision"
-    return network(frames.to(next(network.parameters()).dtype))
 
 
 class EncodedBatches:

@@ -1,4 +1,6 @@
-"""The latent cache of a driving set: frozen encoders run once, training reads what they gave. One shard a scene:
+"""What frozen encoders gave, on disk: shards that appear whole, and an `index.json` that names them, replaced whole.
+
+The latent cache of a driving set: encoders run once, training reads what they gave. One shard a scene:
 
 times                 int16  [N]                  frames that are in
 pairs                 int16  [R, 2]               time and path position of every target row
@@ -19,24 +21,175 @@ K copies keep the 0.02 pixel noise of the paper: every frame of every clip draws
 clip.
 """
 
-from collections.abc import Collection, Sequence
+import fcntl
+import hashlib
+from collections.abc import Callable, Collection, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import torch
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from gcd_model.errors import FileError
+from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks, weights_digest
+from gcd_model.small_files import read_json
 from gcd_model.vae import Posterior
 from gcd_train.data.files import Recent
-from gcd_train.data.latents import Index, Shard, open_shard, read_index
-from gcd_train.errors import DataError
+from gcd_train.errors import DataError, RunError
+from gcd_train.files import write_whole
 from gcd_train.training.draws import Draws
 
+FORMAT = 2
+_INDEX, _MOST_INDEX = "index.json", 1 << 26
 PathKind = Literal["gradual", "direct"]
 _LOWEST, _SPAN, _CODES = -30.0, 50.0, 255
+Made = TypeVar("Made")
+
+
+class Shard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One file. file: in the folder. arrays: shape by name."""
+
+    file: str
+    sha256: str
+    bytes: int
+    arrays: dict[str, tuple[int, ...]]
+
+
+class Index(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What `index.json` says. format: of index and shards."""
+
+    format: int = FORMAT
+
+
+Kind = TypeVar("Kind", bound=Index)
+AnyShard = TypeVar("AnyShard", bound=Shard)
+
+
+def read_index(folder: Path, kind: type[Kind]) -> Kind | None:
+    """The index of a folder, None where there is none yet. Raises RunError if it cannot be read."""
+    path = folder / _INDEX
+    if not (path.exists() or path.is_symlink()):
+        return None
+    try:
+        index = read_json(path, kind, _MOST_INDEX)
+    except FileError as error:
+        raise RunError(f"{path} {error}; delete {folder} and encode again") from error
+    if index.format != FORMAT:
+        raise RunError(f"{path} has format {index.format}, this version reads {FORMAT}; delete {folder}, encode again")
+    return index
+
+
+def write_index(folder: Path, index: Index) -> None:
+    """Replace the index; a reader sees the old one or the new one. Raises RunError if it cannot be written."""
+    write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)), lasting=True)
+
+
+def write_shard(folder: Path, name: str, tensors: dict[str, Tensor], kind: type[AnyShard], **facts: Any) -> AnyShard:
+    """Write a shard and say what it is, with some more facts. Raises RunError if it cannot be written."""
+    content, file = save(tensors), f"{name}.safetensors"
+    write_whole(folder / file, content, lasting=True)
+    arrays = {name: tuple(values.shape) for name, values in sorted(tensors.items())}
+    digest = hashlib.sha256(content).hexdigest()
+    return kind(file=file, sha256=digest, bytes=len(content), arrays=arrays, **facts)
+
+
+def fault(folder: Path, shard: Shard) -> str | None:
+    """What is wrong with a shard: missing, cut, changed; None if it is as it was written."""
+    path = folder / shard.file
+    try:
+        if not path.is_file() or path.stat().st_size != shard.bytes:
+            return f"{path} is missing or not of the {shard.bytes} bytes that were written"
+        content = path.read_bytes()
+    except OSError as error:
+        return f"{path}: {error.strerror}"
+    same = hashlib.sha256(content).hexdigest() == shard.sha256
+    return None if same else f"{path} is damaged: its SHA-256 is not the one it was written with"
+
+
+def open_shard(folder: Path, shard: Shard, redo: str) -> dict[str, Tensor]:
+    """The arrays of a shard, mapped: read where they are used.
+
+    Raises DataError, with how to make it again, if it is missing or not as it was written.
+    """
+    wrong = fault(folder, shard)
+    if wrong is not None:
+        raise DataError(f"{wrong}; {redo}")
+    return load_file(folder / shard.file)
+
+
+@contextmanager
+def only_writer(folder: Path) -> Generator[None]:
+    """Hold a folder for one run. Raises RunError if another run has it; a killed one lets go by itself."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RunError(f"another run is writing to {folder}; wait for it, or stop it") from error
+        for leftover in folder.glob(".*.partial"):
+            leftover.unlink(missing_ok=True)
+        yield
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrozenEncoders:
+    """The encoders of some networks, run where and as precisely as their weights are kept.
+
+    at_once: frames a call; it changes memory, not the result. All give float32, on the device of the weights.
+    """
+
+    networks: Networks
+    at_once: int = 14
+
+    def target(self, frames: Tensor) -> Posterior:
+        """Target latents of frames [N, 3, H, W] in [-1, 1], not scaled."""
+        parts = self._parts(self.networks.target_encoder, frames)
+        return Posterior(*(torch.cat([getattr(p, name).float() for p in parts]) for name in ("mean", "log_variance")))
+
+    def condition(self, frames: Tensor) -> Tensor:
+        """Condition latents [N, C, h, w] of frames with their noise, not scaled."""
+        return torch.cat([part.mean.float() for part in self._parts(self.networks.condition_encoder, frames)])
+
+    def tokens(self, frames: Tensor) -> Tensor | None:
+        """Image tokens [N, D] of clean frames; None for a model without an image tower."""
+        tower = self.networks.image_encoder
+        if tower is None:
+            return None
+        pixels = [clip_pixels(part, tower.config.image_size) for part in frames.split(self.at_once)]
+        return torch.cat([tokens.float() for part in pixels for tokens in self._parts(tower, part)])
+
+    def _parts(self, encoder: Callable[[Tensor], Made], frames: Tensor) -> list[Made]:
+        assert isinstance(encoder, nn.Module), "weights say where and how precisely they compute"
+        return [encoder(part) for part in frames.to(next(encoder.parameters())).split(self.at_once)]
+
+
+def encoder_parts(networks: Networks) -> dict[str, nn.Module]:
+    """The frozen encoders by what they encode."""
+    parts = {
+        "target": networks.target_encoder,
+        "condition": networks.condition_encoder,
+        "image": networks.image_encoder,
+    }
+    return {name: part for name, part in parts.items() if part is not None}
+
+
+def encoders_digest(networks: Networks) -> str:
+    """Names the weights of the frozen encoders, whatever type they are kept in."""
+    states = {name: part.state_dict() for name, part in encoder_parts(networks).items()}
+    return weights_digest({f"{part}.{name}": value.float() for part in states for name, value in states[part].items()})
+
+
+def autoencoder_digest(networks: Networks) -> str:
+    """Names the weights that encode and decode."""
+    parts = (networks.target_encoder, networks.condition_encoder, networks.decoder)
+    return weights_digest(
+        {f"{i}.{name}": value for i, part in enumerate(parts) for name, value in part.state_dict().items()}
+    )
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -231,19 +384,3 @@ def log_variance_codes(log_variance: Tensor) -> Tensor:
 def log_variance_of(codes: Tensor) -> Tensor:
     """Inverse of `log_variance_codes`, float32; off by 0.1 at most."""
     return codes.float() * (_SPAN / _CODES) + _LOWEST
-
-
-def encoder_parts(networks: Networks) -> dict[str, nn.Module]:
-    """The frozen encoders by what they encode."""
-    parts = {
-        "target": networks.target_encoder,
-        "condition": networks.condition_encoder,
-        "image": networks.image_encoder,
-    }
-    return {name: part for name, part in parts.items() if part is not None}
-
-
-def encoders_digest(networks: Networks) -> str:
-    """Names the weights of the frozen encoders, whatever type they are kept in."""
-    states = {name: part.state_dict() for name, part in encoder_parts(networks).items()}
-    return weights_digest({f"{part}.{name}": value.float() for part in states for name, value in states[part].items()})

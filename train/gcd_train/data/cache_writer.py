@@ -22,26 +22,28 @@ from gcd_model.conditioning import clip_pixels
 from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
 from gcd_model.loading import random_weights, weights_path
-from gcd_model.networks import Networks
-from gcd_model.vae import Posterior
 from gcd_model.weights.card import precision
 from gcd_model.weights.load import load_weights
 from gcd_train.data.cache import (
     CacheIdentity,
     CacheIndex,
     ClipPlan,
+    FrozenEncoders,
     SceneShard,
     encoder_parts,
     encoders_digest,
+    fault,
     log_variance_codes,
+    read_index,
+    write_index,
+    write_shard,
 )
 from gcd_train.data.dataset4d import Dataset4D
-from gcd_train.data.latents import fault, read_index, write_index, write_shard
 from gcd_train.data.paths import Draw
 from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
 from gcd_train.data.sample import Bytes, to_network
 from gcd_train.errors import DataError, RecipeError, RunError
-from gcd_train.parallel import map_items
+from gcd_train.parallel import Outcome, map_items
 from gcd_train.training.draws import Draws
 from gcd_train.training.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
 
@@ -61,41 +63,9 @@ class EncoderChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     batch: int = 2
 
 
-@dataclass(frozen=True, slots=True)
-class Encoders:
-    """Frozen encoders on their device. digest: names their weights, whatever checkpoint they came in."""
-
-    networks: Networks
-    digest: str
-    choice: EncoderChoice
-    device: torch.device
-
-    def posterior(self, frames: Tensor) -> Posterior:
-        """Target latents of frames [N, 3, H, W] in [-1, 1], not scaled: float32 moments on the CPU."""
-        parts = [self.networks.target_encoder(rows) for rows in self._batches(frames)]
-        mean, log_variance = (torch.cat([getattr(p, name) for p in parts]) for name in ("mean", "log_variance"))
-        return Posterior(mean.float().cpu(), log_variance.float().cpu())
-
-    def condition_mean(self, frames: Tensor) -> Tensor:
-        """Condition latents [N, C, h, w] of frames with their noise, not scaled; float32 on the CPU."""
-        return torch.cat([self.networks.condition_encoder(rows).mean for rows in self._batches(frames)]).float().cpu()
-
-    def tokens(self, frames: Tensor) -> Tensor | None:
-        """Image tokens [N, D] of clean frames; None for a model without an image tower."""
-        tower = self.networks.image_encoder
-        if tower is None:
-            return None
-        size = tower.config.image_size
-        rows = [tower(clip_pixels(rows.float(), size).to(rows.dtype)) for rows in self._batches(frames)]
-        return torch.cat(rows).float().cpu()
-
-    def _batches(self, frames: Tensor) -> tuple[Tensor, ...]:
-        return frames.to(self.device, precision(self.choice.dtype)).split(self.choice.batch)
-
-
 @lru_cache(maxsize=1)
-def load_encoders(choice: EncoderChoice) -> Encoders:
-    """Load, freeze and place the encoders; a process does it once.
+def load_encoders(choice: EncoderChoice) -> tuple[FrozenEncoders, str]:
+    """Load, freeze and place the encoders, and name their weights by a digest; a process does it once.
 
     Raises: CheckpointError, OptionError as `load_weights`; RecipeError where the device is not there.
     """
@@ -112,7 +82,7 @@ def load_encoders(choice: EncoderChoice) -> Encoders:
         module.to(device, precision(choice.dtype)).requires_grad_(False).eval()
         if device.type == "cpu":
             arrange(module)
-    return Encoders(networks, digest, choice, device)
+    return FrozenEncoders(networks=networks, at_once=choice.batch), digest
 
 
 class DrivingPictures:
@@ -147,7 +117,7 @@ class DrivingPictures:
             start=None,
             deltas=None,
         )
-        made = self._pictures.make(scene, draw)
+        made = self._pictures.sample(scene, draw)
         if not self._options.exact:
             return made.source[0], made.target
         view = self.data.views(scene, time, [self.data.source_camera])[0]
@@ -155,7 +125,7 @@ class DrivingPictures:
 
 
 def encode_scene(
-    encoders: Encoders, pictures: DrivingPictures, identity: CacheIdentity, scene: str
+    encoders: FrozenEncoders, pictures: DrivingPictures, identity: CacheIdentity, scene: str
 ) -> tuple[dict[str, Tensor], dict[int, str]]:
     """The tensors of a scene's shard: everything its clips need; and why frames that cannot be had are left out.
 
@@ -195,15 +165,15 @@ def encode_scene(
 
 @torch.no_grad()
 def encode_moment(
-    encoders: Encoders, identity: CacheIdentity, source_picture: Bytes, target_pictures: Bytes, name: str
+    encoders: FrozenEncoders, identity: CacheIdentity, source_picture: Bytes, target_pictures: Bytes, name: str
 ) -> dict[str, Tensor]:
     """The rows of one frame: source [1, ...], targets [P, ...]. name: of the frame, what its noise follows from."""
     source, targets = to_network(source_picture[None]), to_network(target_pictures)
     draws = Draws(identity.seed, f"latent cache/{name}", 0, torch.device("cpu"))
     noise = draws.normal(identity.copies, *source.shape[1:])
-    posterior = encoders.posterior(targets)
+    posterior = encoders.target(targets)
     rows = {
-        "source": encoders.condition_mean(source + identity.augmentation * noise)[None].half(),
+        "source": encoders.condition(source + identity.augmentation * noise)[None].half(),
         "target_mean": posterior.mean.half(),
         "target_log_variance": log_variance_codes(posterior.log_variance),
     }
@@ -213,7 +183,7 @@ def encode_moment(
     if identity.emphasis:
         size = (posterior.mean.shape[-2], posterior.mean.shape[-1])
         rows["emphasis"] = class_emphasis(targets, PARALLEL_DOMAIN_WEIGHTS, size).half()
-    return rows
+    return {name: values.cpu() for name, values in rows.items()}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -227,10 +197,10 @@ class CacheJob:
 
     def __call__(self, scene: str) -> SceneShard:
         """Encode a scene and write its shard. Raises TrainError."""
-        encoders = load_encoders(self.choice)
-        if encoders.digest != self.identity.encoders:
+        encoders, digest = load_encoders(self.choice)
+        if digest != self.identity.encoders:
             raise RunError(
-                f"{self.choice.weights} holds encoders {encoders.digest} on this machine, {self.identity.encoders} "
+                f"{self.choice.weights} holds encoders {digest} on this machine, {self.identity.encoders} "
                 "where the run was started; copy the same file there"
             )
         started = time.perf_counter()
@@ -247,31 +217,15 @@ class CacheJob:
         )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CacheProgress:
-    """A scene is done, or failed. entry: None if it failed. error: why. done, failed, total: scenes so far."""
-
-    scene: str
-    entry: SceneShard | None
-    error: str | None
-    done: int
-    failed: int
-    total: int
-
-
 def identity_of(
-    encoders: Encoders,
-    pictures: DrivingPictures,
-    plan: ClipPlan,
-    *,
-    copies: int = 4,
-    seed: int = 0,
+    choice: EncoderChoice, pictures: DrivingPictures, plan: ClipPlan, *, copies: int = 4, seed: int = 0
 ) -> CacheIdentity:
     """What a cache made now would say of itself; its pixel noise is as strong as the checkpoint is sampled with."""
+    encoders, digest = load_encoders(choice)
     config = encoders.networks.config
     return CacheIdentity(
-        encoders=encoders.digest,
-        dtype=encoders.choice.dtype,
+        encoders=digest,
+        dtype=choice.dtype,
         pictures=pictures.origin,
         fps=pictures.fps,
         plan=plan,
@@ -286,28 +240,20 @@ def identity_of(
 
 
 def cache_scenes(
-    job: CacheJob,
-    scenes: Sequence[str],
-    *,
-    workers: int = 1,
-    ray_address: str | None = None,
-) -> Iterator[CacheProgress]:
+    job: CacheJob, scenes: Sequence[str], *, workers: int = 1, ray_address: str | None = None
+) -> Iterator[Outcome[str, SceneShard]]:
     """Make the shards that are missing or damaged; each scene ends in the index or is reported with its error.
 
     The caller holds `only_writer`. Raises: RunError if the folder holds another cache or cannot be written.
     """
     index = _begun(job)
     todo = [scene for scene in scenes if scene not in index.scenes]
-    done, failed = len(scenes) - len(todo), 0
     for outcome in map_items(job, todo, workers=workers, ray_address=ray_address):
-        scene, entry, why = outcome.item, outcome.value, outcome.error and str(outcome.error)
-        if entry is None:
-            failed += 1
-        else:
-            done += 1
-            index = msgspec.structs.replace(index, scenes=dict(sorted({**index.scenes, scene: entry}.items())))
+        if outcome.value is not None:
+            scenes_now = sorted({**index.scenes, outcome.item: outcome.value}.items())
+            index = msgspec.structs.replace(index, scenes=dict(scenes_now))
             write_index(job.folder, index)
-        yield CacheProgress(scene=scene, entry=entry, error=why, done=done, failed=failed, total=len(scenes))
+        yield outcome
 
 
 def _begun(job: CacheJob) -> CacheIndex:

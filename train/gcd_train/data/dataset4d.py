@@ -153,7 +153,7 @@ class _Colour(msgspec.Struct, frozen=True):
 
 
 class _Item(msgspec.Struct, frozen=True):
-    """Others' file: what else stands in it is theirs."""
+    """Others' file: what else stands in it is not needed."""
 
     id: int
     name: str
@@ -166,14 +166,10 @@ class _File(msgspec.Struct, frozen=True):
 
 def _parsed(path: Path) -> Ontology:
     try:
-        items = decode_json(read(path, MOST_TEXT), _File).items
-        return Ontology(
-            tuple(
-                OntologyItem(id=item.id, name=item.name, colour=(item.color.r, item.color.g, item.color.b))
-                for item in items
-                if 0 <= item.id < _IDS
-            )
-        )
+        items = [item for item in decode_json(read(path, MOST_TEXT), _File).items if 0 <= item.id < _IDS]
+        colours = [(item.color.r, item.color.g, item.color.b) for item in items]
+        listed = zip(items, colours, strict=True)
+        return Ontology(tuple(OntologyItem(id=item.id, name=item.name, colour=colour) for item, colour in listed))
     except FileError as error:
         raise FileFault(path, f"is no ontology: it {error}") from error
     except FileFault:
@@ -222,11 +218,15 @@ class Dataset4D(ABC):
         """world_from_camera of a view, f64 [4, 4], metres. Raises FileFault."""
 
     @abstractmethod
-    def views(self, scene: str, time: int, cameras: Sequence[str] | None = None) -> list[SceneView]:
-        """What the cameras (all, if None) saw at a time step, in the order asked for.
+    def view(self, scene: str, camera: str, time: int) -> SceneView:
+        """What a camera saw at a time step.
 
         Raises FileFault (a DataError) that names the file which is missing, damaged or does not fit.
         """
+
+    def views(self, scene: str, time: int, cameras: Sequence[str] | None = None) -> list[SceneView]:
+        """What the cameras (all, if None) saw at a time step, in the order asked for. Raises FileFault."""
+        return [self.view(scene, camera, time) for camera in cameras or self.cameras]
 
 
 def scene_names(root: Path, number: Callable[[str], int | None], example: str) -> list[str]:

@@ -1,29 +1,29 @@
-"""Files of data sets, archives and pictures: nothing is unpickled or unfolds without limit, and a fault names its file.
+"""Files of data sets and archives: nothing is unpickled or unfolds without limit, and a fault names its file.
 
-What could not be read and was left out is counted and named, so that no fault in the data is silent or fatal.
+What could not be read and was left out is counted and named, so that no fault in the data is silent or fatal. Folders
+of our own scenes keep a checksum of every file in their `gcd-manifest.json`.
 """
 
+import hashlib
 import io
 import logging
-import struct
 import zipfile
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
-import cv2
-import imagesize
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_model.errors import FileError
+from gcd_model.small_files import read_json
 from gcd_train.errors import DataError
-from gcd_train.layouts.encodings import FAR_M, stored_depth
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
@@ -33,9 +33,11 @@ ZIP_FAULTS = (OSError, KeyError, ValueError, NotImplementedError, EOFError, zlib
 """What zipfile raises for a damaged or hostile file, and `read_member`."""
 MOST_TEXT, MOST_PICTURE = 1 << 24, 1 << 28
 """Bytes of a data set's JSON, and of a picture's file."""
-_MOST_ARRAYS, _MOST_MEMBER, _MOST_PIXELS = 1 << 30, 1 << 28, 1 << 27
-_PNG = b"\x89PNG\r\n\x1a\n"
-_PNG_PALETTE, _PNG_GREY = 3, 0
+_MOST_ARRAYS, _MOST_MEMBER = 1 << 30, 1 << 28
+MANIFEST = "gcd-manifest.json"
+GEOMETRY = "geometry.npz"
+"""A scene ready to draw (`FrozenScene`), beside the manifest."""
+Matrix = tuple[tuple[float, float, float, float], ...]
 
 
 class FileFault(DataError):  # noqa: N818  a fault of the data, which readers of it name
@@ -163,136 +165,87 @@ def read_member(archive: zipfile.ZipFile, name: str) -> bytes:
     return archive.read(name)
 
 
-def read_colour(path: Path) -> Bytes:
-    """RGB picture of a PNG, WebP or JPEG file, u8 [H, W, 3]; alpha is dropped. Raises FileFault."""
-    picture = decoded(path, read(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+class SceneManifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Written last, so that a scene that has one is whole.
 
-
-def read_depth(path: Path, key: str = "data") -> Floats:
-    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a PNG of ours (`DepthCode`).
-
-    0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
-    Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known or within those.
+    layout: which names and encodings. world, seed, edition: what was drawn; the edition rises whenever a world draws
+    another scene for the same seed. version: of this package. compact: WebP and depth codes in place of the
+    published encodings. cameras: their names, in order. hfov_deg: of every camera. world_from_vehicle: [T][4][4],
+    where the vehicle is in the frame of `geometry.npz`; None where poses are told in the world itself. facts: what the
+    world tells of the whole scene. files: relative path -> SHA-256, without the manifest.
     """
-    match path.suffix:
-        case ".npz":
-            metres = _npz(path, key)
-        case ".png":
-            metres = _depth_png(path)
-        case _:
-            metres = _float_tiff(path)
-    if not float(metres.min()) >= 0:  # NaN is the least of all
-        bad = int(np.count_nonzero(~(metres >= 0)))
-        raise FileFault(path, f"has {bad} of {metres.size} depths that are NaN or negative")
-    farthest = float(metres.max())
-    if farthest == 0:
-        raise FileFault(path, "has no depth above 0 in any pixel")
-    if float(metres.min()) > FAR_M:
-        raise FileFault(path, f"has depths beyond {FAR_M:g} m in every pixel: no scene is so far away")
-    return np.minimum(metres, np.float32(FAR_M)) if farthest > FAR_M else metres
+
+    layout: Literal["kubric4d", "parallel_domain4d"]
+    world: str
+    seed: int
+    version: str
+    edition: int
+    frames: int
+    fps: float
+    width: int
+    height: int
+    oversample: int
+    compact: bool
+    hfov_deg: float
+    cameras: tuple[str, ...]
+    files: dict[str, str]
+    world_from_vehicle: tuple[Matrix, ...] | None = None
+    facts: dict[str, float | str] = {}
+    format: Literal[1] = 1
 
 
-def read_ids(path: Path) -> NDArray[np.int32]:
-    """Ids, i32 [H, W], of a PNG that stores them as R + 256 G + 65536 B. Raises FileFault."""
-    content = read(path)
-    _require_whole_png(path, content)
-    picture = decoded(path, content, cv2.IMREAD_COLOR)
-    ids = cv2.extractChannel(picture, 2).astype(np.int32)
-    for channel, unit in ((1, 256), (0, 65536)):
-        more = cv2.extractChannel(picture, channel)
-        if cv2.countNonZero(more):  # mostly there is nothing in them
-            ids += more.astype(np.int32) * unit
-    return ids
+class SceneFiles:
+    """Writes into one scene folder and keeps the SHA-256 of every file for its manifest."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.checksums: dict[str, str] = {}
+        self.size = 0
+
+    def write(self, path: Path, data: bytes) -> None:
+        """One file; its folder is made when needed. Raises OSError, which names it, for one if the disk is full."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.write_bytes(data)
+        except OSError as error:  # a full disk does not say for which file
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        self.checksums[path.relative_to(self.folder).as_posix()] = hashlib.sha256(data).hexdigest()
+        self.size += len(data)
 
 
-def read_palette_indices(path: Path) -> Bytes:
-    """Indices, u8 [H, W], of a palette PNG; of a grey one its values. Raises FileFault.
+def package_version() -> str:
+    """Of this package; `unknown` in a tree that was never installed."""
+    try:
+        return version("gcd-node")
+    except PackageNotFoundError:
+        return "unknown"
 
-    OpenCV would give the palette's colours. A palette picture without its palette is a grey picture, though, so the
-    header is rewritten to say that before it is decoded.
+
+def read_manifest(scene: Path) -> SceneManifest:
+    """Of a scene folder. Raises DataError if it has none, or one that cannot be read."""
+    path = scene / MANIFEST
+    if not path.exists():
+        raise DataError(f"{scene} has no {MANIFEST}: it was not made by `gcd-train generate`")
+    try:
+        return read_json(path, SceneManifest, MOST_TEXT)
+    except FileError as error:
+        raise DataError(f"{path} {error}; delete the scene and generate it again") from error
+
+
+def faults(scene: Path) -> Iterator[str]:
+    """One line for every file of a scene folder that is missing, cannot be read, or is not as it was written.
+
+    Files that other programs added are no fault. Raises: DataError as `read_manifest`.
     """
-    content = read(path)
-    _require_whole_png(path, content)
-    depth, kind = content[24], content[25]
-    if kind == _PNG_PALETTE:
-        content = _as_grey(content)
-    elif kind != _PNG_GREY:
-        raise FileFault(path, "holds colours, not a palette: instance numbers cannot be told from it")
-    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
-    if picture.dtype != np.uint8 or picture.ndim != 2:
-        raise FileFault(path, f"should hold 8-bit indices, got {picture.dtype} {list(picture.shape)}")
-    step = 255 // (2**depth - 1) if depth < 8 else 1  # fewer bits are spread over 0..255 when they are decoded
-    return np.ascontiguousarray(picture // step, dtype=np.uint8)
-
-
-def require_size(path: Path, picture: NDArray[np.generic], height: int, width: int, other: str) -> None:
-    """Raises FileFault if a picture has another size than `other` says."""
-    if picture.shape[:2] != (height, width):
-        got = f"{picture.shape[1]} x {picture.shape[0]}"
-        raise FileFault(path, f"is {got} where {other} says {width} x {height}: sizes are mixed")
-
-
-def decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
-    """The picture in a file's content, as OpenCV decodes it with these flags. Raises FileFault."""
-    try:
-        width, height = imagesize.get(io.BytesIO(content), exif_rotation=False)
-    except Exception as error:  # of any kind, where a header is damaged
-        raise FileFault(path, f"is damaged: its size cannot be read ({error})") from error
-    if width * height > _MOST_PIXELS:
-        raise FileFault(path, f"states {width} x {height} pixels, more than {_MOST_PIXELS}")
-    try:
-        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error as error:
-        raise FileFault(path, f"cannot be decoded ({error.err or error})") from error
-    if picture is None:  # pyright: ignore[reportUnnecessaryComparison]  the stub does not tell
-        raise FileFault(path, f"is damaged: its {len(content)} bytes hold no whole picture")
-    return picture  # pyright: ignore[reportReturnType]
-
-
-def _float_tiff(path: Path) -> Floats:
-    picture = decoded(path, read(path), cv2.IMREAD_UNCHANGED)
-    if picture.dtype.kind != "f" or picture.size != picture.shape[0] * picture.shape[1]:
-        raise FileFault(path, f"should hold float32 depth, got {picture.dtype} {list(picture.shape)}")
-    return picture.reshape(picture.shape[:2]).astype(np.float32, copy=False)
-
-
-def _npz(path: Path, key: str) -> Floats:
-    array = read_npz(path).get(key)
-    if array is None:
-        raise FileFault(path, f"lacks its array `{key}`")
-    if array.dtype.kind != "f" or array.ndim < 2 or array.size == 0 or array.size != array.shape[0] * array.shape[1]:
-        raise FileFault(path, f"should hold float depth [H, W], got {array.dtype} {list(array.shape)}")
-    return array.reshape(array.shape[:2]).astype(np.float32, copy=False)
-
-
-def _depth_png(path: Path) -> Floats:
-    content = read(path)
-    _require_whole_png(path, content)
-    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
-    metres = stored_depth(picture)
-    if metres is None:
-        got = f"{picture.dtype} {list(picture.shape)}"
-        raise FileFault(path, f"should hold 16-bit depth codes, or their low bytes above their high ones, got {got}")
-    return metres
-
-
-def _require_whole_png(path: Path, content: bytes) -> None:
-    """Some versions of libpng fill what is cut off with zeros; those would be ids."""
-    if not content.startswith(_PNG) or len(content) < 33:
-        raise FileFault(path, "is damaged: it is no PNG")
-    if content[-8:-4] != b"IEND":
-        raise FileFault(path, f"is damaged: it is cut off after {len(content)} bytes")
-
-
-def _as_grey(content: bytes) -> bytes:
-    """A palette PNG as a grey PNG of its indices."""
-    header = content[12:25] + bytes([_PNG_GREY]) + content[26:29]
-    rebuilt = [content[:12], header, struct.pack(">I", zlib.crc32(header))]
-    at = 33
-    while at + 8 <= len(content):
-        length, name = struct.unpack_from(">I4s", content, at)
-        if name not in (b"PLTE", b"tRNS", b"bKGD", b"sBIT", b"hIST"):  # mean something else, or nothing, in grey
-            rebuilt.append(content[at : at + 12 + length])
-        at += 12 + length
-    return b"".join(rebuilt)
+    for name, wanted in read_manifest(scene).files.items():
+        try:
+            if (scene / name).exists() and not (scene / name).is_file():
+                yield f"{scene / name} is no regular file"
+                continue
+            with (scene / name).open("rb") as file:
+                came = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            yield f"{scene / name} cannot be read ({error.strerror})"
+            continue
+        if came != wanted:
+            yield f"{scene / name} is not as it was written: SHA-256 {came[:12]}…, wanted {wanted[:12]}…"

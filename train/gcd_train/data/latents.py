@@ -1,9 +1,6 @@
-"""Folders of what encoders made of clips or scenes: shards that appear whole, and an index that names them.
+"""The clips of a run, encoded once: as the U-Net needs them.
 
-index.json      how everything was made and, of every shard, size, SHA-256 and arrays; replaced as a whole
-*.safetensors   a shard
-
-Of the clips of a run, as the U-Net needs them, a shard holds some that follow each other (a scene's: see `cache`):
+A folder of them has an index and shards (see `cache`); a shard holds some clips that follow each other:
 
 source      float16 [N, F, T, C, h, w]      clean condition latents, plain and (F = 2) mirrored
 target      float16 [N, F, T, C, h, w]      target latents, as the U-Net works on them
@@ -12,112 +9,43 @@ control     float32 [N, F, T, K]            camera features, where the model is 
 emphasis    float16 [N, T, 1, h, w]         how much more a class counts, see `class_emphasis`
 """
 
-import fcntl
-import hashlib
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+import logging
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Self
 
 import msgspec
 import torch
-from safetensors.torch import load_file, save
 from torch import Tensor
 
-from gcd_model.errors import FileError
-from gcd_model.small_files import read_json
-from gcd_train.errors import DataError, RunError
-from gcd_train.files import write_whole
+from gcd_model import Family, ModelConfig
+from gcd_model.networks import Networks
+from gcd_train.data.cache import (
+    FrozenEncoders,
+    Index,
+    Shard,
+    autoencoder_digest,
+    open_shard,
+    read_index,
+    write_index,
+    write_shard,
+)
+from gcd_train.data.sample import Clips, numbers_of, to_network
+from gcd_train.errors import DataError, Interrupted, RunError
+from gcd_train.recipe import LatentsRecipe, Recipe
+from gcd_train.stop import StopSignal
+from gcd_train.training.conditioner import Conditioner, mirrored_path
+from gcd_train.training.draws import Draws
+from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
+from gcd_train.training.setup import Precision, digest_of
 
-FORMAT = 2
-_INDEX, _MOST_INDEX = "index.json", 1 << 26
-
-
-class Shard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One file. file: in the folder. arrays: shape by name."""
-
-    file: str
-    sha256: str
-    bytes: int
-    arrays: dict[str, tuple[int, ...]]
-
-
-class Index(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What `index.json` says. format: of index and shards."""
-
-    format: int = FORMAT
-
-
-Kind = TypeVar("Kind", bound=Index)
-AnyShard = TypeVar("AnyShard", bound=Shard)
+_log = logging.getLogger(__name__)
+_SHARD = 32  # clips
+_LOG_S = 15.0
+_SENSITIVITY_CLIPS, _NUDGE = 8, 0.25
 _ANEW = "delete its folder and run `gcd-train train ... --stage latents`"
-
-
-def read_index(folder: Path, kind: type[Kind]) -> Kind | None:
-    """The index of a folder, None where there is none yet. Raises RunError if it cannot be read."""
-    path = folder / _INDEX
-    if not (path.exists() or path.is_symlink()):
-        return None
-    try:
-        index = read_json(path, kind, _MOST_INDEX)
-    except FileError as error:
-        raise RunError(f"{path} {error}; delete {folder} and encode again") from error
-    if index.format != FORMAT:
-        raise RunError(f"{path} has format {index.format}, this version reads {FORMAT}; delete {folder}, encode again")
-    return index
-
-
-def write_index(folder: Path, index: Index) -> None:
-    """Replace the index; a reader sees the old one or the new one. Raises RunError if it cannot be written."""
-    write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)), lasting=True)
-
-
-def write_shard(folder: Path, name: str, tensors: dict[str, Tensor], kind: type[AnyShard], **facts: Any) -> AnyShard:
-    """Write a shard and say what it is, with some more facts. Raises RunError if it cannot be written."""
-    content, file = save(tensors), f"{name}.safetensors"
-    write_whole(folder / file, content, lasting=True)
-    arrays = {name: tuple(values.shape) for name, values in sorted(tensors.items())}
-    digest = hashlib.sha256(content).hexdigest()
-    return kind(file=file, sha256=digest, bytes=len(content), arrays=arrays, **facts)
-
-
-def fault(folder: Path, shard: Shard) -> str | None:
-    """What is wrong with a shard: missing, cut, changed; None if it is as it was written."""
-    path = folder / shard.file
-    try:
-        if not path.is_file() or path.stat().st_size != shard.bytes:
-            return f"{path} is missing or not of the {shard.bytes} bytes that were written"
-        content = path.read_bytes()
-    except OSError as error:
-        return f"{path}: {error.strerror}"
-    same = hashlib.sha256(content).hexdigest() == shard.sha256
-    return None if same else f"{path} is damaged: its SHA-256 is not the one it was written with"
-
-
-def open_shard(folder: Path, shard: Shard, redo: str) -> dict[str, Tensor]:
-    """The arrays of a shard, mapped: read where they are used.
-
-    Raises DataError, with how to make it again, if it is missing or not as it was written.
-    """
-    wrong = fault(folder, shard)
-    if wrong is not None:
-        raise DataError(f"{wrong}; {redo}")
-    return load_file(folder / shard.file)
-
-
-@contextmanager
-def only_writer(folder: Path) -> Generator[None]:
-    """Hold a folder for one run. Raises RunError if another run has it; a killed one lets go by itself."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RunError(f"another run is writing to {folder}; wait for it, or stop it") from error
-        for leftover in folder.glob(".*.partial"):
-            leftover.unlink(missing_ok=True)
-        yield
 
 
 class LatentsMeta(Index, frozen=True, kw_only=True):
@@ -221,3 +149,158 @@ class LatentClips:
     def names(self, clips: Tensor) -> tuple[str, ...]:
         """What the clips are called in messages: their seeds."""
         return tuple(f"clip {self.meta.seeds[number]}" for number in clips.tolist())
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Encodings:
+    """A run's folder of latents: its clips, encoded once.
+
+    networks are given to each function; of them the autoencoder counts. folder: of the run's own. shared: a folder that
+    several runs share, where each set of clips lies under the name of what it belongs to; None for the run's own.
+    """
+
+    recipe: Recipe
+    config: ModelConfig
+    family: Family
+    precision: Precision
+    clips: Clips
+    folder: Path
+    shared: Path | None
+    stop: StopSignal
+
+    def encode(self, networks: Networks) -> None:
+        """Write the folder of latents, or what is missing of it.
+
+        Raises:
+            Interrupted: the stop signal was set; run again to go on. DataError: there are no clips.
+            RunError: the folder holds latents of another autoencoder or cannot be written.
+        """
+        identity = self._identity(networks)
+        folder = self._place(identity)
+        meta = read_index(folder, LatentsMeta) or self._description(identity)
+        _require_identity(folder, meta, identity)
+        if meta.sensitivity:
+            return
+        self.precision.placed(networks.target_encoder)
+        places, done, rows = numbers_of(self.clips, meta.seeds), meta.done, list[dict[str, Tensor]]()
+        conditioner = Conditioner(self.config, self.recipe.unet, self.precision, self.family)
+        logged = started = time.perf_counter()
+        for number in range(done, meta.clips):
+            rows.append(self._encoded(networks, conditioner, places[number], meta.flips))
+            now, stopped = time.perf_counter(), self.stop.is_set()
+            if now - logged > _LOG_S:
+                logged, rate = now, (number + 1 - done) / (now - started)
+                left_s = (meta.clips - number - 1) / rate
+                _log.info("latents  clip %d of %d  %.2f clips/s  %.0f s left", number + 1, meta.clips, rate, left_s)
+            if stopped or len(rows) == _SHARD or number + 1 == meta.clips:
+                tensors = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+                shard = write_shard(folder, f"clips-{meta.done:06d}", tensors, Shard)
+                meta = msgspec.structs.replace(meta, shards=(*meta.shards, shard))
+                write_index(folder, meta)
+                rows.clear()
+            if stopped:
+                raise Interrupted(f"stopped after clip {number + 1} of {meta.clips} of latents; run again to go on")
+        first = [open_shard(folder, shard, f"delete {folder}")["target"] for shard in meta.shards[:_SENSITIVITY_CLIPS]]
+        told = self._sensitivity(networks, torch.cat(first)[:_SENSITIVITY_CLIPS, 0].float())
+        write_index(folder, msgspec.structs.replace(meta, sensitivity=tuple(told.tolist())))
+
+    def opened(self, networks: Networks) -> LatentClips:
+        """What the U-Net learns from.
+
+        Raises RunError for latents of another autoencoder, or unfinished ones; DataError for damaged ones.
+        """
+        identity = self._identity(networks)
+        place = self._place(identity)
+        latents = LatentClips.open(place)
+        _require_identity(place, latents.meta, identity)
+        return latents.resident(self.precision.device) if self.recipe.compute.resident else latents
+
+    def _place(self, identity: str) -> Path:
+        return self.folder if self.shared is None else self.shared / identity
+
+    def _identity(self, networks: Networks) -> str:
+        recipe, config, family = self.recipe, self.config, self.family
+        by_path = family.motion_bucket is None and family.limits is not None
+        motion = family.name if by_path else None  # families with the recipe's number write the same latents
+        steered = (config.camera, motion, recipe.unet.motion_bucket)
+        options = digest_of(self._latents, recipe.seed, self.clips.origin, steered, recipe.unet.loss.class_weights)
+        return f"{autoencoder_digest(networks)}-{options}"
+
+    @property
+    def _latents(self) -> LatentsRecipe:
+        assert self.recipe.latents is not None, "clips are encoded only if the recipe has the table"
+        return self.recipe.latents
+
+    def _description(self, identity: str) -> LatentsMeta:
+        config, count = self.config, len(self.clips)
+        if count == 0:
+            raise DataError("there are no clips to encode; generate some with `gcd-train generate driving`")
+        frames, height, width = self.clips.sample(0).source.shape[:3]
+        if (frames, height, width) != (config.frames, config.height, config.width):
+            raise DataError(
+                f"clips must be {config.frames} frames of {config.width}x{config.height} for this model, "
+                f"got {frames} of {width}x{height}; generate them anew, or change [model] in the recipe"
+            )
+        seeds = tuple(self.clips.seeds[: self._latents.limit or count])
+        return LatentsMeta(identity=identity, seeds=seeds, frames=frames, flips=2 if self._latents.flip else 1)
+
+    @torch.no_grad()
+    def _encoded(self, networks: Networks, conditioner: Conditioner, number: int, flips: int) -> dict[str, Tensor]:
+        """One clip's row of every array."""
+        sample = self.clips.sample(number)
+        path, draws = sample.trajectory, Draws(self.recipe.seed, "latents", number, self.precision.device)
+        source, target = (self.precision.frames(to_network(side)) for side in (sample.source, sample.target))
+        sources, targets = ([side, side.flip(-1)][:flips] for side in (source, target))
+        encoders = FrozenEncoders(networks=networks, at_once=len(source))
+        rows = {
+            "source": torch.stack([self._condition(encoders, frames, draws) for frames in sources]).half(),
+            "target": torch.stack([self._target(encoders, frames, draws) for frames in targets]).half(),
+            "motion": torch.tensor(conditioner.motion(path), dtype=torch.float32),
+        }
+        features = [conditioner.camera(each) for each in (path, mirrored_path(path))[:flips]]
+        steered = [each.float() for each in features if each is not None]
+        if steered:
+            rows["control"] = torch.stack(steered)
+        if class_weights := COLOUR_WEIGHTS[self.recipe.unet.loss.class_weights]:
+            size = (rows["target"].shape[-2], rows["target"].shape[-1])
+            rows["emphasis"] = class_emphasis(target, class_weights, size).half()
+        return {name: value.cpu() for name, value in rows.items()}
+
+    def _condition(self, encoders: FrozenEncoders, frames: Tensor, draws: Draws) -> Tensor:
+        if self._latents.augmentation:
+            frames = frames + self._latents.augmentation * draws.normal(*frames.shape)
+        with self.precision.arithmetic():
+            return encoders.condition(frames)
+
+    def _target(self, encoders: FrozenEncoders, frames: Tensor, draws: Draws) -> Tensor:
+        with self.precision.arithmetic():
+            posterior = encoders.target(frames)
+        latents = posterior.sample(draws.normal(*posterior.mean.shape)) if self._latents.sample else posterior.mean
+        return latents * encoders.networks.config.vae.scale
+
+    @torch.no_grad()
+    def _sensitivity(self, networks: Networks, latents: Tensor) -> Tensor:
+        """Mean squared change of the decoded picture for a small change of each channel, one on average: [C].
+
+        latents: [N, T, C, h, w]; the first, middle and last frame of each are decoded, each by itself.
+        """
+        decoder = self.precision.placed(networks.decoder)
+        draws = Draws(self.recipe.seed, "sensitivity", 0, self.precision.device)
+        frames = latents[:, [0, latents.shape[1] // 2, -1]].flatten(0, 1) / networks.config.vae.scale
+        rows = self.precision.frames(frames)
+        plain = decoder(rows, None)
+        changes: list[Tensor] = []
+        for channel in range(rows.shape[1]):
+            nudged = rows.clone()
+            nudged[:, channel] += _NUDGE * draws.normal(*rows[:, channel].shape)
+            changes.append(((decoder(nudged, None) - plain) ** 2).mean())
+        total = torch.stack(changes).cpu()
+        return total / total.mean()
+
+
+def _require_identity(folder: Path, meta: LatentsMeta, identity: str) -> None:
+    if meta.identity != identity:
+        raise RunError(
+            f"{folder} was made by another autoencoder, of other clips or with other options ({meta.identity}, now "
+            f"{identity}); delete it and run the latents stage again"
+        )

@@ -3,18 +3,19 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
 from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
 from gcd_model.weights.families import Family
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.batches import CachedBatches, SampleBatches
 from gcd_train.data.cache import CachedLatents
 from gcd_train.data.dataset4d import Dataset4D, Ontology
-from gcd_train.data.files import Skips
+from gcd_train.data.files import MANIFEST, Skips, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
+from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.pairs import PairedClips, data_folders
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling, Sampling
@@ -23,9 +24,6 @@ from gcd_train.data.sample import Bytes, Clips, MadeClips, Sample, Samples, Vide
 from gcd_train.data.splits import Part, kubric_split, present, read_split, require_apart
 from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.layouts.manifest import MANIFEST, read_manifest
-from gcd_train.lerobot.pairs import LeRobotOptions, LeRobotPairs
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import DataRecipe
 from gcd_train.training.objective import BatchMaker, BatchSource
@@ -33,7 +31,6 @@ from gcd_train.training.setup import Precision, digest_of
 
 _FIXED_SEED = 0  # of the clips that are measured on: the same ones in every run
 _VIDEO_FAMILY = "svd"
-Set = TypeVar("Set", Kubric4D, ParallelDomain4D)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -117,8 +114,15 @@ class _Opening:
     def views(self) -> RunData:
         if self._data.kind == "kubric4d":
             self._require_family_covers_orbit()
-            return self._views(*self._parts(self._kubric(self.places.data)))
-        return self._views(*self._parts(self._driving(self.places.data)))
+        whole, valid = self._dataset(self.places.data), self.places.valid
+        learned, held = (whole, self._dataset(valid)) if valid is not None else self._parts(whole)
+        require_apart(_worlds_of(learned), _worlds_of(held))
+        sampling = sampling_of(self.recipe, self.config.frames)
+        return RunData(
+            clips=self._one_rate(learned, learned.fps, repeats=self._data.repeats),
+            valid=self._one_rate(held, held.fps),
+            batches=self._sampled(self._pairs(learned, sampling, self.recipe.seed, self._data.repeats)),
+        )
 
     def lerobot(self) -> RunData:
         held_out = 0 if self.places.valid else self._data.held_out
@@ -158,9 +162,9 @@ class _Opening:
             raise RecipeError("a latent cache is of a frozen autoencoder: leave out [vae] and [latents]")
         cache, valid = CachedLatents.open(self.places.data), self._valid_folder("a latent cache holds no pictures")
         self._require_drawn_as_cached(cache)
-        held = self._driving(valid)
+        held = self._dataset(valid)
         if self._data.split == "last" or self._data.split_file is not None:
-            held = held.only(self._part(held, "val"))
+            held = held.only(self._part(held.scenes, "val"))
         require_apart(dict.fromkeys(cache.scenes, ""), dict.fromkeys(held.scenes, ""))
         clips = self._one_rate(held, held.fps)
 
@@ -169,29 +173,16 @@ class _Opening:
 
         return RunData(clips=clips, valid=clips, batches=batches)
 
-    def _views(self, learned: Kubric4D | ParallelDomain4D, held: Kubric4D | ParallelDomain4D) -> RunData:
-        require_apart(_worlds_of(learned), _worlds_of(held))
-        sampling = sampling_of(self.recipe, self.config.frames)
-        return RunData(
-            clips=self._one_rate(learned, learned.fps, repeats=self._data.repeats),
-            valid=self._one_rate(held, held.fps),
-            batches=self._sampled(self._pairs(learned, sampling, self.recipe.seed, self._data.repeats)),
-        )
+    def _dataset(self, root: Path) -> Dataset4D:
+        cameras, published = self._data.cameras, self._data.published
+        if self._data.kind == "kubric4d":
+            return Kubric4D(root, cameras=cameras or kubric4d.CAMERAS, published=published)
+        classes = self._data.modality == "semantic"
+        return ParallelDomain4D(root, cameras=cameras or parallel_domain4d.CAMERAS, classes=classes)
 
-    def _kubric(self, root: Path) -> Kubric4D:
-        cameras = self._data.cameras or kubric4d.CAMERAS
-        return Kubric4D.open(root, cameras=cameras, published=self._data.published)
-
-    def _driving(self, root: Path) -> ParallelDomain4D:
-        cameras = self._data.cameras or parallel_domain4d.CAMERAS
-        return ParallelDomain4D.open(root, cameras=cameras, classes=self._data.modality == "semantic")
-
-    def _parts(self, whole: Set) -> tuple[Set, Set]:
-        """What to learn from, and what to measure on."""
-        if self.places.valid is not None:
-            held = self._kubric(self.places.valid) if isinstance(whole, Kubric4D) else self._driving(self.places.valid)
-            return whole, held  # pyright: ignore[reportReturnType]  # opened as the other one was
-        learned, held_out = (self._part(whole, part) for part in ("train", "val"))
+    def _parts(self, whole: Dataset4D) -> tuple[Dataset4D, Dataset4D]:
+        """What to learn from, and what to measure on, of one folder."""
+        learned, held_out = (self._part(whole.scenes, part) for part in ("train", "val"))
         if not learned or not held_out:
             raise DataError(
                 f"{self.places.data} has {len(whole.scenes)} scenes: {len(learned)} to learn from and {len(held_out)} "
@@ -199,12 +190,12 @@ class _Opening:
             )
         return whole.only(learned), whole.only(held_out)
 
-    def _part(self, whole: Kubric4D | ParallelDomain4D, part: Part) -> tuple[str, ...]:
-        data, scenes = self._data, tuple(whole.scenes)
+    def _part(self, scenes: tuple[str, ...], part: Part) -> tuple[str, ...]:
+        data = self._data
         if data.split == "last":
             first_held = max(len(scenes) - data.held_out, 0)
             return scenes[:first_held] if part == "train" else scenes[first_held:]
-        if isinstance(whole, Kubric4D):
+        if data.kind == "kubric4d":
             return kubric_split(scenes, part)
         if data.split_file is None:
             raise RecipeError(
@@ -263,18 +254,19 @@ class _Opening:
         return batches
 
     def _episodes(self, folder: Path, episodes: tuple[int, int | None]) -> LeRobotPairs:
-        told = self._data.lerobot
-        options = LeRobotOptions(
+        options = self._data.lerobot
+        return LeRobotPairs(
+            folder,
+            self.recipe.seed,
             frames=self.config.frames,
             fps=self.recipe.unet.fps,
             size=(self.config.width, self.config.height),
-            tolerance_s=told.tolerance_s,
-            cameras=told.cameras,
-            calibration=None if told.calibration is None else Path(told.calibration),
+            tolerance_s=options.tolerance_s,
+            cameras=options.cameras,
+            calibration=None if options.calibration is None else Path(options.calibration),
             repeats=self._data.repeats,
             episodes=episodes,
         )
-        return LeRobotPairs(folder, self.recipe.seed, options)
 
     def _valid_folder(self, why: str) -> Path:
         if self.places.valid is None:

@@ -1,15 +1,27 @@
-"""Reader of ParallelDomain-4D, as published and downloaded or as `gcd-train generate` writes it.
+"""ParallelDomain-4D scene folders, as published and downloaded or as `gcd-train generate` writes them: names, reader,
+writer.
 
-Cameras ride on a vehicle; poses are given in the vehicle's frame (x ahead, y left, z up), which the views call their
-world. Depth is stored along the optical axis. Folders and names: `gcd_train.layouts.parallel_domain4d`.
+    scene_000042/
+        rgb/yaw-0/000000000000000075.png                        colour, 8 bit           compact: .webp
+        depth/yaw-0/000000000000000075.npz                      array `data`, float32,  compact: .png, 16 bit, see
+                                                                metres along the axis   STREET_DEPTH
+        semantic_segmentation_2d/yaw-0/000000000000000075.png   class id =              compact: the same colours, as
+                                                                R + 256 G + 65536 B     a palette PNG
+        instance_segmentation_2d/yaw-0/000000000000000075.png   instance id, alike
+        calibration/*.json, ontology/*.json
+
+Files are named by ten times the frame number plus five (frame 7: 75). Poses are given in the vehicle's frame (x ahead,
+y left, z up), where all 19 cameras stand still; the views call it their world.
+Source: the ParallelDomain-4D data set of Van Hoorick et al. 2024, as downloaded.
 """
 
 import logging
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,115 +30,126 @@ from numpy.typing import NDArray
 from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics
 from gcd_model.small_files import decode_json
-from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, Ontology, pose_from_quaternion, read_ontology, scene_names
-from gcd_train.data.files import (
-    MOST_TEXT,
-    FileFault,
-    Recent,
-    one_of,
-    read,
-    read_colour,
-    read_depth,
-    read_ids,
-    require_size,
+from gcd_train.data import encodings
+from gcd_train.data.dataset4d import (
+    KEPT_SCENES,
+    VOID,
+    Dataset4D,
+    Ontology,
+    pose_from_quaternion,
+    read_ontology,
+    scene_names,
 )
+from gcd_train.data.encodings import Doubles, quaternions, read_colour, read_depth, read_ids, sized, with_sky
+from gcd_train.data.files import MOST_TEXT, FileFault, Recent, SceneFiles, one_of, read
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
-from gcd_train.layouts import parallel_domain4d as names
+
+if TYPE_CHECKING:
+    from gcd_train.scenes.driving import OntologyItem
+    from gcd_train.scenes.renderer import Rendering
 
 _LOG = logging.getLogger(__name__)
-_U8, _U16 = 255, 65535
+Id = TypeVar("Id", np.uint8, np.uint16)
+
+Layer = Literal["rgb", "depth", "semantic_segmentation_2d", "instance_segmentation_2d"]
+
+FRAMES = 50
+FPS = 10.0
+WIDTH, HEIGHT = 640, 480
+CAMERAS = (*sorted(f"camera{number}" for number in range(16)), "yaw-0", "yaw-60", "yaw-neg-60")
+"""The 19 cameras in the published order: 16 around the scene by name, then the vehicle's own."""
+FORWARD = "yaw-0"
+"""The camera that looks ahead: the source of every clip."""
+DEPTH_KEY = "data"
+"""Name of the array in a depth npz."""
+_SUFFIXES = {"rgb": "png", "depth": "npz"}
+_COMPACT_SUFFIXES = {"rgb": "webp", "depth": "png"}
+WEBP_QUALITY = 80
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CameraCalibration:
-    """One camera on the vehicle. fx, fy, cx, cy: pixels. vehicle_from_camera: f64 [4, 4], metres."""
+def scene_name(number: int) -> str:
+    """Folder of a scene, `scene_000042`."""
+    return f"scene_{number:06d}"
 
-    path: Path
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    vehicle_from_camera: NDArray[np.float64]
 
-    def lens(self, width: int, height: int) -> Intrinsics:
-        """For pictures of this size. Raises FileFault for a lens that no picture of this size has."""
-        if not (0 <= self.cx <= width and 0 <= self.cy <= height):
-            raise FileFault(
-                self.path,
-                f"says that the optical axis meets the picture at ({self.cx:g}, {self.cy:g}), outside of the "
-                f"{width} x {height} pixels that pictures have: they were resized or the file is another scene's",
-            )
-        try:
-            return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, width=width, height=height)
-        except ModelError as error:
-            raise FileFault(self.path, f"holds an impossible lens: {error}") from error
+def scene_number(name: str) -> int | None:
+    """The number in a folder's name, None if it is no scene of this layout."""
+    named = re.fullmatch(r"scene_(\d{6,})", name)
+    return None if named is None else int(named[1])
+
+
+def frame_stem(time: int) -> str:
+    """File name without suffix of frame number `time`."""
+    return f"{10 * time + 5:018d}"
+
+
+def frame_time(stem: str) -> int | None:
+    """Inverse of `frame_stem`; None if the file is no frame of this layout."""
+    if not re.fullmatch(r"\d{18}", stem) or int(stem) % 10 != 5:
+        return None
+    return int(stem) // 10
+
+
+def frame_path(scene: Path, camera: str, layer: Layer, time: int, *, compact: bool = False) -> Path:
+    """One picture of a layer at frame number `time`, `scene_000042/rgb/yaw-0/000000000000000075.png`."""
+    suffix = (_COMPACT_SUFFIXES if compact else _SUFFIXES).get(layer, "png")
+    return scene / layer / camera / f"{frame_stem(time)}.{suffix}"
+
+
+def calibration_folder(scene: Path) -> Path:
+    """Holds one JSON with the cameras (its name is not fixed)."""
+    return scene / "calibration"
+
+
+def ontology_folder(scene: Path) -> Path:
+    """Holds one JSON with the classes (its name is not fixed)."""
+    return scene / "ontology"
 
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """What does not change over the time of a scene."""
+    """What does not change over the time of a scene. cameras: lens, and vehicle_from_camera f64 [4, 4], metres."""
 
-    cameras: dict[str, CameraCalibration]
-    width: int
-    height: int
+    cameras: Mapping[str, tuple[Intrinsics, Doubles]]
     frames: int
 
 
 class ParallelDomain4D(Dataset4D):
     """See Dataset4D.
 
-    root: the folder with `scene_000000` and so on; gaps in the numbers are fine.
-    classes, instances: read these layers too, where they are there. cameras: which there are, the 19 published ones by
-    default. The ontology is that of the first scene; a scene with another one is at fault.
+    root: the folder with `scene_000000` and so on; gaps in the numbers are fine. scenes: by default all there are, with
+    the ontology of the first that has a readable one, if classes are wanted. cameras: which there are, by default the
+    19 published ones. classes, instances: read these layers too, where they are there. ontology: the classes of scenes
+    that are named; one with other classes is at fault.
+    Raises DataError: there is no scene, no such source camera, or classes are wanted and no scene has an ontology.
     """
 
-    fps = names.FPS
+    fps = FPS
 
     def __init__(
         self,
-        root: Path,
-        scenes: Sequence[str],
+        root: Path | str,
+        scenes: Sequence[str] | None = None,
         *,
-        cameras: Sequence[str] = names.CAMERAS,
+        cameras: Sequence[str] = CAMERAS,
         classes: bool = True,
         instances: bool = False,
         ontology: Ontology | None = None,
-        source_camera: str = names.FORWARD,
+        source_camera: str = FORWARD,
     ) -> None:
-        super().__init__(root, scenes, cameras, source_camera)
-        if self.source_camera not in self.cameras:
-            raise DataError(f"the source camera {self.source_camera} is none of {', '.join(self.cameras)}")
+        root = Path(root)
+        found = scene_names(root, scene_number, "scene_000000") if scenes is None else scenes
+        super().__init__(root, found, cameras, source_camera)
+        if source_camera not in self.cameras:
+            raise DataError(f"the source camera {source_camera} is none of {', '.join(self.cameras)}")
+        if scenes is None and classes:
+            ontology = _first_ontology(root, found)
+            if ontology.duplicates:
+                merged = "; ".join(ontology.merged_names)
+                _LOG.warning("%s: classes of one colour are merged in decoding: %s", root, merged)
         self._classes, self._instances, self.ontology = classes, instances, ontology
         self._scene = Recent(self._read_scene, KEPT_SCENES)
-
-    @classmethod
-    def open(
-        cls,
-        root: Path | str,
-        *,
-        cameras: Sequence[str] = names.CAMERAS,
-        classes: bool = True,
-        instances: bool = False,
-        source_camera: str = names.FORWARD,
-    ) -> Self:
-        """Every scene of a folder, by number, with the ontology of the first that has a readable one.
-
-        Raises: DataError if there is no scene, or classes are wanted and no scene has an ontology.
-        """
-        found = scene_names(Path(root), names.scene_number, "scene_000000")
-        ontology = _first_ontology(Path(root), found) if classes else None
-        if ontology is not None and ontology.duplicates:
-            _LOG.warning("%s: classes of one colour are merged in decoding: %s", root, "; ".join(ontology.merged_names))
-        return cls(
-            Path(root),
-            found,
-            cameras=cameras,
-            classes=classes,
-            instances=instances,
-            ontology=ontology,
-            source_camera=source_camera,
-        )
 
     def frames(self, scene: str) -> int:
         """Time steps, up to the last picture of the source camera; some may be missing. Raises FileFault."""
@@ -134,79 +157,60 @@ class ParallelDomain4D(Dataset4D):
 
     def lens(self, scene: str) -> Intrinsics:
         """See Dataset4D."""
-        known = self._scene(scene)
-        return known.cameras[self.source_camera].lens(known.width, known.height)
+        return self._scene(scene).cameras[self.source_camera][0]
 
-    def pose(self, scene: str, camera: str, time: int = 0) -> NDArray[np.float64]:
+    def pose(self, scene: str, camera: str, time: int = 0) -> Doubles:
         """vehicle_from_camera; it does not change with time. Raises FileFault."""
-        return self._scene(scene).cameras[camera].vehicle_from_camera
+        return self._scene(scene).cameras[camera][1]
 
-    def views(self, scene: str, time: int, cameras: Sequence[str] | None = None) -> list[SceneView]:
+    def view(self, scene: str, camera: str, time: int) -> SceneView:
         """See Dataset4D."""
-        known = self._scene(scene)
-        return [self._view(scene, known, camera, time) for camera in cameras or self.cameras]
-
-    def _view(self, scene: str, known: _Scene, camera: str, time: int) -> SceneView:
-        told = f"{self.source_camera}'s first picture"
-        colour_path = self._path(scene, camera, "rgb", time)
-        rgb = read_colour(colour_path)
-        require_size(colour_path, rgb, known.height, known.width, told)
-        depth_path = self._path(scene, camera, "depth", time)
-        depth = read_depth(depth_path, names.DEPTH_KEY)
-        require_size(depth_path, depth, known.height, known.width, told)
+        folder, (lens, pose) = self.folder(scene), self._scene(scene).cameras[camera]
+        colour, depth = (_existing(folder, camera, layer, time) for layer in ("rgb", "depth"))
+        size = (lens.height, lens.width, f"{self.source_camera}'s first picture")
+        rgb, metres = sized(colour, read_colour(colour), *size), sized(depth, read_depth(depth, DEPTH_KEY), *size)
         classes = instances = None
         if self._classes:
-            classes = self._ids(scene, known, camera, "semantic_segmentation_2d", time, _U8)
+            classes = self._ids(folder, camera, "semantic_segmentation_2d", time, np.uint8)
         if self._instances:
-            instances = self._ids(scene, known, camera, "instance_segmentation_2d", time, _U16)
-        return SceneView(
-            rgb=rgb,
-            depth=depth,
-            classes=None if classes is None else classes.astype(np.uint8),
-            instances=None if instances is None else instances.astype(np.uint16),
-            world_from_camera=known.cameras[camera].vehicle_from_camera,
-            lens=known.cameras[camera].lens(known.width, known.height),
-        )
+            instances = self._ids(folder, camera, "instance_segmentation_2d", time, np.uint16)
+        return SceneView(rgb=rgb, depth=metres, classes=classes, instances=instances, world_from_camera=pose, lens=lens)
 
-    def _ids(
-        self, scene: str, known: _Scene, camera: str, layer: names.Layer, time: int, most: int
-    ) -> NDArray[np.int32] | None:
+    def _ids(self, folder: Path, camera: str, layer: Layer, time: int, kind: type[Id]) -> NDArray[Id] | None:
         """None where the layer was not downloaded at all; a single missing file is a fault."""
-        if not (self.folder(scene) / layer).is_dir():
+        if not (folder / layer).is_dir():
             return None
-        path = names.frame_path(self.folder(scene), camera, layer, time)
-        ids = read_ids(path)
-        require_size(path, ids, known.height, known.width, f"{self.source_camera}'s first picture")
+        path, lens, most = frame_path(folder, camera, layer, time), self.lens(folder.name), np.iinfo(kind).max
+        ids = sized(path, read_ids(path), lens.height, lens.width, f"{self.source_camera}'s first picture")
         if int(ids.max()) > most:
             raise FileFault(path, f"holds id {int(ids.max())}, beyond {most}: is it another layer?")
-        return ids
-
-    def _path(self, scene: str, camera: str, layer: names.Layer, time: int) -> Path:
-        folder = self.folder(scene)
-        published = names.frame_path(folder, camera, layer, time)
-        return one_of(published, names.frame_path(folder, camera, layer, time, compact=True))
+        return ids.astype(kind)
 
     def _read_scene(self, scene: str) -> _Scene:
         folder = self.folder(scene)
-        cameras = read_calibration(names.calibration_folder(folder), self.cameras)
-        if self.ontology is not None and (folder / "semantic_segmentation_2d").is_dir():
-            self._require_same_ontology(names.ontology_folder(folder))
         pictures = _pictures(folder / "rgb" / self.source_camera)
         height, width = read_colour(pictures[0]).shape[:2]
-        return _Scene(cameras, width, height, 1 + max(names.frame_time(path.stem) or 0 for path in pictures))
+        cameras = read_calibration(calibration_folder(folder), self.cameras, width, height)
+        if self.ontology is not None and (folder / "semantic_segmentation_2d").is_dir():
+            found = read_ontology(ontology_folder(folder))
+            if found.items != self.ontology.items:
+                other = sorted({item.name for item in found.items} ^ {item.name for item in self.ontology.items})
+                differ = f"by {', '.join(other[:5])}" if other else "in ids or colours"
+                raise FileFault(
+                    ontology_folder(folder), f"holds the wrong ontology: it differs from the first scene's {differ}"
+                )
+        return _Scene(cameras, 1 + max(frame_time(path.stem) or 0 for path in pictures))
 
-    def _require_same_ontology(self, folder: Path) -> None:
-        found, wanted = read_ontology(folder), self.ontology
-        if wanted is not None and found.items != wanted.items:
-            other = sorted({item.name for item in found.items} ^ {item.name for item in wanted.items})
-            differ = f"by {', '.join(other[:5])}" if other else "in ids or colours"
-            raise FileFault(folder, f"holds the wrong ontology: it differs from the first scene's {differ}")
+
+def _existing(folder: Path, camera: str, layer: Layer, time: int) -> Path:
+    """The file of a picture, published or compact."""
+    return one_of(*(frame_path(folder, camera, layer, time, compact=compact) for compact in (False, True)))
 
 
 def _pictures(folder: Path) -> list[Path]:
     """Frames of a camera in order. Raises FileFault if there is none."""
     try:
-        found = sorted(path for path in folder.iterdir() if names.frame_time(path.stem) is not None)
+        found = sorted(path for path in folder.iterdir() if frame_time(path.stem) is not None)
     except OSError as error:
         raise FileFault(folder, f"is missing: a view cannot be read ({error})") from error
     if not found:
@@ -218,13 +222,10 @@ def _first_ontology(root: Path, scenes: Sequence[str]) -> Ontology:
     first: FileFault | None = None
     for scene in scenes:
         try:
-            return read_ontology(names.ontology_folder(root / scene))
+            return read_ontology(ontology_folder(root / scene))
         except FileFault as fault:
             first = first or fault
     raise DataError(f"no scene has a readable ontology, first: {first}; read the set without classes instead")
-
-
-_ROTATIONS, _TRANSLATIONS = ("rotation", "orientation"), ("translation", "position")
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -235,47 +236,57 @@ class _File(msgspec.Struct, frozen=True):
     extrinsics: list[dict[str, Any] | None]
 
 
-def read_calibration(folder: Path, cameras: Sequence[str]) -> dict[str, CameraCalibration]:
-    """These cameras of a scene's `calibration` folder, from however many JSON files they are in.
+def read_calibration(
+    folder: Path, cameras: Sequence[str], width: int, height: int
+) -> dict[str, tuple[Intrinsics, Doubles]]:
+    """Lens and vehicle_from_camera of these cameras, from however many JSON files of a scene's `calibration` folder.
 
-    Raises: FileFault if there is no file, one is damaged, or a camera is in none.
+    width, height: of the pictures, pixels.
+    Raises: FileFault if there is no file, one is damaged or of other pictures, or a camera is in none.
     """
     paths = sorted(folder.glob("*.json"))
     if not paths:
         raise FileFault(folder, "holds no JSON: where the cameras are is unknown; download the scene again")
-    found: dict[str, CameraCalibration] = {}
+    found: dict[str, tuple[Intrinsics, Doubles]] = {}
     for path in paths:
-        wanted = [camera for camera in cameras if camera not in found]
-        if wanted:
-            found |= _cameras_of(path, wanted)
+        try:
+            file = decode_json(read(path, MOST_TEXT), _File)
+        except FileError as error:
+            raise FileFault(path, f"is no calibration: it {error}") from error
+        if not len(file.names) == len(file.intrinsics) == len(file.extrinsics):
+            raise FileFault(path, "is damaged: its lists of names, intrinsics and extrinsics differ in length")
+        for name, lens, pose in zip(file.names, file.intrinsics, file.extrinsics, strict=True):
+            if name in cameras and name not in found:
+                found[name] = _lens(path, lens or {}, width, height), _pose(path, pose or {})
     lacking = [camera for camera in cameras if camera not in found]
     if lacking:
         raise FileFault(paths[0], f"lacks {len(lacking)} of {len(cameras)} cameras, first: {lacking[0]}")
     return found
 
 
-def _cameras_of(path: Path, wanted: Sequence[str]) -> dict[str, CameraCalibration]:
-    try:
-        file = decode_json(read(path, MOST_TEXT), _File)
-        if not len(file.names) == len(file.intrinsics) == len(file.extrinsics):
-            raise FileFault(path, "is damaged: its lists of names, intrinsics and extrinsics differ in length")
-        places = {name: place for place, name in enumerate(file.names) if name in wanted}
-        return {name: _camera(path, file.intrinsics[at], file.extrinsics[at]) for name, at in places.items()}
-    except FileError as error:
-        raise FileFault(path, f"is no calibration: it {error}") from error
-
-
-def _camera(path: Path, lens: Mapping[str, Any] | None, pose: Mapping[str, Any] | None) -> CameraCalibration:
-    rotation = _first(path, pose or {}, _ROTATIONS)
-    translation = _first(path, pose or {}, _TRANSLATIONS)
+def _pose(path: Path, pose: Mapping[str, Any]) -> Doubles:
+    rotation = _first(path, pose, ("rotation", "orientation"))
+    translation = _first(path, pose, ("translation", "position"))
     quaternion = [_number(path, rotation, (f"q{axis}", axis)) for axis in "wxyz"]
     position = [_number(path, translation, (axis,)) for axis in "xyz"]
     try:
-        matrix = pose_from_quaternion(np.array(quaternion), np.array(position))
+        return pose_from_quaternion(np.array(quaternion), np.array(position))
     except DataError as error:
         raise FileFault(path, f"holds no usable camera pose: {error}") from error
-    fx, fy, cx, cy = (_number(path, lens or {}, (name,)) for name in ("fx", "fy", "cx", "cy"))
-    return CameraCalibration(path=path, fx=fx, fy=fy, cx=cx, cy=cy, vehicle_from_camera=matrix)
+
+
+def _lens(path: Path, lens: Mapping[str, Any], width: int, height: int) -> Intrinsics:
+    fx, fy, cx, cy = (_number(path, lens, (name,)) for name in ("fx", "fy", "cx", "cy"))
+    if not (0 <= cx <= width and 0 <= cy <= height):
+        raise FileFault(
+            path,
+            f"says that the optical axis meets the picture at ({cx:g}, {cy:g}), outside of the {width} x {height} "
+            "pixels that pictures have: they were resized or the file is another scene's",
+        )
+    try:
+        return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+    except ModelError as error:
+        raise FileFault(path, f"holds an impossible lens: {error}") from error
 
 
 def _first(path: Path, pose: Mapping[str, Any], spellings: Sequence[str]) -> Mapping[str, Any]:
@@ -291,3 +302,78 @@ def _number(path: Path, numbers: Mapping[str, Any], spellings: Sequence[str]) ->
         if isinstance(value, int | float) and math.isfinite(value):
             return float(value)
     raise FileFault(path, f"holds a camera without a number for {' or '.join(spellings)}")
+
+
+class ParallelDomain4DWriter:
+    """One scene, view by view as they are drawn, in any order; `finish` adds calibration and ontology.
+
+    Depth is along the axis, 30 km for the sky. Classes are those of `classes`, void where it has none.
+    """
+
+    def __init__(
+        self,
+        files: SceneFiles,
+        lens: Intrinsics,
+        vehicle_from_camera: Mapping[str, Doubles],
+        classes: "Sequence[OntologyItem]",
+        *,
+        compact: bool,
+    ) -> None:
+        self._files, self._compact = files, compact
+        self._calibration = calibration(vehicle_from_camera, lens)
+        self._ontology = ontology(classes)
+        self._class_ids = np.full(256, VOID, np.uint8)
+        self._class_ids[[item.label for item in classes]] = [item.id for item in classes]
+
+    def add(self, time: int, camera: str, drawn: "Rendering") -> None:
+        """Write colour, depth, classes and instances of one view."""
+        depth = with_sky(drawn.depth)
+        id_png = encodings.packed_id_png if self._compact else encodings.id_png
+        if self._compact:
+            self._write(camera, "rgb", time, encodings.webp(drawn.rgb, quality=WEBP_QUALITY))
+            self._write(camera, "depth", time, encodings.street_depth_png(depth))
+        else:
+            self._write(camera, "rgb", time, encodings.rgb_png(drawn.rgb))
+            self._write(camera, "depth", time, encodings.float_npz(depth, DEPTH_KEY))
+        self._write(camera, "semantic_segmentation_2d", time, id_png(self._class_ids[drawn.classes]))
+        self._write(camera, "instance_segmentation_2d", time, id_png(drawn.instances))
+
+    def finish(self) -> None:
+        """Write what holds for the whole scene."""
+        folder = self._files.folder
+        self._files.write(calibration_folder(folder) / "calibration.json", msgspec.json.encode(self._calibration))
+        self._files.write(ontology_folder(folder) / "ontology.json", msgspec.json.encode(self._ontology))
+
+    def _write(self, camera: str, layer: Layer, time: int, data: bytes) -> None:
+        self._files.write(frame_path(self._files.folder, camera, layer, time, compact=self._compact), data)
+
+
+def calibration(vehicle_from_camera: Mapping[str, Doubles], lens: Intrinsics) -> dict[str, Any]:
+    """Parallel lists of names, intrinsics in pixels and extrinsics: where each camera sits on the vehicle."""
+    inside = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy, "skew": 0.0, "fov": 0.0, "fisheye": 0}
+    inside |= {f"k{number}": 0.0 for number in range(1, 7)} | {"p1": 0.0, "p2": 0.0}
+    extrinsics = [
+        {
+            "rotation": dict(zip(("qw", "qx", "qy", "qz"), quaternions(pose[:3, :3]).tolist(), strict=True)),
+            "translation": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)),
+        }
+        for pose in vehicle_from_camera.values()
+    ]
+    return {"names": list(vehicle_from_camera), "intrinsics": [inside] * len(extrinsics), "extrinsics": extrinsics}
+
+
+def ontology(classes: "Sequence[OntologyItem]") -> dict[str, Any]:
+    """Names and colours by id, and 255 for what has no class."""
+    rows = [(kind.id, kind.name, kind.colour, kind.is_thing) for kind in classes]
+    return {
+        "items": [
+            {
+                "id": number,
+                "name": name,
+                "color": dict(zip("rgb", colour, strict=True)),
+                "isthing": is_thing,
+                "supercategory": "",
+            }
+            for number, name, colour, is_thing in [*rows, (VOID, "Void", (0, 0, 0), False)]
+        ]
+    }

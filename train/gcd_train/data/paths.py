@@ -5,6 +5,7 @@ in any number of workers.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -23,12 +24,37 @@ from gcd_model.geometry import (
     spherical_trajectory,
     to_pose,
 )
-from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RecipeError
 
 Range = tuple[float, float]
 CLIP = 14
 """Frames of a clip."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Control:
+    """One evaluation sample. name: as in the file, `sample_00`. frame_start: first frame number. frame_skip: stride.
+
+    start, goal: where the camera is at first and in the end; None in driving, whose path is fixed.
+    """
+
+    name: str
+    frame_start: int
+    frame_skip: int
+    start: Spherical | None = None
+    goal: Spherical | None = None
+
+    def frame_numbers(self, clip: int) -> tuple[int, ...]:
+        """Of a clip of so many frames."""
+        return tuple(self.frame_start + self.frame_skip * step for step in range(clip))
+
+    def fps(self, scene_fps: float) -> float:
+        """Frames per second of the clip as the network is told it, rounded as published."""
+        return float(round(scene_fps / self.frame_skip))
+
+
+Controls = Mapping[str, tuple[Control, ...]]
+"""By scene name, in the order of the file."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

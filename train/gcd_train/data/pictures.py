@@ -6,8 +6,9 @@ blur, and hardly a byte to read.
 """
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -18,13 +19,11 @@ import torch
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose
-from gcd_train.data.dataset4d import VOID, Dataset4D, Ontology
-from gcd_train.data.files import FileFault, Recent
-from gcd_train.data.paths import Draw, Sampling
+from gcd_train.data.dataset4d import VOID, Dataset4D
+from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_manifest
+from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
-from gcd_train.data.splits import Control
 from gcd_train.errors import DataError, RenderError
-from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, read_manifest
 from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility
 
 if TYPE_CHECKING:
@@ -59,51 +58,81 @@ class PictureOptions:
     device: str | None = None
 
 
-class SplatPictures:
-    """Draws points. Raises DataError where classes are asked of a set without."""
+class Pictures(ABC):
+    """Makes the pictures of draws. Raises DataError where classes are asked of a set without."""
 
     def __init__(self, dataset: Dataset4D, options: PictureOptions) -> None:
-        self._ontology = _ontology_of(dataset, options)
+        self._ontology = dataset.ontology if options.modality == "classes" or options.class_ids else None
+        if self._ontology is None and (options.modality == "classes" or options.class_ids):
+            raise DataError("classes were asked of a data set that has none: Kubric-4D has instances only")
         self._dataset, self._options, (self._width, self._height) = dataset, options, options.size
-        self._points = SplatOptions(published=options.published)
 
-    def make(self, scene: str, draw: Draw) -> Sample:
-        """The sample. Raises DataError, FileFault: a file is missing, damaged or does not fit."""
+    def sample(self, scene: str, draw: Draw) -> Sample:
+        """Source, target and what else the options ask for. Raises DataError, FileFault: a file is missing, damaged or
+        does not fit."""
+        made = self._drawn(scene, draw)
+        poses = map(torch.from_numpy, (made.world_from_source, draw.world_from_target))
+        return Sample(
+            source=np.stack(made.source),
+            target=np.stack(made.target),
+            target_classes=np.stack(made.classes) if self._options.class_ids else None,
+            source_from_target=relative_pose(*poses).numpy(),
+            start=draw.start,
+            deltas=draw.deltas,
+            fps=draw.fps,
+            scene=scene,
+            frame_numbers=draw.frame_numbers,
+            visible=np.stack(made.visible) if self._options.visible else None,
+        )
+
+    @abstractmethod
+    def _drawn(self, scene: str, draw: Draw) -> "_Drawn":
+        """Frame by frame."""
+
+
+@dataclass(kw_only=True, slots=True)
+class _Drawn:
+    """T frames each, where they are asked for. world_from_source: where the source camera really stood."""
+
+    world_from_source: Doubles
+    source: list[Bytes] = field(default_factory=list[Bytes])
+    target: list[Bytes] = field(default_factory=list[Bytes])
+    classes: list[Bytes] = field(default_factory=list[Bytes])
+    visible: list[NDArray[np.bool_]] = field(default_factory=list[NDArray[np.bool_]])
+
+
+class SplatPictures(Pictures):
+    """Draws points."""
+
+    def _drawn(self, scene: str, draw: Draw) -> _Drawn:
         lens, read = self._dataset.lens(scene), Recent(partial(self._dataset.views, scene), 1)
         place = list(self._dataset.cameras).index(self._dataset.source_camera)
-        world_from_source, frames = draw.world_from_source, list[tuple[Bytes, ...]]()
-        classes, masks = list[Bytes](), list[NDArray[np.bool_]]()
+        made, (across, along) = _Drawn(world_from_source=draw.world_from_source), self._options.size
         for number, world_from_target in zip(draw.frame_numbers, draw.world_from_target, strict=True):
             views = read(number)
-            own, seen = views[place], None
+            own = seen = views[place]
             if draw.start is None:
-                world_from_source, seen = own.world_from_camera, own
-                source = trained_picture(own.rgb, self._width, self._height)
+                made.world_from_source = own.world_from_camera
+                made.source.append(trained_picture(own.rgb, across, along))
             else:
-                source = self._picture(views, world_from_source, lens)
-                if self._options.visible:
-                    same = np.abs(own.world_from_camera - world_from_source).max() < SAME_POSE
-                    seen = own if same else self._seen(views, world_from_source, lens)
+                made.source.append(self._picture(views, draw.world_from_source, lens))
+                if np.abs(own.world_from_camera - draw.world_from_source).max() >= SAME_POSE and self._options.visible:
+                    seen = self._seen(views, draw.world_from_source, lens)
             values = None
             if self._ontology is not None and self._options.modality == "classes":
                 values = [self._ontology.encode(ids) for ids in self._ids(views)]
-            frames.append((source, self._picture(views, world_from_target, lens, values)))
+            made.target.append(self._picture(views, world_from_target, lens, values))
             if self._options.class_ids:
-                classes.append(self._target_ids(views, world_from_target, lens))
-            if self._options.visible and seen is not None:
-                across, along = self._options.size
-                masks.append(
+                made.classes.append(self._target_ids(views, world_from_target, lens))
+            if self._options.visible:
+                made.visible.append(
                     visibility(seen, world_from_target, lens, width=across, height=along, options=self._points)
                 )
-        return _sample(
-            scene,
-            draw,
-            world_from_source,
-            source=np.stack([source for source, _ in frames]),
-            target=np.stack([target for _, target in frames]),
-            classes=np.stack(classes) if classes else None,
-            visible=np.stack(masks) if masks else None,
-        )
+        return made
+
+    @property
+    def _points(self) -> SplatOptions:
+        return SplatOptions(published=self._options.published)
 
     def _target_ids(self, views: Sequence[SceneView], world_from_target: Doubles, lens: Intrinsics) -> Bytes:
         """The class of the point that shows most in each pixel, `VOID` where none does: colours of edges are mixed, and
@@ -147,24 +176,22 @@ class SplatPictures:
         return _view(rgb, drawn.depth.cpu().numpy(), world_from_source, smaller)
 
 
-class ExactPictures:
+class ExactPictures(Pictures):
     """Draws geometry; options `published` and `device` mean nothing here.
 
     A renderer is made when the first sample is, in the process that makes it. Raises RenderError without the extra
-    `scenes`, DataError where classes are asked of a set without.
+    `scenes` or a headless OpenGL.
     """
 
     def __init__(self, dataset: Dataset4D, options: PictureOptions) -> None:
-        self._ontology = _ontology_of(dataset, options)
-        self._dataset, self._options, (self._width, self._height) = dataset, options, options.size
+        super().__init__(dataset, options)
         self._renderer: tuple[int, Renderer] | None = None
         renderer_kind()  # what is not installed is said now, not sample by sample
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_renderer": None}  # an OpenGL context cannot go to another process
 
-    def make(self, scene: str, draw: Draw) -> Sample:
-        """See SplatPictures. Raises RenderError without a headless OpenGL."""
+    def _drawn(self, scene: str, draw: Draw) -> _Drawn:
         from gcd_train.scenes.driving.classes import class_ids as published_ids
 
         folder, numbers = self._dataset.folder(scene), list(draw.frame_numbers)
@@ -178,19 +205,19 @@ class ExactPictures:
         drawn: dict[str, list[Rendering]] = {name: [] for name in cameras}
         for _, name, rendering in renderer.views(still, cameras):
             drawn[name].append(rendering)
-        target, ids = np.stack([each.rgb for each in drawn[_TARGET]]), None
+        source, target = ([each.rgb for each in drawn[name]] for name in (_SOURCE, _TARGET))
+        made = _Drawn(world_from_source=draw.world_from_source, source=source, target=target)
         if self._ontology is not None:
-            ids = self._ontology.merge(np.stack([published_ids(each.classes) for each in drawn[_TARGET]]))
-            target = self._ontology.encode(ids) if self._options.modality == "classes" else target
-        return _sample(
-            scene,
-            draw,
-            draw.world_from_source,
-            source=np.stack([each.rgb for each in drawn[_SOURCE]]),
-            target=target,
-            classes=ids if self._options.class_ids else None,
-            visible=_visibility(drawn, cameras, lens) if self._options.visible else None,
-        )
+            made.classes = [self._ontology.merge(published_ids(each.classes)) for each in drawn[_TARGET]]
+            if self._options.modality == "classes":
+                made.target = [self._ontology.encode(ids) for ids in made.classes]
+        if self._options.visible:  # where the source saw the very surface of the target
+            each = zip(drawn[_SOURCE], cameras[_SOURCE], drawn[_TARGET], cameras[_TARGET], strict=True)
+            made.visible = [
+                depth_visibility(_view(near.rgb, near.depth, at, lens), far.depth, aimed, lens)
+                for near, at, far, aimed in each
+            ]
+        return made
 
     def _own_renderer(self) -> "Renderer":
         """Of this process: an OpenGL context does not survive a fork."""
@@ -199,35 +226,9 @@ class ExactPictures:
         return self._renderer[1]
 
 
-def pictures_of(dataset: Dataset4D, options: PictureOptions) -> SplatPictures | ExactPictures:
+def pictures_of(dataset: Dataset4D, options: PictureOptions) -> Pictures:
     """What makes a set's pictures. Raises DataError where classes are asked of a set without."""
     return (ExactPictures if options.exact else SplatPictures)(dataset, options)
-
-
-def _sample(
-    scene: str,
-    draw: Draw,
-    world_from_source: Doubles,
-    *,
-    source: Bytes,
-    target: Bytes,
-    classes: Bytes | None,
-    visible: NDArray[np.bool_] | None,
-) -> Sample:
-    """world_from_source: f64 [4, 4], where the source camera really stood."""
-    poses = map(torch.from_numpy, (world_from_source, draw.world_from_target))
-    return Sample(
-        source=source,
-        target=target,
-        target_classes=classes,
-        source_from_target=relative_pose(*poses).numpy(),
-        start=draw.start,
-        deltas=draw.deltas,
-        fps=draw.fps,
-        scene=scene,
-        frame_numbers=draw.frame_numbers,
-        visible=visible,
-    )
 
 
 class ViewPairs(DrawnSamples):
@@ -264,7 +265,7 @@ class ViewPairs(DrawnSamples):
 
     def pair(self, scene: str, draw: Draw) -> Sample:
         """A sample drawn elsewhere. Raises DataError, FileFault: it cannot be read."""
-        return self._pictures.make(scene, draw)
+        return self._pictures.sample(scene, draw)
 
     def _made(self, number: int, random: np.random.Generator) -> Sample:
         scene, _ = self._place(number)
@@ -287,37 +288,6 @@ def trained_picture(rgb: Bytes, width: int, height: int) -> Bytes:
 def trained_lens(lens: Intrinsics, width: int, height: int) -> Intrinsics:
     """The lens of `trained_picture`'s result, for a picture of this lens."""
     return lens.cropped(*center_crop_box(lens.width, lens.height, width / height)).resized(width, height)
-
-
-def seen_through(picture: Bytes, own: Intrinsics, lens: Intrinsics, size: tuple[int, int]) -> Bytes:
-    """A camera's picture as if taken through another lens, cropped about its middle and resized: u8 [H, W, 3].
-
-    own: of the picture. lens: the other one; what it shows beyond the picture is black. size: width and height.
-    """
-    wide, high = size
-    if lens != own:
-        middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from a pixel's middle
-        to_lens = (lens.matrix @ own.matrix.inverse()).numpy()
-        warp = np.linalg.inv(middle) @ to_lens @ middle
-        picture = cv2.warpPerspective(picture, warp, (lens.width, lens.height)).astype(np.uint8, copy=False)
-    left, top, across, along = center_crop_box(lens.width, lens.height, wide / high)
-    kept = picture[top : top + along, left : left + across]
-    how = cv2.INTER_AREA if across >= wide else cv2.INTER_LINEAR
-    return cv2.resize(kept, size, interpolation=how).astype(np.uint8, copy=False)
-
-
-def narrower(one: Intrinsics, other: Intrinsics) -> Intrinsics:
-    """Of two lenses the one that shows less, which is within what the other shows."""
-    return max(one, other, key=lambda lens: lens.fx / lens.width)
-
-
-def _ontology_of(dataset: Dataset4D, options: PictureOptions) -> Ontology | None:
-    """The classes that the options need. Raises DataError for a set that has none."""
-    if options.modality == "rgb" and not options.class_ids:
-        return None
-    if dataset.ontology is None:
-        raise DataError("classes were asked of a data set that has none: Kubric-4D has instances only")
-    return dataset.ontology
 
 
 def renderer_kind() -> "type[Renderer]":
@@ -352,16 +322,3 @@ def geometry_poses(folder: Path, numbers: Sequence[int]) -> Doubles:
     if max(numbers) >= len(poses):
         raise FileFault(folder / MANIFEST, f"tells where the vehicle is in {len(poses)} frames, not {max(numbers) + 1}")
     return poses[list(numbers)]
-
-
-def _visibility(
-    drawn: dict[str, list["Rendering"]], cameras: dict[str, Doubles], lens: Intrinsics
-) -> NDArray[np.bool_]:
-    """Where the source saw the very surface of the target."""
-    masks = [
-        depth_visibility(_view(source.rgb, source.depth, at, lens), target.depth, aimed, lens)
-        for source, target, at, aimed in zip(
-            drawn[_SOURCE], drawn[_TARGET], cameras[_SOURCE], cameras[_TARGET], strict=True
-        )
-    ]
-    return np.stack(masks)

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from filecmp import cmp
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,9 +11,10 @@ import msgspec
 from gcd_model.errors import FileError, PoseError
 from gcd_model.geometry import Spherical
 from gcd_model.small_files import read_json, read_small
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.files import Skips
+from gcd_train.data.paths import Control, Controls
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d, parallel_domain4d
 
 Part = Literal["train", "val", "test"]
 
@@ -143,32 +143,6 @@ class _Entry(msgspec.Struct, frozen=True):
     fps: float | None = None
     spherical_start: tuple[float, float, float] | None = None
     spherical_end: tuple[float, float, float] | None = None
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Control:
-    """One evaluation sample. name: as in the file, `sample_00`. frame_start: first frame number. frame_skip: stride.
-
-    start, goal: where the camera is at first and in the end; None in driving, whose path is fixed.
-    """
-
-    name: str
-    frame_start: int
-    frame_skip: int
-    start: Spherical | None = None
-    goal: Spherical | None = None
-
-    def frame_numbers(self, clip: int) -> tuple[int, ...]:
-        """Of a clip of so many frames."""
-        return tuple(self.frame_start + self.frame_skip * step for step in range(clip))
-
-    def fps(self, scene_fps: float) -> float:
-        """Frames per second of the clip as the network is told it, rounded as published."""
-        return float(round(scene_fps / self.frame_skip))
-
-
-Controls = Mapping[str, tuple[Control, ...]]
-"""By scene name, in the order of the file."""
 
 
 def read_controls(path: Path) -> Controls:

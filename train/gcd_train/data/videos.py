@@ -10,9 +10,10 @@ cy); no distortion. Metres; camera axes are x right, y down, z ahead; any world.
 folder of them.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
 import cv2
 import msgspec
@@ -22,25 +23,35 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gcd_model.errors import FileError, ModelError
-from gcd_model.geometry import Intrinsics, relative_pose, require_rigid
+from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose, require_rigid
 from gcd_model.small_files import read_json
 from gcd_train.data.files import MOST_PICTURE, FileFault
-from gcd_train.data.pictures import narrower, seen_through
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample
 from gcd_train.errors import DataError, RecipeError
 
 CAMERA_FILE = "cameras.json"
 _RATE_TOLERANCE = 0.01
+_EARLY_S = 0.5
 Doubles = NDArray[np.float64]
 
 
-class _Camera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FileLens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A pinhole in pixels, as a file of cameras has it."""
+
     width: int
     height: int
     fx: float
     fy: float
     cx: float
     cy: float
+
+    @property
+    def lens(self) -> Intrinsics:
+        """Raises OptionError or ShapeError if it is none."""
+        return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, width=self.width, height=self.height)
+
+
+class _Camera(FileLens, frozen=True, kw_only=True):
     world_from_camera: Annotated[tuple[tuple[tuple[float, ...], ...], ...], Meta(min_length=1)]
 
 
@@ -125,9 +136,7 @@ def _frames_of(video: Path, file: Path, fps: float, camera: _Camera) -> int:
 
 def _camera(path: Path, name: str, camera: _Camera, frames: int) -> FilmedCamera:
     try:
-        lens = Intrinsics(
-            fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=camera.width, height=camera.height
-        )
+        lens = camera.lens
         poses = require_rigid(torch.tensor(camera.world_from_camera, dtype=torch.float64), "world_from_camera").numpy()
     except (ModelError, ValueError) as error:
         raise FileFault(path, f"is wrong about {name}: {error}") from error
@@ -174,24 +183,12 @@ class FilmedPairs(DrawnSamples):
 
     def _made(self, number: int, random: np.random.Generator) -> Sample:
         scene = self.scenes[number % len(self.scenes)]
-        source, target = (scene.cameras[int(k)] for k in random.choice(len(scene.cameras), 2, replace=False))
+        cameras = [scene.cameras[int(k)] for k in random.choice(len(scene.cameras), 2, replace=False)]
         stride = self._stride(scene)
         start = int(random.integers(scene.frames - (self._frames - 1) * stride))
         numbers = range(start, start + self._frames * stride, stride)
-        lens = narrower(source.lens, target.lens)
-        poses = (torch.from_numpy(camera.poses[list(numbers)]) for camera in (source, target))
-        return Sample(
-            source=self._pictures(source, numbers, lens),
-            target=self._pictures(target, numbers, lens),
-            source_from_target=relative_pose(*poses).numpy(),
-            fps=self.fps,
-            scene=scene.name,
-            frame_numbers=tuple(numbers),
-        )
-
-    def _pictures(self, camera: FilmedCamera, numbers: range, lens: Intrinsics) -> Bytes:
-        """Frames of a video as a camera with this lens sees them, at the size of the samples. u8 [T, H, W, 3]."""
-        return np.stack([seen_through(each, camera.lens, lens, self._size) for each in _decoded(camera.video, numbers)])
+        sides = [Side(_decoded(each.video, numbers), each.lens, each.poses[list(numbers)]) for each in cameras]
+        return sample_of(sides, self._size, fps=self.fps, scene=scene.name, frame_numbers=tuple(numbers))
 
 
 def _decoded(video: Path, numbers: range) -> list[Bytes]:
@@ -210,3 +207,92 @@ def _decoded(video: Path, numbers: range) -> list[Bytes]:
     finally:
         opened.release()
     return found
+
+
+def nearest_pictures(path: Path, times_s: Sequence[float], tolerance_s: float, av: Any) -> list[Bytes]:
+    """The picture nearest to each time.
+
+    Args:
+        times_s: rising, seconds in the file.
+        tolerance_s: a picture farther away in time is none.
+        av: PyAV.
+    Returns:
+        T of u8 [H, W, 3], RGB.
+    Raises: FileFault: the video is missing, damaged, too short, or has no picture near enough.
+    """
+    if not path.is_file():
+        raise FileFault(path, "is missing: download or export the data set again")
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise FileFault(path, "holds no video")
+            stream = container.streams.video[0]
+            stream.thread_type = "NONE"  # loader workers share the cores
+            begin = max(0.0, times_s[0] - _EARLY_S)
+            container.seek(int(begin / stream.time_base), stream=stream, backward=True)
+            frames = (frame for frame in container.decode(stream) if frame.pts is not None)
+            return list(_nearest(path, frames, times_s, tolerance_s))
+    except (av.FFmpegError, ValueError, IndexError) as error:
+        raise FileFault(path, f"is damaged ({error})") from error
+
+
+def _nearest(path: Path, frames: Iterator[Any], times_s: Sequence[float], tolerance_s: float) -> Iterator[Bytes]:
+    """One picture a wanted time; a picture may serve two."""
+    before, after = None, next(frames, None)
+    for wanted in times_s:
+        while after is not None and after.time < wanted:
+            before, after = after, next(frames, None)
+        there = [frame for frame in (before, after) if frame is not None]
+        if not there:
+            raise FileFault(path, "holds no picture that can be decoded")
+        frame = min(there, key=lambda each: abs(each.time - wanted))
+        if abs(frame.time - wanted) > tolerance_s:
+            end = f"it ends at {frame.time:.3f} s" if after is None else f"the nearest is at {frame.time:.3f} s"
+            raise FileFault(path, f"has no picture within {1000 * tolerance_s:.1f} ms of {wanted:.3f} s: {end}")
+        yield frame.to_ndarray(format="rgb24")
+
+
+class Side(NamedTuple):
+    """One camera of a pair. pictures: T of u8 [H, W, 3]. poses: world_from_camera, f64 [T, 4, 4], metres."""
+
+    pictures: Sequence[Bytes]
+    lens: Intrinsics
+    poses: Doubles
+
+
+def sample_of(
+    sides: Sequence[Side], size: tuple[int, int], *, fps: float, scene: str, frame_numbers: tuple[int, ...]
+) -> Sample:
+    """What two calibrated cameras filmed at the same moments: the first is the source, the second the target.
+
+    size: width and height. Both sides get the lens that shows less, which is within what the other one shows.
+    """
+    lens = max((side.lens for side in sides), key=lambda lens: lens.fx / lens.width)
+    source, target = (
+        np.stack([seen_through(picture, side.lens, lens, size) for picture in side.pictures]) for side in sides
+    )
+    return Sample(
+        source=source,
+        target=target,
+        source_from_target=relative_pose(*(torch.from_numpy(side.poses) for side in sides)).numpy(),
+        fps=fps,
+        scene=scene,
+        frame_numbers=frame_numbers,
+    )
+
+
+def seen_through(picture: Bytes, own: Intrinsics, lens: Intrinsics, size: tuple[int, int]) -> Bytes:
+    """A camera's picture as if taken through another lens, cropped about its middle and resized: u8 [H, W, 3].
+
+    own: of the picture. lens: the other one; what it shows beyond the picture is black. size: width and height.
+    """
+    wide, high = size
+    if lens != own:
+        middle = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV counts from a pixel's middle
+        to_lens = (lens.matrix @ own.matrix.inverse()).numpy()
+        warp = np.linalg.inv(middle) @ to_lens @ middle
+        picture = cv2.warpPerspective(picture, warp, (lens.width, lens.height)).astype(np.uint8, copy=False)
+    left, top, across, along = center_crop_box(lens.width, lens.height, wide / high)
+    kept = picture[top : top + along, left : left + across]
+    how = cv2.INTER_AREA if across >= wide else cv2.INTER_LINEAR
+    return cv2.resize(kept, size, interpolation=how).astype(np.uint8, copy=False)

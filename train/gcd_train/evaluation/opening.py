@@ -12,7 +12,8 @@ from typing import Literal, TypeAlias, get_args
 
 from gcd_model import Traits
 from gcd_model.small_files import read_small
-from gcd_train.data.files import Skips
+from gcd_train.data import kubric4d, parallel_domain4d
+from gcd_train.data.files import MANIFEST, Skips, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
@@ -30,8 +31,6 @@ from gcd_train.evaluation.protocol import (
     require_orbits,
     scene_number,
 )
-from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.layouts.manifest import MANIFEST, read_manifest
 
 DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
 """What a folder holds."""
@@ -247,10 +246,10 @@ def _dataset(folder: Path, options: ClipOptions, *, orbits: bool, painted: bool)
     names = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
     cameras = tuple(options.camera or names)
     if not orbits:
-        return ParallelDomain4D.open(folder, cameras=cameras, classes=painted)
+        return ParallelDomain4D(folder, cameras=cameras, classes=painted)
     if painted:
         raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
-    return Kubric4D.open(folder, cameras=cameras, published=options.protocol == "release")
+    return Kubric4D(folder, cameras=cameras, published=options.protocol == "release")
 
 
 def _controls(options: ClipOptions, scenes: Sequence[str], sampling: OrbitSampling | DrivingSampling) -> SceneControls:

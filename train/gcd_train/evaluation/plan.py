@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from gcd_model.diffusion import Quality, RenderOptions, SolverName
+from gcd_train.data.files import package_version
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import VANILLA_SVD, BaselineSettings, baselines
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet
@@ -21,7 +22,6 @@ from gcd_train.evaluation.opening import ClipOptions, data_kind, open_clips
 from gcd_train.evaluation.predictors import Method
 from gcd_train.evaluation.protocol import SAMPLES
 from gcd_train.evaluation.store import LPIPS, RunNote
-from gcd_train.layouts.manifest import package_version
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

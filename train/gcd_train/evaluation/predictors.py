@@ -15,7 +15,8 @@ from torch import Tensor
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
-from gcd_train.data.files import FileFault, read_colour
+from gcd_train.data.encodings import read_colour
+from gcd_train.data.files import FileFault
 from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.errors import DataError
 from gcd_train.pointcloud.project import tangents

@@ -14,12 +14,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from gcd_model.geometry import Spherical, SphericalDelta
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.dataset4d import Dataset4D
 from gcd_train.data.files import Skips
-from gcd_train.data.paths import DrivingSampling, OrbitSampling, generator
-from gcd_train.data.splits import Control, Controls
+from gcd_train.data.paths import Control, Controls, DrivingSampling, OrbitSampling, generator
 from gcd_train.errors import DataError
-from gcd_train.layouts import kubric4d, parallel_domain4d
 
 ProtocolName: TypeAlias = Literal["paper", "release"]
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from gcd_model.errors import FileError
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics, from_pose, spherical_trajectory
 from gcd_model.small_files import decode_json, read_json
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.dataset4d import Dataset4D, OntologyItem, read_ontology
-from gcd_train.data.files import MOST_TEXT, ZIP_FAULTS, read_member
+from gcd_train.data.files import GEOMETRY, MOST_TEXT, ZIP_FAULTS, read_manifest, read_member
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
@@ -24,8 +25,6 @@ from gcd_train.data.pictures import frames_of, geometry_poses, renderer_kind, tr
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.evaluation.clips import nearest_resized
-from gcd_train.layouts import kubric4d, parallel_domain4d
-from gcd_train.layouts.manifest import GEOMETRY, read_manifest
 from gcd_train.look.clip import Bytes, Footage, Poses, instance_colour
 from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, splat, visibility
 
@@ -72,8 +71,7 @@ def open_scene(path: Path, options: ShowOptions) -> Footage:
 def _data_set(path: Path) -> Dataset4D:
     """Of one scene, with the cameras that are there: to look at it not all are needed. Raises DataError, FileFault."""
     if kubric4d.scene_number(path.name) is not None:
-        every = enumerate(kubric4d.CAMERAS)
-        views = [camera for view, camera in every if os.path.lexists(kubric4d.metadata_path(path, view))]
+        views = [camera for camera in kubric4d.CAMERAS if os.path.lexists(kubric4d.metadata_path(path, camera))]
         return Kubric4D(path.parent, [path.name], cameras=views or kubric4d.CAMERAS, instances=True)
     if parallel_domain4d.scene_number(path.name) is not None:
         cameras = [camera for camera in parallel_domain4d.CAMERAS if (path / "rgb" / camera).is_dir()]
@@ -250,7 +248,7 @@ def _labels(
     if len(found) < len(views):
         return None, "class", ()
     labels = np.stack([nearest_resized(ids, *size) for ids in found]).astype(np.int32)
-    path = kubric4d.metadata_path(data.folder(scene), int(data.source_camera.removeprefix("view") or 0))
+    path = kubric4d.metadata_path(data.folder(scene), data.source_camera)
     try:
         assets = read_json(path, _Assets, MOST_TEXT).instances
     except FileError:

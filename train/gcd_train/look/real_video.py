@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from gcd_model import Traits
 from gcd_model.errors import ShapeError
 from gcd_model.geometry import center_crop_box
-from gcd_train.data.files import decoded, read
+from gcd_train.data.encodings import decoded
+from gcd_train.data.files import read
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.store import folder_name
 

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.errors import RecipeError
-from gcd_train.layouts import kubric4d, parallel_domain4d
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving import EDITION, ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
 

@@ -15,8 +15,8 @@ from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
 from gcd_train.data.batches import EncodedBatches, SampleBatches
-from gcd_train.data.latents import LatentClips
-from gcd_train.data.latents_writer import Encodings, autoencoder_digest
+from gcd_train.data.cache import autoencoder_digest
+from gcd_train.data.latents import Encodings, LatentClips
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips
 from gcd_train.errors import DataError, RecipeError

@@ -1,4 +1,4 @@
-"""Pictures, depth and rotations as the published files have them, and as the compact ones do."""
+"""Pictures, depth and rotations as the published files have them and as the compact ones do, written and read."""
 
 import colorsys
 import io
@@ -7,17 +7,21 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
+import imagesize
 import numpy as np
 from numpy.typing import NDArray
 
+from gcd_train.data.files import FileFault, read, read_npz
 from gcd_train.errors import DataError, RenderError
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+Number = TypeVar("Number", bound=np.generic)
 
 NEAR_M, FAR_M = 0.05, 30_000.0
 """The range that depth codes keep; the farthest code also stands for the sky."""
@@ -35,7 +39,9 @@ _FAST_PNG = _png_options(1, cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_STRATEGY
 _DEPTH_PNG = _png_options(6, cv2.IMWRITE_PNG_FILTER_PAETH, cv2.IMWRITE_PNG_STRATEGY_FILTERED)
 # only what changes from row to row, in runs: a third of the time of searching for repetitions
 _ID_PNG = _png_options(1, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_STRATEGY_RLE)
-_PALETTE_KIND = 3  # of a PNG
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_PALETTE, _PNG_GREY = 3, 0  # kinds of a PNG
+_MOST_PIXELS = 1 << 27
 _PLAIN_TIFF = [cv2.IMWRITE_TIFF_COMPRESSION, 1]  # not compressed: every reader can
 _WEBP_EFFORT = 2  # half the time of OpenCV's effort, which is 4, for 3 % more bytes
 
@@ -91,21 +97,6 @@ STREET_DEPTH = DepthCode(step=0.0025, bend_m=20.0)
 """For streets: two thirds of the bytes. Half a step is 0.125 % * (1 + z / 20 m) of the depth: 8 mm at 5 m, 5 cm at
 20 m, 0.75 m at 100 m; a camera that moves by some metres does not see the difference."""
 _STAGE_METRES, _STREET_METRES = STAGE_DEPTH.table(), STREET_DEPTH.table()
-
-
-def stored_depth(picture: NDArray[Any]) -> Floats | None:
-    """Metres [H, W] of a depth PNG as it is decoded, None if it can be neither a stage's nor a street's.
-
-    picture: u16 [H, W], codes of a stage, or u8 [2 H, W], codes of a street: low bytes above, high bytes below.
-    """
-    if picture.ndim != 2:
-        return None
-    if picture.dtype == np.uint16:
-        return _STAGE_METRES[picture]
-    if picture.dtype != np.uint8 or picture.shape[0] % 2:
-        return None
-    low, high = np.split(picture, 2)
-    return _STREET_METRES[low + high.astype(np.uint16) * 256]
 
 
 def with_sky(metres: Floats) -> Floats:
@@ -175,7 +166,7 @@ def packed_id_png(ids: Bytes) -> bytes:
 def indexed_png(ids: Bytes, palette: Sequence[tuple[int, int, int]]) -> bytes:
     """[H, W] as a palette PNG: the pixels are the ids, a viewer shows their colours (OpenCV writes no palettes)."""
     grey = _encoded(".png", ids, _ID_PNG)
-    header = grey[12:25] + bytes([_PALETTE_KIND]) + grey[26:29]
+    header = grey[12:25] + bytes([_PNG_PALETTE]) + grey[26:29]
     colours = bytes(channel for colour in palette for channel in colour)
     return grey[:8] + _chunk(header[:4], header[4:]) + _chunk(b"PLTE", colours) + grey[33:]
 
@@ -216,3 +207,132 @@ def _encoded(suffix: str, picture: NDArray[np.generic], options: list[int]) -> b
     if not done:
         raise DataError(f"OpenCV could not write a {suffix} of {picture.dtype} {list(picture.shape)}")
     return data.tobytes()
+
+
+def read_colour(path: Path) -> Bytes:
+    """RGB picture of a PNG, WebP or JPEG file, u8 [H, W, 3]; alpha is dropped. Raises FileFault."""
+    picture = decoded(path, read(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def read_depth(path: Path, key: str = "data") -> Floats:
+    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a PNG of ours (`DepthCode`).
+
+    0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
+    Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known or within those.
+    """
+    match path.suffix:
+        case ".npz":
+            stored = read_npz(path).get(key)
+            if stored is None:
+                raise FileFault(path, f"lacks its array `{key}`")
+        case ".png":
+            stored = _from_codes(path)
+        case _:
+            stored = decoded(path, read(path), cv2.IMREAD_UNCHANGED)
+    shape = stored.shape[:2]
+    if stored.dtype.kind != "f" or stored.ndim < 2 or stored.size == 0 or stored.size != shape[0] * shape[1]:
+        raise FileFault(path, f"should hold float32 depth [H, W], got {stored.dtype} {list(stored.shape)}")
+    metres = stored.reshape(shape).astype(np.float32, copy=False)
+    nearest, farthest = float(metres.min()), float(metres.max())
+    if not nearest >= 0:  # NaN is the least of all
+        bad = int(np.count_nonzero(~(metres >= 0)))
+        raise FileFault(path, f"has {bad} of {metres.size} depths that are NaN or negative")
+    if farthest == 0:
+        raise FileFault(path, "has no depth above 0 in any pixel")
+    if nearest > FAR_M:
+        raise FileFault(path, f"has depths beyond {FAR_M:g} m in every pixel: no scene is so far away")
+    return np.minimum(metres, np.float32(FAR_M)) if farthest > FAR_M else metres
+
+
+def _from_codes(path: Path) -> Floats:
+    """Metres of a depth PNG: 16-bit codes of a stage, or of a street the low bytes above the high ones."""
+    content = read(path)
+    _require_whole_png(path, content)
+    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
+    if picture.ndim == 2 and picture.dtype == np.uint16:
+        return _STAGE_METRES[picture]
+    if picture.ndim != 2 or picture.dtype != np.uint8 or picture.shape[0] % 2:
+        got = f"{picture.dtype} {list(picture.shape)}"
+        raise FileFault(path, f"should hold 16-bit depth codes, or their low bytes above their high ones, got {got}")
+    low, high = np.split(picture, 2)
+    return _STREET_METRES[low + high.astype(np.uint16) * 256]
+
+
+def read_ids(path: Path) -> NDArray[np.int32]:
+    """Ids, i32 [H, W], of a PNG that stores them as R + 256 G + 65536 B. Raises FileFault."""
+    content = read(path)
+    _require_whole_png(path, content)
+    picture = decoded(path, content, cv2.IMREAD_COLOR)
+    ids = cv2.extractChannel(picture, 2).astype(np.int32)
+    for channel, unit in ((1, 256), (0, 65536)):
+        more = cv2.extractChannel(picture, channel)
+        if cv2.countNonZero(more):  # mostly there is nothing in them
+            ids += more.astype(np.int32) * unit
+    return ids
+
+
+def read_palette_indices(path: Path) -> Bytes:
+    """Indices, u8 [H, W], of a palette PNG; of a grey one its values. Raises FileFault.
+
+    OpenCV would give the palette's colours. A palette picture without its palette is a grey picture, though, so the
+    header is rewritten to say that before it is decoded.
+    """
+    content = read(path)
+    _require_whole_png(path, content)
+    depth, kind = content[24], content[25]
+    if kind == _PNG_PALETTE:
+        content = _as_grey(content)
+    elif kind != _PNG_GREY:
+        raise FileFault(path, "holds colours, not a palette: instance numbers cannot be told from it")
+    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
+    if picture.dtype != np.uint8 or picture.ndim != 2:
+        raise FileFault(path, f"should hold 8-bit indices, got {picture.dtype} {list(picture.shape)}")
+    step = 255 // (2**depth - 1) if depth < 8 else 1  # fewer bits are spread over 0..255 when they are decoded
+    return np.ascontiguousarray(picture // step, dtype=np.uint8)
+
+
+def sized(path: Path, picture: NDArray[Number], height: int, width: int, other: str) -> NDArray[Number]:
+    """The picture. Raises FileFault if it has another size than `other` says."""
+    if picture.shape[:2] != (height, width):
+        got = f"{picture.shape[1]} x {picture.shape[0]}"
+        raise FileFault(path, f"is {got} where {other} says {width} x {height}: sizes are mixed")
+    return picture
+
+
+def decoded(path: Path, content: bytes, flags: int) -> NDArray[Any]:
+    """The picture in a file's content, as OpenCV decodes it with these flags. Raises FileFault."""
+    try:
+        width, height = imagesize.get(io.BytesIO(content), exif_rotation=False)
+    except Exception as error:  # of any kind, where a header is damaged
+        raise FileFault(path, f"is damaged: its size cannot be read ({error})") from error
+    if width * height > _MOST_PIXELS:
+        raise FileFault(path, f"states {width} x {height} pixels, more than {_MOST_PIXELS}")
+    try:
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise FileFault(path, f"cannot be decoded ({error.err or error})") from error
+    if picture is None:  # pyright: ignore[reportUnnecessaryComparison]  the stub does not tell
+        raise FileFault(path, f"is damaged: its {len(content)} bytes hold no whole picture")
+    return picture  # pyright: ignore[reportReturnType]
+
+
+def _require_whole_png(path: Path, content: bytes) -> None:
+    """Some versions of libpng fill what is cut off with zeros; those would be ids."""
+    if not content.startswith(_PNG_SIGNATURE) or len(content) < 33:
+        raise FileFault(path, "is damaged: it is no PNG")
+    if content[-8:-4] != b"IEND":
+        raise FileFault(path, f"is damaged: it is cut off after {len(content)} bytes")
+
+
+def _as_grey(content: bytes) -> bytes:
+    """A palette PNG as a grey PNG of its indices."""
+    header = content[12:25] + bytes([_PNG_GREY]) + content[26:29]
+    rebuilt = [content[:12], header, struct.pack(">I", zlib.crc32(header))]
+    at = 33
+    while at + 8 <= len(content):
+        length, name = struct.unpack_from(">I4s", content, at)
+        if name not in (b"PLTE", b"tRNS", b"bKGD", b"sBIT", b"hIST"):  # mean something else, or nothing, in grey
+            rebuilt.append(content[at : at + 12 + length])
+        at += 12 + length
+    return b"".join(rebuilt)

@@ -12,10 +12,7 @@ import msgspec
 import numpy as np
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.errors import DataError, RecipeError, TrainError
-from gcd_train.files import new_folder, remove_leftovers
-from gcd_train.layouts.kubric4d import Kubric4DWriter
-from gcd_train.layouts.manifest import (
+from gcd_train.data.files import (
     GEOMETRY,
     MANIFEST,
     Matrix,
@@ -24,7 +21,10 @@ from gcd_train.layouts.manifest import (
     package_version,
     read_manifest,
 )
-from gcd_train.layouts.parallel_domain4d import ParallelDomain4DWriter
+from gcd_train.data.kubric4d import Kubric4DWriter
+from gcd_train.data.parallel_domain4d import ParallelDomain4DWriter
+from gcd_train.errors import DataError, RecipeError, TrainError
+from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import freeze

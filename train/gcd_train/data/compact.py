@@ -8,17 +8,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from gcd_train.data.files import FileFault
+from gcd_train.data import encodings, kubric4d, parallel_domain4d
+from gcd_train.data.dataset4d import scene_names
+from gcd_train.data.encodings import FAR_M, NEAR_M
+from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, SceneFiles, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.files import new_folder
-from gcd_train.layouts import encodings, kubric4d, parallel_domain4d
-from gcd_train.layouts.encodings import FAR_M, NEAR_M
-from gcd_train.layouts.manifest import GEOMETRY, MANIFEST, SceneFiles, read_manifest
 
-_KUBRIC_WEBP, _STREET_WEBP = 85, 80
 _LEAST_PSNR_DB = 20.0  # what WebP of this quality is far above
 _JSON_FOLDERS = ("calibration", "ontology")
 
@@ -63,9 +62,10 @@ class Compaction:
     @property
     def scenes(self) -> tuple[str, ...]:
         """All there are, by number. Raises DataError for none."""
-        if self.orbits:
-            return Kubric4D.open(self.source, cameras=self.cameras).scenes
-        return ParallelDomain4D.open(self.source, cameras=self.cameras, source_camera=self._ahead, classes=False).scenes
+        number, example = (
+            (kubric4d.scene_number, "scn00000") if self.orbits else (parallel_domain4d.scene_number, "scene_000000")
+        )
+        return tuple(scene_names(self.source, number, example))
 
     def __call__(self, scene: str) -> Packed:
         """Pack a scene unless it is there: its folder appears once everything in it was compared with the source.
@@ -91,7 +91,10 @@ class Compaction:
             for time, camera in written:
                 (same,), (view,) = packed.views(scene, time, [camera]), reader.views(scene, time, [camera])
                 _require_alike(same, view, f"{camera} at frame {time}", street=not self.orbits)
-            self._write_manifest(scene, files)
+            if (self.source / scene / MANIFEST).exists():  # a scene of ours, whose files are others now
+                told = read_manifest(self.source / scene)
+                told = msgspec.structs.replace(told, compact=True, files=dict(sorted(files.checksums.items())))
+                files.write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(told), indent=1))
         gaps = frames * len(self.cameras) - len(written)
         return Packed(made=True, written=files.size, gaps=gaps)
 
@@ -110,7 +113,7 @@ class Compaction:
         """Files of a scene that are no pictures."""
         folder = self.source / scene
         if self.orbits:
-            yield from (kubric4d.metadata_path(folder, _number(camera)) for camera in self.cameras)
+            yield from (kubric4d.metadata_path(folder, camera) for camera in self.cameras)
         yield from (path for name in _JSON_FOLDERS for path in sorted((folder / name).glob("*.json")))
         if (folder / MANIFEST).exists():
             yield folder / GEOMETRY
@@ -142,10 +145,10 @@ class Compaction:
         self, source: Path, out: Path, view: SceneView, time: int, camera: str
     ) -> Iterator[tuple[Path, bytes]]:
         def place(folder: Path, layer: kubric4d.Layer, *, compact: bool = False) -> Path:
-            return kubric4d.frame_path(folder, _number(camera), layer, time, compact=compact)
+            return kubric4d.frame_path(folder, camera, layer, time, compact=compact)
 
         _require_published(place(source, "rgba"))
-        yield place(out, "rgba", compact=True), encodings.webp(view.rgb, quality=_KUBRIC_WEBP)
+        yield place(out, "rgba", compact=True), encodings.webp(view.rgb, quality=kubric4d.WEBP_QUALITY)
         yield place(out, "depth", compact=True), encodings.depth_png(view.depth)
         if view.instances is not None:
             yield place(out, "segmentation", compact=True), place(source, "segmentation").read_bytes()
@@ -157,7 +160,7 @@ class Compaction:
             return parallel_domain4d.frame_path(folder, camera, layer, time, compact=compact)
 
         _require_published(place(source, "rgb"))
-        yield place(out, "rgb", compact=True), encodings.webp(view.rgb, quality=_STREET_WEBP)
+        yield place(out, "rgb", compact=True), encodings.webp(view.rgb, quality=parallel_domain4d.WEBP_QUALITY)
         yield place(out, "depth", compact=True), encodings.street_depth_png(view.depth)
         if view.classes is not None:
             yield place(out, "semantic_segmentation_2d"), encodings.packed_id_png(view.classes)
@@ -166,18 +169,6 @@ class Compaction:
             small = int(view.instances.max()) < 256
             data = encodings.packed_id_png(view.instances.astype(np.uint8)) if small else path.read_bytes()
             yield place(out, "instance_segmentation_2d"), data
-
-    def _write_manifest(self, scene: str, files: SceneFiles) -> None:
-        """Of our own scenes, whose files are others now."""
-        if (self.source / scene / MANIFEST).exists():
-            told = read_manifest(self.source / scene)
-            told = msgspec.structs.replace(told, compact=True, files=dict(sorted(files.checksums.items())))
-            files.write(files.folder / MANIFEST, msgspec.json.format(msgspec.json.encode(told), indent=1))
-
-
-def _number(camera: str) -> int:
-    """Of a view of Kubric-4D."""
-    return int(camera.removeprefix("view"))
 
 
 def _require_published(path: Path) -> None:

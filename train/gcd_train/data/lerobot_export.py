@@ -1,28 +1,38 @@
-"""Episodes of a robot as a LeRobot data set (format v3.0), with the cameras' calibration beside it.
+"""Episodes of a robot, as those of the tabletop world, as a LeRobot data set (format v3.0) with calibrated cameras.
 
 Source: the LeRobotDataset v3.0 format as its documentation describes it: many episodes a file, `meta/episodes` says
-where each begins. The calibration is ours, see `folder`.
+where each begins. The calibration is ours, see `lerobot`.
 """
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.errors import DataError
-from gcd_train.lerobot.folder import CameraCalibration, load_arrow, load_av, write_cameras
+from gcd_model.geometry import Intrinsics
+from gcd_train.data.lerobot import CAMERA_FILE, CHUNK, CameraCalibration, CameraFile, extra
+from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.files import new_folder
+from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
+from gcd_train.scenes.frozen import freeze
+from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.tabletop import FPS, UNITS_A_METRE, Episode, tabletop_episode, upright_base
 
 Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+WRIST = "wrist"
+_IMAGES = "observation.images."
+_POSE_FEATURE = f"observation.camera_pose.{WRIST}"
 _SAMPLED = 8
 """Every so many frames' pictures go into the statistics."""
 _FILE = "chunk-{chunk:03d}/file-{file:03d}"
-_FILES_A_CHUNK = 1000
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
@@ -94,8 +104,7 @@ class LeRobotWriter:
 
     def __init__(self, folder: Path, cameras: dict[str, CameraCalibration], options: ExportOptions) -> None:
         self._folder, self._cameras, self._options = folder, cameras, options
-        self._arrow, self._parquet = load_arrow()
-        self._av = load_av()
+        self._arrow, self._parquet, self._av = extra("pyarrow"), extra("pyarrow.parquet"), extra("av")
         self._count, self._frames, self._tasks = 0, 0, dict[str, int]()
         self._statistics: dict[str, list[Statistics]] = {}
         self._videos: dict[str, _Video] = {}
@@ -113,7 +122,14 @@ class LeRobotWriter:
             raise DataError(f"an episode has {frames} pictures and {sorted(lengths)} rows; give one for each")
         columns = self._columns(episode, frames)
         statistics |= {name: _statistics(values) for name, values in columns.items()}
-        self._tables.append(self._arrow.table({name: self._column(name, values) for name, values in columns.items()}))
+        pa = self._arrow
+        flat = {name: pa.array(values.reshape(-1)) for name, values in columns.items()}
+        lists = {  # LeRobot's own are plain numbers
+            name: pa.FixedSizeListArray.from_arrays(flat[name], values.shape[1])
+            for name, values in columns.items()
+            if name not in _OWN
+        }
+        self._tables.append(pa.table(flat | lists))
         self._episodes.append(self._episode(episode, frames, begins, statistics))
         self._count, self._frames = self._count + 1, self._frames + frames
         if self._count % self._options.episodes_a_file == 0:
@@ -123,15 +139,16 @@ class LeRobotWriter:
         """Write what describes the set."""
         self._finish_files()
         statistics = {name: self._listed(name, _together(parts)) for name, parts in self._statistics.items()}
-        _write(self._folder / "meta/stats.json", statistics)
-        _write(self._folder / "meta/info.json", self._info())
+        for name, told in (("stats", statistics), ("info", self._info())):
+            (self._folder / f"meta/{name}.json").write_text(json.dumps(told, indent=4) + "\n", encoding="utf-8")
         self._write_tasks()
-        write_cameras(self._folder, self._cameras)
+        calibration = msgspec.json.format(msgspec.json.encode(CameraFile(cameras=self._cameras)), indent=1)
+        (self._folder / CAMERA_FILE).write_bytes(calibration)
 
     @property
     def _place(self) -> dict[str, int]:
         number = self._count // self._options.episodes_a_file
-        return {"chunk": number // _FILES_A_CHUNK, "file": number % _FILES_A_CHUNK}
+        return {"chunk": number // CHUNK, "file": number % CHUNK}
 
     def _video(self, name: str) -> _Video:
         if name not in self._videos:
@@ -155,16 +172,16 @@ class LeRobotWriter:
                 picture = seen[name]
                 if picture.shape != (camera.height, camera.width, 3):
                     raise DataError(f"{name} must be {camera.width} x {camera.height}, got a picture {picture.shape}")
-                self._encode_one(self._video(name), picture)
+                video, frame = (
+                    self._video(name),
+                    self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24"),
+                )
+                frame.pts, frame.time_base = video.frames, Fraction(1, self._options.fps)
+                video.container.mux(video.stream.encode(frame))
+                video.frames += 1
                 if number % _SAMPLED == 0:
                     sampled[name].append(picture[::4, ::4].reshape(-1, 3) / 255)
         return {name: _statistics(np.concatenate(rows)) for name, rows in sampled.items() if rows}
-
-    def _encode_one(self, video: _Video, picture: Bytes) -> None:
-        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-        frame.pts, frame.time_base = video.frames, Fraction(1, self._options.fps)
-        video.container.mux(video.stream.encode(frame))
-        video.frames += 1
 
     def _columns(self, episode: LoggedEpisode, frames: int) -> dict[str, NDArray[Any]]:
         """Rows [T, N] of an episode by name: its features and LeRobot's own numbers."""
@@ -177,11 +194,6 @@ class LeRobotWriter:
         numbers = (steps, np.full(frames, self._count), self._frames + steps, np.full(frames, task))
         own = [(steps / self._options.fps).astype(np.float32), *(row.astype(np.int64) for row in numbers)]
         return columns | {name: row[:, None] for name, row in zip(_OWN, own, strict=True)}
-
-    def _column(self, name: str, values: NDArray[Any]) -> Any:
-        """LeRobot's own are plain numbers, features are lists."""
-        flat = self._arrow.array(values.reshape(-1))
-        return flat if name in _OWN else self._arrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
     def _episode(
         self, episode: LoggedEpisode, frames: int, begins: dict[str, int], statistics: dict[str, Statistics]
@@ -226,7 +238,7 @@ class LeRobotWriter:
         if not self._tables:
             return
         number = (self._count - 1) // self._options.episodes_a_file
-        name = f"{_FILE.format(chunk=number // _FILES_A_CHUNK, file=number % _FILES_A_CHUNK)}.parquet"
+        name = f"{_FILE.format(chunk=number // CHUNK, file=number % CHUNK)}.parquet"
         for table, room in (
             (self._arrow.concat_tables(self._tables), "data"),
             (self._arrow.Table.from_pylist(self._episodes), "meta/episodes"),
@@ -256,7 +268,7 @@ class LeRobotWriter:
             "total_episodes": self._count,
             "total_frames": self._frames,
             "total_tasks": len(self._tasks),
-            "chunks_size": _FILES_A_CHUNK,
+            "chunks_size": CHUNK,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": self._options.fps,
@@ -267,36 +279,25 @@ class LeRobotWriter:
         }
 
     def _features(self) -> dict[str, Any]:
-        told: dict[str, Any] = {name: self._video_feature(camera) for name, camera in self._cameras.items()}
+        told: dict[str, Any] = {}
+        for name, camera in self._cameras.items():
+            video: dict[str, Any] = {"height": camera.height, "width": camera.width, "codec": "h264"}
+            video |= {"pix_fmt": "yuv420p", "is_depth_map": False, "fps": self._options.fps, "channels": 3}
+            info = {f"video.{key}": value for key, value in video.items()} | {"has_audio": False}
+            shape, axes = [camera.height, camera.width, 3], ["height", "width", "channels"]
+            told[name] = {"dtype": "video", "shape": shape, "names": axes, "info": info}
         for name, parts in self._statistics.items():
-            if name in self._cameras or name in _OWN:
-                continue
-            names = list(self._options.names.get(name, [])) or None
-            told[name] = {"dtype": "float32", "shape": list(parts[0]["mean"].shape), "names": names}
+            if name not in self._cameras and name not in _OWN:
+                names = list(self._options.names.get(name, [])) or None
+                told[name] = {"dtype": "float32", "shape": list(parts[0]["mean"].shape), "names": names}
         for name in _OWN:
             told[name] = {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
         return told
 
-    def _video_feature(self, camera: CameraCalibration) -> dict[str, Any]:
-        info = {
-            "video.height": camera.height,
-            "video.width": camera.width,
-            "video.codec": "h264",
-            "video.pix_fmt": "yuv420p",
-            "video.is_depth_map": False,
-            "video.fps": self._options.fps,
-            "video.channels": 3,
-            "has_audio": False,
-        }
-        shape = [camera.height, camera.width, 3]
-        return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": info}
-
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
         else:
@@ -304,5 +305,94 @@ class LeRobotWriter:
                 video.container.close()
 
 
-def _write(path: Path, told: dict[str, Any]) -> None:
-    path.write_text(json.dumps(told, indent=4) + "\n", encoding="utf-8")
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TabletopExport:
+    """How episodes are made.
+
+    seeds: one an episode. frames: of an episode, at 24 Hz. cameras: of view0..view15 and wrist, which moves with the
+    hand; the others stand where Kubric-4D has them, turned so that they look at every episode's robot alike.
+    width, height: pixels. oversample: as in `Renderer`.
+    """
+
+    seeds: range
+    frames: int = 120
+    cameras: tuple[str, ...] = ("view0", "view4", "view9", WRIST)
+    width: int = 320
+    height: int = 240
+    oversample: int = 2
+
+
+def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
+    """Write the data set `out`; yields how many episodes are done. The folder appears when all are.
+
+    Raises:
+        RecipeError: no such camera. RunError: `out` is there already, or cannot be written.
+        RenderError, DataError: an extra is not installed.
+    """
+    poses = _base_from_cameras(export.cameras)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise RunError(f"{out} is there already; choose another folder, or remove it")
+    names = {_POSE_FEATURE: [f"base_from_camera_{row}{column}" for row in range(4) for column in range(4)]}
+    options = ExportOptions(robot="tabletop primitive", fps=round(FPS), names=names)
+    with (
+        new_folder(out.absolute().parent, out.name) as folder,
+        Renderer(export.width, export.height, oversample=export.oversample) as renderer,
+        LeRobotWriter(folder, _calibrations(export, poses), options) as writer,
+    ):
+        for done, seed in enumerate(export.seeds, start=1):
+            episode = tabletop_episode(seed, frames=export.frames, skipped_s=0.0)
+            features = {"observation.state": episode.motion.state, "action": episode.motion.action}
+            if WRIST in export.cameras:
+                base_from_wrist = np.linalg.inv(episode.world_from_base) @ episode.wrist
+                features[_POSE_FEATURE] = _in_metres(base_from_wrist).reshape(-1, 16)
+            logged = LoggedEpisode(features=features, task=episode.task)
+            writer.add(logged, _pictures(renderer, episode, poses, export))
+            yield done
+
+
+def _base_from_cameras(names: tuple[str, ...]) -> dict[str, Floats]:
+    """base_from_camera [4, 4] of the cameras that stand still, decimetres."""
+    there = orbit_cameras(1)
+    unknown = [name for name in names if name not in there and name != WRIST]
+    if unknown or len(set(names)) != len(names) or len(names) < 2:
+        raise RecipeError(
+            f"cameras must be two or more different ones of view0..view15 and {WRIST}, got {', '.join(names)}"
+        )
+    base_from_world = np.linalg.inv(upright_base())
+    return {name: base_from_world @ there[name][0] for name in names if name != WRIST}
+
+
+def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[str, CameraCalibration]:
+    lens = Intrinsics.from_hfov(HFOV_DEG, export.width, export.height)
+    made: dict[str, CameraCalibration] = {}
+    for name in export.cameras:
+        rows = None if name == WRIST else tuple(map(tuple, _in_metres(poses[name]).tolist()))
+        made[_IMAGES + name] = CameraCalibration(
+            width=lens.width,
+            height=lens.height,
+            fx=lens.fx,
+            fy=lens.fy,
+            cx=lens.cx,
+            cy=lens.cy,
+            base_from_camera=rows,
+            pose_feature=_POSE_FEATURE if name == WRIST else None,
+        )
+    return made
+
+
+def _pictures(
+    renderer: Renderer, episode: Episode, poses: Mapping[str, Floats], export: TabletopExport
+) -> Iterator[Mapping[str, NDArray[np.uint8]]]:
+    """A picture of every camera, frame by frame."""
+    cameras = {name: np.tile(episode.world_from_base @ pose, (export.frames, 1, 1)) for name, pose in poses.items()}
+    if WRIST in export.cameras:
+        cameras[WRIST] = episode.wrist
+    views = renderer.views(freeze(episode.scene), cameras)
+    while seen := list(islice(views, len(cameras))):
+        yield {_IMAGES + name: rendering.rgb for _, name, rendering in seen}
+
+
+def _in_metres(poses: Floats) -> Floats:
+    scaled = poses.copy()
+    scaled[..., :3, 3] /= UNITS_A_METRE
+    return scaled

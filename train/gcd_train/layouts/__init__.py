@@ -1,1 +1,0 @@
-"""Published data layouts on disk: names, metadata, encodings, and folders that appear whole."""
