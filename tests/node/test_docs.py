@@ -23,7 +23,7 @@ from gcd_node.config import NodeConfig, ViewConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.sources import SourceConfig, SourcePose
 from gcd_node.verbs import VERBS
-from gcd_train.cli.main import app as train_app
+from gcd_train.cli.generate import app as train_app
 
 pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]

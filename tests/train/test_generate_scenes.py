@@ -19,7 +19,7 @@ from box_world import box_scene, box_world, checked, odd_box_scene
 from headless import needs_egl
 from typer.testing import CliRunner
 
-from gcd_train.cli.main import app
+from gcd_train.cli.generate import app
 from gcd_train.data import kubric4d
 from gcd_train.data.files import GEOMETRY, MANIFEST, SceneFiles, faults, read_manifest
 from gcd_train.errors import DataError, RecipeError, RenderError, RunError

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import CameraMount, driving_trajectory
-from gcd_train.cli.main import app
+from gcd_train.cli.generate import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.sample import painted as painted_clips
 from gcd_train.data.splits import require_apart

@@ -12,7 +12,7 @@ from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import save_weights
-from gcd_train.cli.main import app
+from gcd_train.cli.generate import app
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.galleries import has_views, write_views
 from gcd_train.evaluation.predictors import CopySource

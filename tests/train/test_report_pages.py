@@ -11,7 +11,7 @@ import pytest
 from made_records import FRAMES, note, record, region
 from typer.testing import CliRunner
 
-from gcd_train.cli.main import app
+from gcd_train.cli.generate import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
 from gcd_train.evaluation.plots import all_plots

@@ -12,7 +12,7 @@ import pytest
 from headless import needs_egl
 from typer.testing import CliRunner
 
-from gcd_train.cli.main import app
+from gcd_train.cli.generate import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gcd_model.conditioning import clip_pixels, micro_conditioning
+from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks

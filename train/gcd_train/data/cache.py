@@ -34,8 +34,8 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from gcd_model.conditioning import clip_pixels
 from gcd_model.errors import FileError
-from gcd_model.image_encoder import clip_pixels
 from gcd_model.networks import Networks, weights_digest
 from gcd_model.small_files import read_json
 from gcd_model.vae import Posterior

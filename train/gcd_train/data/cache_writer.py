@@ -18,7 +18,6 @@ import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model.conditioning import clip_pixels
 from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
 from gcd_model.loading import random_weights, weights_path

@@ -20,8 +20,9 @@ import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model import Family, ModelConfig
+from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
+from gcd_model.weights.families import Family
 from gcd_train.data.cache import (
     FrozenEncoders,
     Index,
