@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Floats, Pattern, Sheet
+from gcd_train.scenes.description import Colour, Floats, Paint, Pattern, Sheet, shaded
 from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.roads import Crossing, Doubles, Road, Street, fan, patches, quads, ribbon
 
@@ -28,9 +28,9 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     sheets = [terrain(800.0, 200.0, grass if random.random() < 0.75 else dry, 0.3 * wetness)]
     if paved:
         court = [piece for road in street.roads for piece in _beside(road, 1.0, road.pavement_m + 16.0, _COURT_M)]
-        sheets.append(flat(np.concatenate(court), _times(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
+        sheets.append(flat(np.concatenate(court), shaded(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
     sheets.append(flat(_asphalt(street), asphalt, Label.ROAD, Pattern.SPECKLE, wetness))
-    sheets.append(flat(_repairs(street.main, random), _times(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
+    sheets.append(flat(_repairs(street.main, random), shaded(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
     if wetness > 0:
         sheets.append(flat(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
     stone = [piece for road in street.roads for piece in _beside(road, 0.0, road.pavement_m, PAVEMENT_M)]
@@ -41,19 +41,14 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     return [*sheets, *_marks(street, wetness, random)]
 
 
-def _times(colour: Colour, factor: float) -> Colour:
-    r, g, b = (min(channel * factor, 1.0) for channel in colour)
-    return r, g, b
-
-
 def flat(
     corners: Floats, colour: Colour, label: Label, pattern: Pattern = Pattern.PLAIN, wetness: float = 0.0
 ) -> Sheet:
     """Triangles turned so that they face up; what is wet is darker, and shines."""
     edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     upward = np.where((edges[:, 2] < 0)[:, None, None], corners[:, ::-1], corners).astype(np.float32)
-    dark = _times(colour, 1 - 0.35 * wetness) if label != Label.LANE_MARKING else colour
-    return Sheet(corners=upward, colour=dark, label=label, pattern=pattern, gloss=wetness)
+    dark = shaded(colour, 1 - 0.35 * wetness) if label != Label.LANE_MARKING else colour
+    return Sheet(upward, Paint(dark, pattern=pattern, gloss=wetness), label)
 
 
 def terrain(half_m: float, cell_m: float, colour: Colour, wetness: float = 0.0) -> Sheet:

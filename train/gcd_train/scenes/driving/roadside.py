@@ -210,7 +210,8 @@ def _houses(plot: Plot, place: Place, district: District, paved: bool, lit: bool
             if roof.shape == "gable":  # closed from below
                 below = (0.0, 0.0, roof.centre[2] - roof.size[2] / 2 - 0.05)
                 size = (roof.size[0], roof.size[1], 0.1)
-                house.append(replace(roof, shape="box", centre=below, size=size, colour=(0.7, 0.68, 0.64)))
+                soffit = replace(roof.paint, colour=(0.7, 0.68, 0.64))
+                house.append(replace(roof, shape="box", centre=below, size=size, paint=soffit))
             if paved and plot.shows_details(at):
                 house += things.shop(width, -place.side * depth / 2, lit, random)
             plot.put(at.put(house))

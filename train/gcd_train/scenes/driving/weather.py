@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Floats, Light, Part, Pattern, Sheet
+from gcd_train.scenes.description import Colour, Floats, Light, Paint, Part, Pattern, Sheet, pick, towards
 from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.ground import PATCH_M
 from gcd_train.scenes.driving.roads import fan
 from gcd_train.scenes.driving.roadside import Place
-from gcd_train.scenes.driving.things import block, picked
+from gcd_train.scenes.driving.things import block
 
 _SHARES = {
     "clear": 0.3, "cloudy": 0.18, "low sun": 0.12, "overcast": 0.12, "rain": 0.12, "fog": 0.06, "dusk": 0.06,
@@ -72,11 +72,6 @@ def _light(kind: str, random: np.random.Generator) -> Light:
     return _grey(kind, azimuth, exposure, random)
 
 
-def _sun_to(height_deg: float, azimuth: float) -> tuple[float, float, float]:
-    height = math.radians(height_deg)
-    return math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)
-
-
 def _sunny(kind: str, azimuth: float, exposure: float, random: np.random.Generator) -> Light:
     height = float(random.uniform(9, 17) if kind == "low sun" else random.uniform(24, 66))
     low = math.exp(-height / 18.0)  # how golden the light is
@@ -85,7 +80,7 @@ def _sunny(kind: str, azimuth: float, exposure: float, random: np.random.Generat
     blue = float(random.uniform(0.6, 1.0)) * (1.0 if kind != "cloudy" else 0.6)
     zenith: Colour = (0.5 - 0.42 * blue, 0.56 - 0.33 * blue, 0.68 + 0.02 * blue)
     return Light(
-        sun_to=_sun_to(height, azimuth),
+        sun_to=towards(math.radians(height), azimuth),
         sun=sun,
         sky=(0.38 - 0.06 * blue, 0.42, 0.48 + 0.06 * blue),
         ground=(0.17, 0.16, 0.14),
@@ -102,7 +97,7 @@ def _grey(kind: str, azimuth: float, exposure: float, random: np.random.Generato
     grey = {"overcast": 0.72, "rain": 0.5, "fog": 0.66}[kind]
     sky: Colour = (grey * 0.96, grey * 0.99, grey * 1.03)
     return Light(
-        sun_to=_sun_to(float(random.uniform(45, 75)), azimuth),
+        sun_to=towards(math.radians(float(random.uniform(45, 75))), azimuth),
         sun=(0.12, 0.12, 0.11),
         sky=(0.86 * grey + 0.16, 0.88 * grey + 0.16, 0.92 * grey + 0.16),
         ground=(0.3 * grey, 0.29 * grey, 0.28 * grey),
@@ -116,7 +111,7 @@ def _grey(kind: str, azimuth: float, exposure: float, random: np.random.Generato
 
 def _dim(kind: str, azimuth: float, exposure: float) -> Light:
     dusk = Light(
-        sun_to=_sun_to(8.0, azimuth),
+        sun_to=towards(math.radians(8.0), azimuth),
         sun=(0.16, 0.08, 0.05),
         sky=(0.2, 0.2, 0.3),
         ground=(0.08, 0.07, 0.07),
@@ -130,7 +125,7 @@ def _dim(kind: str, azimuth: float, exposure: float) -> Light:
         return dusk
     return replace(
         dusk,
-        sun_to=_sun_to(40.0, azimuth),
+        sun_to=towards(math.radians(40.0), azimuth),
         sun=(0.035, 0.045, 0.07),
         sky=(0.06, 0.065, 0.095),
         ground=(0.03, 0.026, 0.022),
@@ -144,9 +139,9 @@ def _dim(kind: str, azimuth: float, exposure: float) -> Light:
 def lit_windows(house: Sequence[Part], random: np.random.Generator) -> list[Part]:
     """Some windows of a house's two long sides, bright; they lie where the shader paints the windows of that wall."""
     wall = house[0]
-    if wall.pattern != Pattern.WINDOWS:
+    if wall.paint.pattern != Pattern.WINDOWS:
         return []
-    r, g, b = (round(255 * channel) / 255 for channel in wall.colour)
+    r, g, b = (round(255 * channel) / 255 for channel in wall.paint.colour)
     wide, high = 2.2 + 2.0 * ((r * 37.0) % 1), 2.9 + 0.6 * ((g * 53.0) % 1)
     size = ((0.35 + 0.45 * ((b * 71.0) % 1)) * wide * 0.96, 0.06, 0.5 * high * 0.96)
     ahead = np.array([np.cos(wall.yaw), np.sin(wall.yaw)])
@@ -162,7 +157,7 @@ def lit_windows(house: Sequence[Part], random: np.random.Generator) -> list[Part
         for index in random.choice(len(cells), count, replace=False) if count else []:
             column, floor = cells[int(index)]
             x, y = face + along * ((column + 0.5) * wide - start)
-            warm, share = picked(random, _WARM), float(random.uniform(0.35, 0.8))
+            warm, share = pick(random, _WARM), float(random.uniform(0.35, 0.8))
             at = (float(x), float(y), (floor + 0.55) * high)
             parts.append(block(at, size, _mixed((0.0, 0.0, 0.0), share, warm), Label.BUILDING, lit=True, yaw=wall.yaw))
     return parts
@@ -183,7 +178,7 @@ def lamp_pools(lamps: Sequence[Place], asphalt: Colour, strength: float) -> list
             pieces.append(fan(np.array([x, y, z]), rim))
         share = (step + 1) / _POOL_STEPS
         colour = _mixed(asphalt, strength * share**2, (0.92, 0.74, 0.5))
-        sheets.append(Sheet(corners=np.concatenate(pieces), colour=colour, label=Label.ROAD))
+        sheets.append(Sheet(np.concatenate(pieces), Paint(colour), Label.ROAD))
     return sheets
 
 

@@ -110,7 +110,7 @@ def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
     crowd = Crowd(street=street, drive=drive, obstacles=plot.taken, cameras=cameras, camera_room_m=CAMERA_ROOM_M)
     fill(crowd, weather.lamps, moving)
     sheets = ground_sheets(street, weather.wetness, paved, ground)
-    asphalt = next(sheet.colour for sheet in sheets if sheet.label == Label.ROAD)
+    asphalt = next(sheet.paint.colour for sheet in sheets if sheet.label == Label.ROAD)
     parts = [sky_dome(), *(part for thing in plot.things for part in thing)]
     if weather.dark:
         sheets += lamp_pools(plot.lamps, asphalt, 0.9 if weather.kind == "night" else 0.3)

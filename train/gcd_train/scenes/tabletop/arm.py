@@ -1,16 +1,14 @@
 """The arm, six hinges and a parallel gripper, and the physics: arm, table and things as one MuJoCo model, in metres."""
 
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.errors import RenderError
-from gcd_train.scenes.description import Colour, Part, Point, rotations
-from gcd_train.scenes.tabletop.furniture import FLOOR_M
-from gcd_train.scenes.tabletop.things import Placed, Setting, TabletopClass, Thing
+from gcd_train.scenes.description import Colour, Part, Point, pick, rotations
+from gcd_train.scenes.drop.world import load_mujoco
+from gcd_train.scenes.tabletop.things import FLOOR_M, Placed, Setting, TableThing, TabletopClass, plain
 
 BASE = (-0.36, 0.0, 0.0)
 """Where the arm is bolted to the table, metres from the middle of its surface."""
@@ -80,7 +78,7 @@ def random_arm(random: np.random.Generator) -> str:
     Its body stands at the origin, x ahead; its site "tool" is the point between the fingertips, z out of the hand, y
     from finger to finger.
     """
-    shell, joint = _LIVERIES[int(random.integers(len(_LIVERIES)))]
+    shell, joint = pick(random, _LIVERIES)
     upper, fore = float(random.uniform(0.33, 0.37)), float(random.uniform(0.30, 0.34))
     r, s, j = 0.045 * float(random.uniform(0.9, 1.15)), _rgba(shell), _rgba(joint)
     return f"""
@@ -169,10 +167,7 @@ class Model:
 
 def build_model(setting: Setting) -> Model:
     """Compile everything. Raises RenderError without MuJoCo."""
-    try:
-        mujoco: Any = import_module("mujoco")  # an optional dependency: only generating needs it
-    except ImportError as error:
-        raise RenderError("the tabletop world needs the extra `scenes`: pip install 'gcd-node[scenes]'") from error
+    mujoco = load_mujoco()
     model = mujoco.MjModel.from_xml_string(_xml(setting))
     return Model(
         mujoco=mujoco,
@@ -187,12 +182,12 @@ def build_model(setting: Setting) -> Model:
     )
 
 
-def arm_links(model: Model) -> list[tuple[Thing, int, TabletopClass]]:
+def arm_links(model: Model) -> list[tuple[TableThing, int, TabletopClass]]:
     """The arm's links, the gripper's last, each with its body's number and its class.
 
     Their names tell the class too, for layouts that keep no classes: robot_arm/upper_arm, gripper/palm.
     """
-    found: list[tuple[Thing, int, TabletopClass]] = []
+    found: list[tuple[TableThing, int, TabletopClass]] = []
     for body_name, name in _LINKS.items():
         label = TabletopClass.GRIPPER if body_name in _GRIPPER else TabletopClass.ROBOT_ARM
         body = model.model.body(body_name).id
@@ -200,7 +195,7 @@ def arm_links(model: Model) -> list[tuple[Thing, int, TabletopClass]]:
         middle, size = _bounding_box(parts)
         mass_kg = float(model.model.body_mass[body])
         name = f"{label.name.lower()}/{name}"
-        link = Thing(name=name, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
+        link = TableThing(name=name, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
         found.append((link, body, label))
     return found
 
@@ -214,17 +209,9 @@ def _parts_of_body(model: Model, body: int, label: TabletopClass) -> tuple[Part,
     for geom in range(first, first + compiled.body_geomnum[body]):
         shape = shapes[kinds(compiled.geom_type[geom])]
         x, y, z = (2 * compiled.geom_size[geom]).tolist()
-        part = Part(
-            shape=shape,
-            size=(x, y, z) if shape == "box" else (x, x, y),
-            centre=tuple(compiled.geom_pos[geom].tolist()),
-            turn=tuple(compiled.geom_quat[geom].tolist()),
-            colour=tuple(compiled.geom_rgba[geom][:3].tolist()),
-            gloss=0.25,
-            grain_m=0.05,
-            label=label,
-        )
-        found.append(part)
+        size = (x, y, z) if shape == "box" else (x, x, y)
+        colour, place = tuple(compiled.geom_rgba[geom][:3].tolist()), tuple(compiled.geom_pos[geom].tolist())
+        found.append(Part(shape, place, size, plain(colour, 0.25), label, tuple(compiled.geom_quat[geom].tolist())))
     return tuple(found)
 
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
+from gcd_train.scenes.description import Doubles as Floats
+from gcd_train.scenes.description import Tracks
 from gcd_train.scenes.tabletop.arm import BASE, HOME, OPEN_M, STEP_S, Model
 from gcd_train.scenes.tabletop.tasks import Planner, Step
 from gcd_train.scenes.tabletop.things import Placed
@@ -21,8 +22,6 @@ _SETTLE_S = 0.5
 _LEAD_S = 0.03
 """Joints are told where to be a little later, since they follow with this delay."""
 _SLIP_M = 0.03
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,15 +46,11 @@ class Grasp:
 class Motion:
     """What happened, a row a frame; metres, radians, seconds, in the frame of the table.
 
-    positions [T, B, 3], quaternions [T, B, 4] (w, x, y, z), velocities and angular_velocities [T, B, 3]: of all bodies
-    of the model. tool: [T, 4, 4], table_from_tool. state, action: [T, J + 2], joints and fingers: where they are and
-    where they are told to be. steps: name of the step of each frame.
+    tracks: of all bodies of the model. tool: [T, 4, 4], table_from_tool. state, action: [T, J + 2], joints and fingers:
+    where they are and where they are told to be. steps: name of the step of each frame.
     """
 
-    positions: Floats
-    quaternions: Floats
-    velocities: Floats
-    angular_velocities: Floats
+    tracks: Tracks
     tool: Floats
     state: Floats
     action: Floats
@@ -73,7 +68,7 @@ class Simulation:
         self._planner = Planner(model, self._data, things, random, speed)
         self._opening = 1.0
         self._watch = _Watch(model, self._data)
-        self._rows: list[dict[str, Floats]] = []
+        self._rows: list[tuple[Floats, ...]] = []
         self._names: list[str] = []
 
     def run(self, frames: int, skipped_s: float) -> Motion:
@@ -99,9 +94,19 @@ class Simulation:
         kinds = (faults.mjWARN_BADQPOS, faults.mjWARN_BADQVEL, faults.mjWARN_BADQACC)
         if any(data.warning[int(kind)].number for kind in kinds):
             raise RenderError("the physics of this tabletop scene became unstable; leave its seed out")
-        kept = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
-        grasps, tasks = tuple(self._watch.grasps), tuple(self._watch.tasks)
-        return Motion(**kept, steps=tuple(self._names), grasps=grasps, tasks=tasks)
+        positions, quaternions, rates, tool, state, action = (np.stack(rows) for rows in zip(*self._rows, strict=True))
+        tracks = Tracks(
+            positions=positions, quaternions=quaternions, velocities=rates[..., 3:], angular_velocities=rates[..., :3]
+        )
+        return Motion(
+            tracks=tracks,
+            tool=tool,
+            state=state,
+            action=action,
+            steps=tuple(self._names),
+            grasps=tuple(self._watch.grasps),
+            tasks=tuple(self._watch.tasks),
+        )
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""
@@ -137,18 +142,9 @@ class Simulation:
             m.mujoco.mj_objectVelocity(m.model, data, m.mujoco.mjtObj.mjOBJ_BODY, body, rates[body], 0)
         tool = np.eye(4)
         tool[:3, :3], tool[:3, 3] = data.site_xmat[m.site].reshape(3, 3), data.site_xpos[m.site]
-        numbers = np.concatenate([m.joints, m.fingers])
-        self._rows.append(
-            {
-                "positions": data.xpos.copy(),
-                "quaternions": data.xquat.copy(),
-                "velocities": rates[:, 3:],
-                "angular_velocities": rates[:, :3],
-                "tool": tool,
-                "state": data.qpos[numbers].copy(),
-                "action": np.concatenate([self._joints, data.ctrl[m.grips]]),
-            }
-        )
+        state = data.qpos[np.concatenate([m.joints, m.fingers])].copy()
+        action = np.concatenate([self._joints, data.ctrl[m.grips]])
+        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, state, action))
         self._names.append(step.name)
 
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Point
 from gcd_train.scenes.tabletop.arm import BASE, OPEN_M, REACH_M, Model, random_arm
-from gcd_train.scenes.tabletop.furniture import TABLE_M, random_clutter, random_table
-from gcd_train.scenes.tabletop.things import Placed, Setting, random_thing
+from gcd_train.scenes.tabletop.things import TABLE_M, Placed, Setting, random_clutter, random_table, random_thing
 
 _FINGER_ROOM_M = 0.085
 """How far the open gripper reaches from the middle of what it takes."""
