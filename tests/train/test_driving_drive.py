@@ -16,8 +16,7 @@ from gcd_train.scenes.driving.flow import Crowd, RoadUser, random_drive
 from gcd_train.scenes.driving.roads import random_street
 from gcd_train.scenes.driving.roadside import Place, Plot
 from gcd_train.scenes.driving.vehicles import Lamps, random_bus
-from gcd_train.scenes.driving.weather import WEATHERS, random_weather
-from gcd_train.scenes.driving.world import random_world
+from gcd_train.scenes.driving.world import WEATHERS, random_weather, random_world
 from gcd_train.scenes.renderer import Renderer
 
 SEEDS = (1, 6, 11)

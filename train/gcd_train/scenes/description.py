@@ -312,3 +312,9 @@ def shaded(colour: Colour, factor: float) -> Colour:
     """The colour, darker or brighter."""
     r, g, b = (min(max(channel * factor, 0.0), 1.0) for channel in colour)
     return r, g, b
+
+
+def mixed(colour: Colour, share: float, other: Colour) -> Colour:
+    """The colour, by a share of the way to another one."""
+    r, g, b = (c + (o - c) * share for c, o in zip(colour, other, strict=True))
+    return r, g, b

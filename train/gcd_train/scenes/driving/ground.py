@@ -1,17 +1,18 @@
 """The ground of the driving world: asphalt, kerbs, rounded corners, pavements, marks, and what rain leaves."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Floats, Paint, Pattern, Sheet, shaded
+from gcd_train.scenes.description import Colour, Doubles, Floats, Paint, Pattern, Sheet, mixed, shaded
 from gcd_train.scenes.driving.classes import Label
-from gcd_train.scenes.driving.roads import Crossing, Doubles, Road, Street, fan, patches, quads, ribbon
+from gcd_train.scenes.driving.roads import Crossing, Road, Street, fan, patches, quads, ribbon
 
 ROAD_M, PATCH_M, MARK_M, PAVEMENT_M = 0.0, 0.004, 0.014, 0.12
 _KERB_WIDE_M, _KERB_SLOPE_M = 0.16, 0.05
 _CORNER_M, _COURT_M = 2.2, PAVEMENT_M - 0.03
 _MARKED_M = -70.0, 190.0
+_POOL_STEPS = 7
 
 
 def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random.Generator) -> list[Sheet]:
@@ -198,3 +199,24 @@ def _stop_lines(road: Road, crossing: Crossing) -> Doubles:
     right, left = -road.lanes_right * road.lane_m, road.lanes_left * road.lane_m
     at = crossing.at_m
     return np.array([(at - away, at - away + 0.4, right, 0.0), (at + away - 0.4, at + away, 0.0, left)])
+
+
+def lamp_pools(spots: Iterable[tuple[float, float, float]], asphalt: Colour, strength: float) -> list[Sheet]:
+    """Light on the road: discs one within the other, each a little brighter, just above the asphalt.
+
+    The renderer has no lamps; lit ground is brighter paint, below the lane marks. spots: x, y and heading of their
+    middles. strength: 0..1.
+    """
+    sheets: list[Sheet] = []
+    turn, spots = np.linspace(0, 2 * np.pi, 15), list(spots)
+    for step in range(_POOL_STEPS):
+        radius, z = 6.5 * (1 - step / _POOL_STEPS), PATCH_M + 0.0008 * (1 + step)
+        along, aside = radius * 1.25 * np.cos(turn), radius * np.sin(turn)
+        pieces = [np.zeros((0, 3, 3), np.float32)]
+        for x, y, heading in spots:
+            cos, sin = np.cos(heading), np.sin(heading)
+            rim = np.stack([x + along * cos - aside * sin, y + along * sin + aside * cos, 0 * turn + z], -1)
+            pieces.append(fan(np.array([x, y, z]), rim))
+        colour = mixed(asphalt, strength * ((step + 1) / _POOL_STEPS) ** 2, (0.92, 0.74, 0.5))
+        sheets.append(Sheet(np.concatenate(pieces), Paint(colour), Label.ROAD))
+    return sheets

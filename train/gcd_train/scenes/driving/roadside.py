@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Colour, Part
+from gcd_train.scenes.description import Colour, Doubles, Part
 from gcd_train.scenes.driving import things
-from gcd_train.scenes.driving.roads import Doubles, Road, Street
+from gcd_train.scenes.driving.roads import Road, Street
 from gcd_train.scenes.driving.things import District, tone
 
 CAMERA_ROOM_M = 0.6
@@ -108,7 +108,7 @@ class Plot:
     """The ground and what has been put on it; cameras: every place where one stands at some time, [N, 3]."""
 
     street: Street
-    cameras: NDArray[np.float64]
+    cameras: Doubles
     things: list[tuple[Part, ...]] = field(default_factory=list[tuple[Part, ...]])
     lamps: list[Place] = field(default_factory=list[Place])
     _taken: list[Footprints] = field(default_factory=list[Footprints])

@@ -1,10 +1,11 @@
 """What stands beside roads: houses, trees, lamps, signals, shelters, hedges; x along the road, y to its left, z up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Paint, Part, Pattern, Point, pick
+from gcd_train.scenes.description import Colour, Paint, Part, Pattern, Point, mixed, pick
 from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.roads import Road
 
@@ -34,6 +35,8 @@ _WALLS: tuple[Colour, ...] = (
     (0.72, 0.68, 0.6), (0.6, 0.36, 0.28), (0.78, 0.76, 0.72), (0.5, 0.5, 0.53), (0.66, 0.55, 0.42), (0.42, 0.28, 0.24),
     (0.82, 0.78, 0.62), (0.48, 0.56, 0.62), (0.36, 0.38, 0.42), (0.7, 0.6, 0.62), (0.58, 0.62, 0.5), (0.86, 0.85, 0.82),
 )  # fmt: skip
+_WARM: tuple[Colour, ...] = ((0.95, 0.78, 0.45), (0.9, 0.7, 0.36), (0.85, 0.86, 0.8), (0.95, 0.85, 0.6))
+_MOST_WINDOWS = 6
 _BOARDS: tuple[Colour, ...] = (
     (0.6, 0.1, 0.1), (0.1, 0.25, 0.5), (0.15, 0.4, 0.2), (0.2, 0.2, 0.2), (0.8, 0.6, 0.15),
 )  # fmt: skip
@@ -110,6 +113,33 @@ def shop(width: float, front: float, lit: bool, random: np.random.Generator) -> 
         block((0, front, 1.45), (wide, 0.16, 2.1), glass, label, gloss=0.7, lit=shines),
         block((0, front, 2.85), (wide + 0.3, 0.4, 0.5), board, label),
     ]
+
+
+def lit_windows(house: Sequence[Part], random: np.random.Generator) -> list[Part]:
+    """Some windows of a house's two long sides, bright; they lie where the shader paints the windows of that wall."""
+    wall = house[0]
+    if wall.paint.pattern != Pattern.WINDOWS:
+        return []
+    r, g, b = (round(255 * channel) / 255 for channel in wall.paint.colour)
+    wide, high = 2.2 + 2.0 * ((r * 37.0) % 1), 2.9 + 0.6 * ((g * 53.0) % 1)
+    size = ((0.35 + 0.45 * ((b * 71.0) % 1)) * wide * 0.96, 0.06, 0.5 * high * 0.96)
+    ahead = np.array([np.cos(wall.yaw), np.sin(wall.yaw)])
+    parts: list[Part] = []
+    for side in (-1.0, 1.0):
+        face = np.array(wall.centre[:2]) + side * wall.size[1] / 2 * np.array([-ahead[1], ahead[0]])
+        along = -side * ahead  # as the shader counts along a wall
+        start = float(face @ along)
+        columns = np.arange(np.ceil((start - wall.size[0] / 2) / wide), np.floor((start + wall.size[0] / 2) / wide))
+        floors = np.arange(0, np.floor(wall.size[2] / high - 0.4))
+        cells = [(float(c), float(f)) for c in columns for f in floors]
+        count = min(_MOST_WINDOWS, len(cells) // 3)
+        for index in random.choice(len(cells), count, replace=False) if count else []:
+            column, floor = cells[int(index)]
+            x, y = face + along * ((column + 0.5) * wide - start)
+            warm, share = pick(random, _WARM), float(random.uniform(0.35, 0.8))
+            at = (float(x), float(y), (floor + 0.55) * high)
+            parts.append(block(at, size, mixed((0.0, 0.0, 0.0), share, warm), Label.BUILDING, lit=True, yaw=wall.yaw))
+    return parts
 
 
 def leaf_colour(random: np.random.Generator) -> Colour:
