@@ -242,7 +242,7 @@ def _geometry(mujoco: Any, spec: Any, part: Part) -> dict[str, Any]:
     return {"type": kind.mjGEOM_MESH, "meshname": mesh.name}
 
 
-def drop_scene(seed: int, *, frames: int = 60) -> Scene:
+def drop_scene(seed: int, frames: int = 60) -> Scene:
     """A scene that depends on nothing but its arguments.
 
     Args:

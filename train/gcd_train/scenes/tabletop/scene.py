@@ -64,7 +64,7 @@ class Episode:
     task: str
 
 
-def tabletop_scene(seed: int, *, frames: int = 60) -> Scene:
+def tabletop_scene(seed: int, frames: int = 60) -> Scene:
     """A scene that depends on nothing but its arguments.
 
     Args:
