@@ -1,5 +1,6 @@
 """The arm, six hinges and a parallel gripper, and the physics: arm, table and things as one MuJoCo model, in metres."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +9,18 @@ from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Colour, Part, Point, pick, rotations
 from gcd_train.scenes.drop.world import load_mujoco
-from gcd_train.scenes.tabletop.things import FLOOR_M, Placed, Setting, TableThing, TabletopClass, plain
+from gcd_train.scenes.tabletop.things import (
+    FLOOR_M,
+    TABLE_M,
+    Placed,
+    Setting,
+    TableThing,
+    TabletopClass,
+    plain,
+    random_clutter,
+    random_table,
+    random_thing,
+)
 
 BASE = (-0.36, 0.0, 0.0)
 """Where the arm is bolted to the table, metres from the middle of its surface."""
@@ -22,6 +34,12 @@ OPEN_M = 0.052
 REACH_M = (0.27, 0.55)
 """Nearest and farthest distance from the base at which the arm grasps from above."""
 STEP_S = 1 / 480
+FINGER_ROOM_M = 0.085
+"""How far the open gripper reaches from the middle of what it takes."""
+_WIDEST_AZIMUTH = 1.15
+_GAP_M, _DROP_M, _TRIES = 0.015, 0.002, 400
+_SPANS_M = ((-0.3, TABLE_M[0] - 0.1), (0.1 - TABLE_M[1], TABLE_M[1] - 0.1))
+"""Where on the table things lie: along x and along y."""
 
 _LIVERIES: tuple[tuple[Colour, Colour], ...] = (
     ((0.93, 0.93, 0.91), (0.16, 0.17, 0.19)),
@@ -70,6 +88,48 @@ _DEFAULTS = """
 <default class="thing"><geom contype="1" conaffinity="3" condim="4"/></default>
 <default class="still"><geom contype="1" conaffinity="3" condim="3" friction="0.6 0.01 0.001"/></default>"""
 _MOVED_ALIKE = '<joint joint1="slide_right" joint2="slide_left" polycoef="0 1 0 0 0" solref="0.005 1"/>'
+
+
+def random_setting(random: np.random.Generator) -> Setting:
+    """An arm, a table with clutter, and things that the arm can take."""
+    arm, table, clutter = random_arm(random), random_table(random), random_clutter(random)
+    return Setting(arm=arm, table=table, clutter=clutter, things=_random_things(random, clutter))
+
+
+def _random_things(random: np.random.Generator, clutter: tuple[Placed, ...]) -> tuple[Placed, ...]:
+    """Five to twelve loose things; the first four or so stand apart and within reach, so that they can be taken."""
+    wanted = int(random.integers(5, 13))
+    placed: list[Placed] = []
+    for _ in range(_TRIES):
+        if len(placed) == wanted:
+            break
+        first = len(placed) < 4
+        thing = random_thing(random, 2 * OPEN_M - 0.022)
+        x, y = reachable_spot(random) if first else tuple(float(random.uniform(*span)) for span in _SPANS_M)
+        gap = FINGER_ROOM_M - 0.02 if first else _GAP_M
+        if _is_free(x, y, thing.radius_m + gap, (*placed, *clutter)):
+            place = (x, y, thing.size[2] / 2 + _DROP_M)
+            placed.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-math.pi, math.pi))))
+    return tuple(placed)
+
+
+def reachable_spot(random: np.random.Generator) -> tuple[float, float]:
+    """A point of the table, x and y in metres, that the arm can grasp at from above."""
+    radius = float(random.uniform(REACH_M[0] + 0.02, REACH_M[1] - 0.02))
+    azimuth = float(random.uniform(-_WIDEST_AZIMUTH, _WIDEST_AZIMUTH))
+    return BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth)
+
+
+def _is_free(x: float, y: float, radius: float, others: tuple[Placed, ...]) -> bool:
+    apart = math.hypot(x - BASE[0], y - BASE[1]) > 0.2 + radius
+    return apart and all(
+        math.hypot(x - other.place[0], y - other.place[1]) > radius + other.thing.radius_m for other in others
+    )
+
+
+def is_reachable(x: float, y: float) -> bool:
+    """Whether the arm can grasp from above at a point of the table, metres."""
+    return REACH_M[0] <= math.hypot(x - BASE[0], y - BASE[1]) <= REACH_M[1]
 
 
 def random_arm(random: np.random.Generator) -> str:

@@ -34,9 +34,8 @@ from gcd_train.scenes.description import (
     yawed,
 )
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model
+from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
-from gcd_train.scenes.tabletop.tasks import random_setting
 from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TabletopClass
 
 UNITS_A_METRE = 10.0
