@@ -7,7 +7,7 @@ import numpy as np
 from gcd_model.geometry import sphere_poses
 from gcd_train.data.files import SceneManifest, faults, read_manifest
 from gcd_train.errors import DataError
-from gcd_train.scenes.description import Light, Part, Pattern, Scene, SceneObject, Sheet, upright
+from gcd_train.scenes.description import Light, Paint, Part, Pattern, Scene, SceneObject, Sheet, square, upright
 from gcd_train.scenes.worlds import SceneWorld
 
 RED, GREEN = 9, 4
@@ -26,15 +26,11 @@ def box_scene(seed: int, frames: int) -> Scene:
     angles = torch.tensor([[90.0, 45.0, 15.0], [15.0, 5.0, 15.0]], dtype=torch.float64)
     return Scene(
         parts=(
-            Part(shape="box", centre=(0, 0, 0), size=(2, 2, 2), colour=(0.9, 0.1, 0.1), label=5, instance=RED, body=1),
-            Part(
-                shape="box", centre=(0, 0, 0), size=(1, 3, 1), colour=(0.1, 0.9, 0.1), label=8, instance=GREEN, body=2
-            ),
-            Part(
-                shape="sphere", centre=(0, 0, 0), size=(600, 600, 600), colour=(0, 0, 0), label=0, pattern=Pattern.SKY
-            ),
+            Part("box", (0, 0, 0), (2, 2, 2), Paint((0.9, 0.1, 0.1)), 5, instance=RED, body=1),
+            Part("box", (0, 0, 0), (1, 3, 1), Paint((0.1, 0.9, 0.1)), 8, instance=GREEN, body=2),
+            Part("sphere", (0, 0, 0), (600, 600, 600), Paint((0, 0, 0), pattern=Pattern.SKY), 0),
         ),
-        sheets=(Sheet(corners=_square(40.0), colour=(0.4, 0.4, 0.4), label=1),),
+        sheets=(Sheet(square(40.0, 0.0), Paint((0.4, 0.4, 0.4)), 1),),
         poses=upright(slide),
         focus=np.zeros((frames, 3), np.float32),
         cameras={f"view{n}": np.tile(pose, (frames, 1, 1)) for n, pose in enumerate(sphere_poses(angles).numpy())},
@@ -92,11 +88,6 @@ def _object(name: str, instance: int, body: int, size: tuple[float, float, float
         velocities=np.zeros((frames, 3)),
         angular_velocities=np.zeros((frames, 3)),
     )
-
-
-def _square(half: float) -> np.ndarray:
-    a, b, c, d = (-half, -half, 0), (half, -half, 0), (half, half, 0), (-half, half, 0)
-    return np.array([[a, b, c], [a, c, d]], np.float32)
 
 
 _LIGHT = Light(

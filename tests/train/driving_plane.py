@@ -30,7 +30,7 @@ from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.measure import predicted_and_measured as measured
 from gcd_train.evaluation.predictors import CameraPair, Predictor, pixel_rays
 from gcd_train.evaluation.statistics import Selection, Sums, class_counts, scene_sums
-from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World
+from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World
 
 SKY, ROAD, TERRAIN = 0, 1, 4
 STAGE_SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=20.0, radius_m=14.0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from gcd_model.geometry import Spherical, to_pose
-from gcd_train.scenes.description import Light, Part, Scene, upright
+from gcd_train.scenes.description import Light, Paint, Part, Scene, upright
 from gcd_train.scenes.worlds import SCENE_WORLDS
 
 LIGHT = Light(
@@ -27,8 +27,8 @@ def stage(seed: int, frames: int) -> Scene:
     path[:, 1, 0] = np.arange(frames) + seed
     angles = [(90.0 * view, 45.0) for view in range(4)] + [(15.0 + 30.0 * view, 5.0) for view in range(12)]
     poses = [to_pose(Spherical(azimuth_deg=a, elevation_deg=e, radius_m=15.0)).numpy() for a, e in angles]
-    floor = Part(shape="box", centre=(0.0, 0.0, -0.5), size=(60.0, 60.0, 1.0), colour=(0.5, 0.4, 0.3), label=1)
-    box = Part(shape="box", centre=(0, 0, 1), size=(2, 2, 2), colour=(0.2, 0.3, 0.8), label=2, instance=7, body=1)
+    floor = Part("box", (0, 0, -0.5), (60, 60, 1), Paint((0.5, 0.4, 0.3)), 1)
+    box = Part("box", (0, 0, 1), (2, 2, 2), Paint((0.2, 0.3, 0.8)), 2, instance=7, body=1)
     return Scene(
         parts=(floor, box),
         sheets=(),

@@ -9,15 +9,14 @@ from headless import needs_egl
 from numpy.typing import NDArray
 
 from gcd_model.geometry import driving_trajectory
-from gcd_train.scenes.description import Part, Scene
+from gcd_train.scenes.description import Paint, Part, Scene
 from gcd_train.scenes.driving import FPS, ONTOLOGY, class_ids, driving_drive, vehicle_from_camera
 from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.flow import Crowd, RoadUser, random_drive
 from gcd_train.scenes.driving.roads import random_street
 from gcd_train.scenes.driving.roadside import Place, Plot
 from gcd_train.scenes.driving.vehicles import Lamps, random_bus
-from gcd_train.scenes.driving.weather import WEATHERS, random_weather
-from gcd_train.scenes.driving.world import random_world
+from gcd_train.scenes.driving.world import WEATHERS, random_weather, random_world
 from gcd_train.scenes.renderer import Renderer
 
 SEEDS = (1, 6, 11)
@@ -123,7 +122,7 @@ def test_the_check_of_cameras_notices_a_wall_across_the_street() -> None:
 def test_nothing_is_put_where_a_camera_passes() -> None:
     street = random_street(np.random.default_rng(3))
     place = Place(road=street.main, s=0.0, side=1.0, away=40.0)
-    house = place.put([Part(shape="box", centre=(0, 0, 4), size=(8, 8, 8), colour=(1, 1, 1), label=Label.BUILDING)])
+    house = place.put([Part("box", (0, 0, 4), (8, 8, 8), Paint((1, 1, 1)), Label.BUILDING)])
     inside = np.array([house[0].centre])
     above = inside + np.array([0.0, 0.0, 6.0])
     assert not Plot(street=street, cameras=inside).put(house)

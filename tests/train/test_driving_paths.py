@@ -15,7 +15,7 @@ from gcd_train.evaluation.clips import cameras_of
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe
 from gcd_train.scenes.driving.world import driving_scene
-from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, agree, driving_world, read_world
+from gcd_train.scenes.worlds import CameraWay, PairForm, World, WorldOptions, agree, driving_world, read_world
 from gcd_train.training.setup import family_of, model_config
 
 FORM = PairForm(width=48, height=32, frames=3, oversample=1)

@@ -11,11 +11,10 @@ from headless import needs_egl
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
-from gcd_train.scenes.description import ORBIT, Part, Scene, rotations
+from gcd_train.scenes.description import ORBIT, Paint, Part, Scene, Tracks, rotations
 from gcd_train.scenes.drop import FPS, HFOV_DEG, DropLabel, drop_scene, orbit_cameras, world
-from gcd_train.scenes.drop.looks import DOME_M
-from gcd_train.scenes.drop.things import KINDS, bounds, outline, random_thing
-from gcd_train.scenes.drop.world import Tracks, UnsoundSceneError
+from gcd_train.scenes.drop.things import KINDS, bounds, outline, random_paint, random_thing
+from gcd_train.scenes.drop.world import DOME_M, UnsoundSceneError, require_sound
 from gcd_train.scenes.primitives import CONVEX, shape
 from gcd_train.scenes.renderer import Renderer
 
@@ -87,7 +86,7 @@ def test_solids_do_not_reach_into_each_other(scene: Scene) -> None:
 
 
 def test_overlap_is_measured_by_the_test_itself() -> None:
-    box = Part(shape="box", centre=(0, 0, 0), size=(2, 2, 2), colour=(0, 0, 0), label=1)
+    box = Part("box", (0, 0, 0), (2, 2, 2), Paint((0, 0, 0)), 1)
     assert depth_inside(np.array([[0.9, 0.0, 0.0], [5.0, 0.0, 0.0]]), box, np.eye(4)[:3]) == pytest.approx(0.1)
     assert depth_inside(np.array([[1.1, 0.0, 0.0]]), box, np.eye(4)[:3]) == 0
 
@@ -185,9 +184,8 @@ def test_mass_grows_with_the_square_of_the_size() -> None:
 def test_things_are_one_piece(name: str) -> None:
     """No part floats apart: boxes around parts touch each other from the first to the last."""
     random = np.random.default_rng(3)
-    paint = world.random_thing(random, side_m=1.0, dynamic=False).parts[0]
-    assert paint.label == DropLabel.OBJECT
-    made = KINDS[name](random, *(m for m in _materials(random)))
+    made = KINDS[name](random, *(random_paint(random, 1.0) for _ in range(2)))
+    assert {part.label for part in made} == {DropLabel.OBJECT}
     boxes = [(c.min(0) - 1e-3, c.max(0) + 1e-3) for c in map(outline, made)]
     joined, rest = {0}, set(range(1, len(boxes)))
     while rest:
@@ -196,20 +194,14 @@ def test_things_are_one_piece(name: str) -> None:
         joined, rest = joined | near, rest - near
 
 
-def _materials(random: np.random.Generator) -> list:
-    from gcd_train.scenes.drop.looks import random_material
-
-    return [random_material(random, 1.0) for _ in range(2)]
-
-
 def _touch(a: tuple, b: tuple) -> bool:
     return bool((a[0] <= b[1]).all() and (b[0] <= a[1]).all())
 
 
-def tracks(**changes: np.ndarray | float) -> Tracks:
+def tracks(**changes: np.ndarray) -> Tracks:
     still = {"positions": np.full((3, 2, 3), 0.5), "velocities": np.zeros((3, 2, 3))}
     turns = {"quaternions": np.tile(np.eye(4)[0], (3, 2, 1)), "angular_velocities": np.zeros((3, 2, 3))}
-    return Tracks(**{**still, **turns, "deepest_m": 0.01, **changes})
+    return Tracks(**{**still, **turns, **changes})
 
 
 def moved(to: float, axis: int, step: int = 2) -> np.ndarray:
@@ -230,20 +222,21 @@ def moved(to: float, axis: int, step: int = 2) -> np.ndarray:
     ],
 )
 def test_an_unsound_simulation_is_noticed(fault: dict, reason: str) -> None:
-    tracks().require_sound([0, 1])
+    require_sound(tracks(), 0.01, [0, 1])
+    deepest = fault.pop("deepest_m", 0.01)
     with pytest.raises(UnsoundSceneError, match=reason):
-        tracks(**fault).require_sound([0, 1])
+        require_sound(tracks(**fault), deepest, [0, 1])
 
 
 def test_an_unsound_attempt_is_followed_by_another(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
 
-    def first_explodes(things: list, *_: object, frames: int, **__: object) -> Tracks:
+    def first_explodes(things: list, *_: object, frames: int) -> tuple[Tracks, float]:
         calls.append(len(things))
         if len(calls) == 1:
             raise UnsoundSceneError("something exploded")
         still, turns = np.ones((frames, len(things), 3)), np.tile(np.eye(4)[0], (frames, len(things), 1))
-        return tracks(positions=still, quaternions=turns, velocities=0 * still, angular_velocities=0 * still)
+        return tracks(positions=still, quaternions=turns, velocities=0 * still, angular_velocities=0 * still), 0.0
 
     monkeypatch.setattr(world, "simulate", first_explodes)
     made = drop_scene(7, frames=2)
@@ -253,10 +246,10 @@ def test_an_unsound_attempt_is_followed_by_another(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_thing_that_reaches_a_camera_spoils_the_attempt(monkeypatch: pytest.MonkeyPatch) -> None:
-    def at_a_camera(things: list, *_: object, frames: int, **__: object) -> Tracks:
+    def at_a_camera(things: list, *_: object, frames: int) -> tuple[Tracks, float]:
         places, turns = np.ones((frames, len(things), 3)), np.tile(np.eye(4)[0], (frames, len(things), 1))
         places[1, -1] = orbit_cameras(1)["view9"][0, :3, 3] + 0.3
-        return tracks(positions=places, quaternions=turns, velocities=0 * places, angular_velocities=0 * places)
+        return tracks(positions=places, quaternions=turns, velocities=0 * places, angular_velocities=0 * places), 0.0
 
     monkeypatch.setattr(world, "simulate", at_a_camera)
     with pytest.raises(RenderError, match="reaches a camera"):

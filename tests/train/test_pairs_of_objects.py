@@ -22,9 +22,10 @@ from gcd_train.data.sample import painted as painted_clips
 from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.scenes.description import Scene, SceneObject
-from gcd_train.scenes.drop import HFOV_DEG
-from gcd_train.scenes.pair_world import (
-    STAGE_HFOV_DEG,
+from gcd_train.scenes.pair_writer import orbit_draw, write_shard
+from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.worlds import (
+    SCENE_WORLDS,
     PairForm,
     World,
     WorldOptions,
@@ -32,10 +33,8 @@ from gcd_train.scenes.pair_world import (
     driving_world,
     orbit_world,
     read_world,
+    scene_world,
 )
-from gcd_train.scenes.pair_writer import orbit_draw, write_shard
-from gcd_train.scenes.renderer import Renderer
-from gcd_train.scenes.worlds import SCENE_WORLDS, scene_world
 
 
 def stage(seed: int, frames: int) -> Scene:
@@ -232,10 +231,6 @@ def with_thing(scene: Scene, at: tuple[float, float, float], side: float = 2.0) 
         angular_velocities=still,
     )
     return replace(scene, objects=(cube,))
-
-
-def test_the_stage_has_one_lens() -> None:
-    assert STAGE_HFOV_DEG == HFOV_DEG
 
 
 @pytest.mark.parametrize(("world", "frames", "said"), [("driving", 14, "no stage"), ("stage", 40, "up to 30")])

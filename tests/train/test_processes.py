@@ -147,8 +147,8 @@ def test_a_run_killed_at_three_random_points_goes_on_to_the_same_losses_bit_for_
 @needs_egl
 def test_torchrun_trains_a_recipe_from_its_clips_to_its_weights(tmp_path: Path) -> None:
     """The command of the manual with two gloo processes, every stage; then SIGTERM in the middle, and on again."""
-    from gcd_train.scenes.pair_world import World
     from gcd_train.scenes.pair_writer import generate
+    from gcd_train.scenes.worlds import World
 
     world = World(
         name="driving",

@@ -11,7 +11,7 @@ from stage_world import LIGHT
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
-from gcd_train.scenes.description import DOMES, ORBIT, STREET, Extent, Part, Pattern, Scene, Sheet, upright
+from gcd_train.scenes.description import DOMES, ORBIT, STREET, Extent, Paint, Part, Pattern, Scene, Sheet, upright
 from gcd_train.scenes.frozen import FrozenScene, freeze, indexed, runs_of, vertices_of
 from gcd_train.scenes.primitives import CONVEX, SHAPES, shape
 from gcd_train.scenes.renderer import Renderer, Rendering
@@ -20,9 +20,12 @@ FORWARD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0
 """world_from_camera of a level camera 1.5 m above the origin that looks along x."""
 
 
+GREY = Paint((0.5, 0.5, 0.5))
+
+
 def box(x: float, y: float, z: float, size: float = 1.0, **tags: int) -> Part:
     given = {"label": 8, "instance": 5, **tags}
-    return Part(shape="box", centre=(x, y, z), size=(size, size, size), colour=(0.5, 0.5, 0.5), **given)
+    return Part("box", (x, y, z), (size, size, size), GREY, **given)
 
 
 STEP_ASIDE = np.zeros((4, 4))
@@ -130,8 +133,8 @@ def test_bodies_carry_their_parts() -> None:
 
 @needs_egl
 def test_a_roof_casts_a_shadow() -> None:
-    floor = Part(shape="box", centre=(10.0, 0.0, -0.5), size=(20.0, 20.0, 1.0), colour=(0.5, 0.5, 0.5), label=1)
-    roof = Part(shape="box", centre=(6.0, 0.0, 6.0), size=(4.0, 4.0, 0.2), colour=(0.5, 0.5, 0.5), label=5)
+    floor = Part("box", (10.0, 0.0, -0.5), (20.0, 20.0, 1.0), GREY, 1)
+    roof = Part("box", (6.0, 0.0, 6.0), (4.0, 4.0, 0.2), GREY, 5)
     lit, shaded = draw([floor]), draw([floor, roof])
     both = (lit.classes == 1) & (shaded.classes == 1)
     darker = both & (shaded.rgb[..., 0].astype(int) < lit.rgb[..., 0].astype(int) - 20)
@@ -140,15 +143,7 @@ def test_a_roof_casts_a_shadow() -> None:
 
 @needs_egl
 def test_the_sky_has_no_depth_and_its_own_class() -> None:
-    dome = Part(
-        shape="ball",
-        centre=(0, 0, 0),
-        size=(-900, 900, 900),
-        colour=(1, 1, 1),
-        label=0,
-        instance=0,
-        pattern=Pattern.SKY,
-    )
+    dome = Part("ball", (0, 0, 0), (-900, 900, 900), Paint((1, 1, 1), pattern=Pattern.SKY), 0)
     shown = draw([dome, box(10.0, 0.0, 1.5)])
     assert shown.depth[0, 0] == 0
     assert shown.classes[0, 0] == 0
@@ -158,7 +153,7 @@ def test_the_sky_has_no_depth_and_its_own_class() -> None:
 @needs_egl
 @pytest.mark.parametrize("pattern", DOMES)
 def test_a_dome_has_its_distance_and_casts_no_shadow(pattern: Pattern) -> None:
-    dome = Part(shape="sphere", centre=(0, 0, 0), size=(-80, 80, 80), colour=(0.7, 0.6, 0.5), label=0, pattern=pattern)
+    dome = Part("sphere", (0, 0, 0), (-80, 80, 80), Paint((0.7, 0.6, 0.5), pattern=pattern), 0)
     floor = box(10.0, 0.0, -9.0, size=18.0, label=1)
     alone, under = draw([floor], extent=ORBIT), draw([dome, floor], extent=ORBIT)
     rays = np.stack([*np.meshgrid((np.arange(96) - 47.5) / 48, (np.arange(64) - 31.5) / 48), np.ones((64, 96))], -1)
@@ -172,9 +167,7 @@ def test_a_dome_has_its_distance_and_casts_no_shadow(pattern: Pattern) -> None:
 @needs_egl
 @pytest.mark.parametrize("pattern", [p for p in Pattern if p >= Pattern.WOOD and p not in DOMES])
 def test_solid_paints_show_both_colours_and_stick_to_their_body(pattern: Pattern) -> None:
-    wall = replace(
-        box(0.0, 0.0, 0.0, size=6.0, body=1), colour=(0.9, 0.1, 0.1), accent=(0.1, 0.1, 0.9), pattern=pattern
-    )
+    wall = replace(box(0.0, 0.0, 0.0, size=6.0, body=1), paint=Paint((0.9, 0.1, 0.1), (0.1, 0.1, 0.9), pattern))
     poses = np.array([[[0, 0, 0, 0], [8.0, 0.0, 1.5, 0.0]]], np.float32)
     near, moved = draw([wall], poses=poses), draw([wall], poses=poses, camera=FORWARD + STEP_ASIDE)
     red, blue = (near.rgb[16:48, 24:72, channel].astype(int) for channel in (0, 2))
@@ -188,7 +181,7 @@ def test_solid_paints_show_both_colours_and_stick_to_their_body(pattern: Pattern
 @needs_egl
 def test_a_bowl_is_hollow() -> None:
     tilt = (np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0)  # its opening, which is up, towards the camera
-    bowl = Part(shape="bowl", centre=(6.0, 0.0, 1.5), size=(4, 4, 4), colour=(0.8, 0.8, 0.8), label=3, turn=tilt)
+    bowl = Part("bowl", (6.0, 0.0, 1.5), (4, 4, 4), Paint((0.8, 0.8, 0.8)), 3, tilt)
     shown = draw([bowl])
     rim, bottom = shown.depth[shown.classes == 3].min(), shown.depth[32, 48]
     assert rim == pytest.approx(6.0 - 0.24 * 4, abs=0.05)
@@ -198,7 +191,7 @@ def test_a_bowl_is_hollow() -> None:
 @needs_egl
 def test_a_floor_alone_is_a_scene() -> None:
     corners = np.array([[(1, -50, 0), (90, 50, 0), (1, 50, 0)], [(1, -50, 0), (90, -50, 0), (90, 50, 0)]], np.float32)
-    floor = Sheet(corners=corners, colour=(0.5, 0.5, 0.5), label=4)
+    floor = Sheet(corners, GREY, 4)
     with Renderer(96, 64, oversample=1) as renderer:
         shown = renderer.render(replace(scene([]), sheets=(floor,)))["camera"][0]
     assert (shown.classes[40:] == 4).all()
@@ -233,7 +226,10 @@ def test_vertices_that_neighbours_share_are_kept_once() -> None:
 
 
 def test_runs_cover_all_triangles_and_are_painted_alike() -> None:
-    parts = [replace(box(float(i), 0.0, 0.0), pattern=p, gloss=i % 2) for i, p in enumerate((*Pattern, *Pattern))]
+    parts = [
+        replace(box(float(i), 0.0, 0.0), paint=replace(GREY, pattern=p, gloss=i % 2))
+        for i, p in enumerate((*Pattern, *Pattern))
+    ]
     vertices = vertices_of(scene(parts))
     runs = runs_of(vertices)
     assert [run.first for run in runs] == [0, *np.cumsum([run.count for run in runs])[:-1]]

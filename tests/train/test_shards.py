@@ -17,9 +17,9 @@ from gcd_train.data.pairs import PairedClips
 from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving import driving_scene
-from gcd_train.scenes.pair_world import World, read_world
 from gcd_train.scenes.pair_writer import generate, shard_path, write_shard
 from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.worlds import World, read_world
 
 TINY = World(name="driving", width=48, height=32, frames=2, fps=10.0, hfov_deg=85.0, oversample=1, clips_per_shard=2)
 

@@ -21,8 +21,8 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.look.clip import SKY_M, UNSEEN, Footage
 from gcd_train.look.open_scene import ShowOptions, open_scene
 from gcd_train.scenes.frozen import freeze
-from gcd_train.scenes.pair_world import DEPTH_UNIT_M, World
 from gcd_train.scenes.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.worlds import DEPTH_UNIT_M, World
 
 FRAMES = 4
 

@@ -12,9 +12,8 @@ from gcd_train.errors import RenderError
 from gcd_train.scenes.frozen import freeze, vertices_of
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.tabletop import Episode, TabletopClass, tabletop_episode, tabletop_scene
-from gcd_train.scenes.tabletop.arm import Model, build_model
+from gcd_train.scenes.tabletop.arm import Model, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Simulation
-from gcd_train.scenes.tabletop.tasks import random_setting
 
 pytest.importorskip("mujoco", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
 

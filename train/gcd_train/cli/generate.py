@@ -12,10 +12,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError
 from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
-from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, driving_world, orbit_world
 from gcd_train.scenes.pair_writer import generate
 from gcd_train.scenes.scene_writer import SceneFormat, SceneRun, generate_scenes
-from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld
+from gcd_train.scenes.worlds import (
+    SCENE_WORLDS,
+    CameraWay,
+    PairForm,
+    SceneWorld,
+    World,
+    WorldOptions,
+    driving_world,
+    orbit_world,
+)
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
 

@@ -27,7 +27,7 @@ from gcd_model.small_files import decode_json
 from gcd_train.data.files import ZIP_FAULTS, read_member
 from gcd_train.data.sample import Bytes, Clips, Sample
 from gcd_train.errors import DataError
-from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, read_world
+from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, read_world
 
 _FOLDER_SEEDS = 10**12
 """Clips of the second folder count from here, of the third from twice this: no clip's own number is as large."""

@@ -4,14 +4,18 @@ World: right-handed, z up, metres. Every world (driving, drop, tabletop) ends in
 writers know nothing else.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+T = TypeVar("T")
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Colour = tuple[float, float, float]
 Point = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -54,27 +58,36 @@ DOMES = (Pattern.HILLS, Pattern.HOUSES, Pattern.HALL, Pattern.STUDIO)
 """What is painted on a dome: drawn last, and casts no shadow."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
+class Paint:
+    """How a surface looks.
+
+    colour: sRGB, 0..1. accent: the pattern's second colour. grain_m: the pattern's spacing, 0.02 to 5 m. gloss: 0..1.
+    """
+
+    colour: Colour
+    accent: Colour = (0.5, 0.5, 0.5)
+    pattern: Pattern = Pattern.PLAIN
+    grain_m: float = 0.5
+    gloss: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Part:
     """One unit primitive, scaled, turned and put in its place within a body.
 
-    shape: a name of `primitives.SHAPES`, which fit a cube of side 1 about the origin. centre, size: metres. turn: unit
-    quaternion w, x, y, z, done before the turn about the vertical by yaw, in radians. colour: sRGB, 0..1. accent: the
-    pattern's second colour. gloss: 0..1. grain_m: the pattern's spacing, 0.02 to 5 m. label: class id. instance:
+    shape: a name of `primitives.SHAPES`, which fit a cube of side 1 about the origin. centre, size: metres. label:
+    class id. turn: unit quaternion w, x, y, z, done before the turn about the vertical by yaw, in radians. instance:
     1..255, 0 for what is not counted. body: index of the body it rides on.
     """
 
     shape: str
     centre: Point
     size: Point
-    colour: Colour
+    paint: Paint
     label: int
-    yaw: float = 0.0
     turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    gloss: float = 0.0
-    pattern: Pattern = Pattern.PLAIN
-    accent: Colour = (0.5, 0.5, 0.5)
-    grain_m: float = 0.5
+    yaw: float = 0.0
     instance: int = 0
     body: int = STATIC
 
@@ -89,20 +102,13 @@ class Part:
         return replace(self, instance=instance, body=body)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Sheet:
-    """Flat ground that is painted alike: triangles that face up.
-
-    corners: [N, 3, 3] triangle corners, metres. The rest as in `Part`.
-    """
+    """Flat ground that is painted alike. corners: of triangles that face up, [N, 3, 3], metres."""
 
     corners: Floats
-    colour: Colour
+    paint: Paint
     label: int
-    pattern: Pattern = Pattern.PLAIN
-    gloss: float = 0.0
-    accent: Colour = (0.5, 0.5, 0.5)
-    grain_m: float = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -144,14 +150,43 @@ ORBIT = Extent(near_m=0.2, far_m=120.0, shadow_radius_m=13.0, shadow_depth_m=30.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Thing:
+    """Something made of parts, in its own frame, metres, before it has a place.
+
+    size, middle: of its bounding box along its own axes. dynamic: thrown or driven, not laid to rest.
+    """
+
+    name: str
+    parts: tuple[Part, ...]
+    size: Point
+    mass_kg: float
+    friction: float
+    restitution: float = 0.0
+    dynamic: bool = True
+    middle: Point = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Tracks:
+    """The motion of N things in T time steps.
+
+    positions: of their origins, [T, N, 3], metres. quaternions: [T, N, 4], w, x, y, z, world_from_thing. velocities:
+    [T, N, 3], metres a second. angular_velocities: [T, N, 3] about the world's axes, radians a second.
+    """
+
+    positions: Doubles
+    quaternions: Doubles
+    velocities: Doubles
+    angular_velocities: Doubles
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SceneObject:
     """What is known of a thing beyond its picture: as the metadata of Kubric-4D tells it.
 
     name: which asset it is. instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id.
-    size: its bounding box along its own axes, metres. middle: of that box, in its own frame, metres. dynamic: thrown or
-    driven, not laid to rest. positions: [T, 3] of its own origin in the world, metres. quaternions: [T, 4], w, x, y, z,
-    world_from_object. velocities: [T, 3], metres a second. angular_velocities: [T, 3] about the world's axes, radians a
-    second.
+    size, middle, dynamic: as in `Thing`. positions, quaternions, velocities, angular_velocities: [T, 3 or 4], as in
+    `Tracks`.
     """
 
     name: str
@@ -163,11 +198,31 @@ class SceneObject:
     mass_kg: float
     friction: float
     restitution: float
-    positions: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-    velocities: NDArray[np.float64]
-    angular_velocities: NDArray[np.float64]
+    positions: Doubles
+    quaternions: Doubles
+    velocities: Doubles
+    angular_velocities: Doubles
     middle: Point = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, thing: Thing, tracks: Tracks, number: int, *, instance: int, body: int, label: int) -> Self:
+        """A thing whose motion is number so-and-so of the tracks."""
+        return cls(
+            name=thing.name,
+            instance=instance,
+            body=body,
+            label=label,
+            size=thing.size,
+            middle=thing.middle,
+            dynamic=thing.dynamic,
+            mass_kg=thing.mass_kg,
+            friction=thing.friction,
+            restitution=thing.restitution,
+            positions=tracks.positions[:, number],
+            quaternions=tracks.quaternions[:, number],
+            velocities=tracks.velocities[:, number],
+            angular_velocities=tracks.angular_velocities[:, number],
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -184,7 +239,7 @@ class Scene:
     sheets: tuple[Sheet, ...]
     poses: Floats
     focus: Floats
-    cameras: dict[str, NDArray[np.float64]]
+    cameras: dict[str, Doubles]
     hfov_deg: float
     light: Light
     facts: dict[str, float | str] = field(default_factory=dict[str, float | str])
@@ -216,3 +271,50 @@ def rotations(quaternions: NDArray[Any]) -> NDArray[Any]:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def with_world(turns: Doubles, positions: Doubles) -> Floats:
+    """world_from_body [T, 1 + B, 3, 4]: the world itself, then bodies by rotation [T, B, 3, 3] and origin [T, B, 3]."""
+    moving = np.concatenate([turns, positions[..., None]], -1)
+    still = np.broadcast_to(np.eye(4)[:3], (len(moving), 1, 3, 4))
+    return np.concatenate([still, moving], 1).astype(np.float32)
+
+
+def yawed(quaternions: NDArray[Any], yaw: float) -> NDArray[Any]:
+    """Unit quaternions w, x, y, z [..., 4] after one more turn about the vertical, radians."""
+    c, s = math.cos(yaw / 2), math.sin(yaw / 2)
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
+
+
+def towards(height: float, azimuth: float) -> Point:
+    """The unit vector at a height above the horizon and an angle about the vertical, radians."""
+    return math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)
+
+
+def square(half_m: float, z: float) -> Floats:
+    """A level square about the origin, as corners of two triangles [2, 3, 3]."""
+    a, b, c, d = ((x * half_m, y * half_m, z) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    return np.array([(a, b, c), (a, c, d)], np.float32)
+
+
+def pick(random: np.random.Generator, choices: Sequence[T]) -> T:
+    """Any of them, equally often."""
+    return choices[int(random.integers(len(choices)))]
+
+
+def pick_by_share(random: np.random.Generator, choices: Sequence[tuple[T, float]]) -> T:
+    """Any of them, each as often as its share says; the shares add up to 1."""
+    return choices[int(random.choice(len(choices), p=[share for _, share in choices]))][0]
+
+
+def shaded(colour: Colour, factor: float) -> Colour:
+    """The colour, darker or brighter."""
+    r, g, b = (min(max(channel * factor, 0.0), 1.0) for channel in colour)
+    return r, g, b
+
+
+def mixed(colour: Colour, share: float, other: Colour) -> Colour:
+    """The colour, by a share of the way to another one."""
+    r, g, b = (c + (o - c) * share for c, o in zip(colour, other, strict=True))
+    return r, g, b

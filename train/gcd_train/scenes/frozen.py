@@ -21,10 +21,10 @@ from gcd_train.errors import DataError
 from gcd_train.scenes.description import (
     DOMES,
     STREET,
-    Colour,
     Extent,
     Floats,
     Light,
+    Paint,
     Part,
     Pattern,
     Scene,
@@ -149,9 +149,9 @@ def _of_parts(name: str, parts: list[Part]) -> Vertices:
     made = np.empty((len(parts), len(corners)), VERTEX)
     made["position"] = (corners * size) @ turn + centre
     made["normal"] = outward @ turn
-    made["colour"] = np.array([_bytes(part.colour, part.gloss) for part in parts], np.uint8)[:, None]
-    made["accent"] = np.array([_bytes(part.accent, _grain(part)) for part in parts], np.uint8)[:, None]
-    made["tags"] = np.array([(p.label, p.instance, p.body, p.pattern) for p in parts], np.uint8)[:, None]
+    paints = np.array([_bytes(part.paint) for part in parts], np.uint8)  # [P, 2, 4]
+    made["colour"], made["accent"] = paints[:, :1], paints[:, 1:]
+    made["tags"] = np.array([(p.label, p.instance, p.body, p.paint.pattern) for p in parts], np.uint8)[:, None]
     return made.reshape(-1)
 
 
@@ -159,18 +159,15 @@ def _of_sheet(sheet: Sheet) -> Vertices:
     made = np.empty(sheet.corners.shape[0] * 3, VERTEX)
     made["position"] = sheet.corners.reshape(-1, 3)
     made["normal"] = (0.0, 0.0, 1.0)
-    made["colour"] = _bytes(sheet.colour, sheet.gloss)
-    made["accent"] = _bytes(sheet.accent, _grain(sheet))
-    made["tags"] = (sheet.label, 0, 0, sheet.pattern)
+    made["colour"], made["accent"] = _bytes(sheet.paint)
+    made["tags"] = (sheet.label, 0, 0, sheet.paint.pattern)
     return made
 
 
-def _bytes(colour: Colour, fourth: float) -> tuple[int, ...]:
-    return tuple(round(255 * min(max(channel, 0.0), 1.0)) for channel in (*colour, fourth))
-
-
-def _grain(surface: Part | Sheet) -> float:
-    return math.log2(max(surface.grain_m, 0.02) / 0.02) / 8
+def _bytes(paint: Paint) -> list[tuple[int, ...]]:
+    """Colour and gloss, accent and grain."""
+    rows = (*paint.colour, paint.gloss), (*paint.accent, math.log2(max(paint.grain_m, 0.02) / 0.02) / 8)
+    return [tuple(round(255 * min(max(channel, 0.0), 1.0)) for channel in row) for row in rows]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -31,9 +31,8 @@ from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene, rotations
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.frozen import freeze
-from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World, agree
 from gcd_train.scenes.renderer import Renderer, Rendering
-from gcd_train.scenes.worlds import scene_world
+from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, agree, scene_world
 
 _ABANDONED_S = 3600.0  # no shard takes so long
 _ATTEMPTS = 100

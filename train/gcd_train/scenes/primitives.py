@@ -1,7 +1,7 @@
 """Unit shapes as triangles with normals; each fits a cube of side 1 about the origin."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -15,8 +15,8 @@ Triangles = tuple[Floats, Floats]
 """Corners [N, 3, 3] and unit normals [N, 3, 3]."""
 
 
-def _flat(corners: list[list[tuple[float, float, float]]]) -> Triangles:
-    """Triangles with one normal a face, turned away from the origin (all shapes here are convex)."""
+def _flat(corners: Any) -> Triangles:
+    """Triangles [N, 3, 3] with one normal a face, turned away from the origin (the shapes are convex)."""
     points = np.asarray(corners, np.float32)
     normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -24,49 +24,20 @@ def _flat(corners: list[list[tuple[float, float, float]]]) -> Triangles:
     return points, np.repeat(normal[:, None], 3, axis=1)
 
 
-def _quads(points: list[tuple[float, float, float]], faces: list[tuple[int, int, int, int]]) -> Triangles:
-    return _flat([[points[i] for i in half] for a, b, c, d in faces for half in ((a, b, c), (a, c, d))])
+_SQUARE = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+
+
+def _faceted(upper: list[tuple[float, float]], faces: Sequence[tuple[int, ...]]) -> Triangles:
+    """Flat faces between the corners of the lower square and those above them, by the corners' numbers."""
+    corners = [*((x, y, -0.5) for x, y in _SQUARE), *((x, y, 0.5) for x, y in upper)]
+    return _flat([[corners[i] for i in (face[0], *pair)] for face in faces for pair in pairwise(face[1:])])
 
 
 def _hull(top: float, front: float = 0.0) -> Triangles:
     """A box whose upper face is `top` times as large in x and y, moved by `front` in x."""
-    low = [(-0.5, -0.5, -0.5), (0.5, -0.5, -0.5), (0.5, 0.5, -0.5), (-0.5, 0.5, -0.5)]
-    width = 0.5 - (0.5 - top / 2) * 0.55  # sides lean in less than front and back
-    high = [
-        (-top / 2 + front, -width, 0.5),
-        (top / 2 + front, -width, 0.5),
-        (top / 2 + front, width, 0.5),
-        (-top / 2 + front, width, 0.5),
-    ]
-    faces = [(0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
-    return _quads(low + high, faces)
-
-
-def _gable() -> Triangles:
-    """A roof: the ridge runs along x."""
-    base = [(-0.5, -0.5, -0.5), (0.5, -0.5, -0.5), (0.5, 0.5, -0.5), (-0.5, 0.5, -0.5)]
-    points = [*base, (-0.5, 0.0, 0.5), (0.5, 0.0, 0.5)]
-    ends = [[points[i] for i in face] for face in ((0, 3, 4), (1, 2, 5))]
-    sides = [[points[i] for i in face] for face in ((0, 1, 5), (0, 5, 4), (3, 2, 5), (3, 5, 4))]
-    return _flat(ends + sides)
-
-
-def _round(sides: int, axis: int) -> Triangles:
-    """A closed cylinder along an axis, smooth around."""
-    angles = np.linspace(0, 2 * np.pi, sides + 1)
-    ring = np.stack([np.cos(angles), np.sin(angles)], -1) * 0.5
-    corners: list[list[tuple[float, ...]]] = []
-    normals: list[list[tuple[float, ...]]] = []
-    for (ax, ay), (bx, by) in pairwise(ring.tolist()):
-        low_a, low_b, high_a, high_b = (ax, ay, -0.5), (bx, by, -0.5), (ax, ay, 0.5), (bx, by, 0.5)
-        na, nb = (2 * ax, 2 * ay, 0.0), (2 * bx, 2 * by, 0.0)
-        corners += [[low_a, low_b, high_b], [low_a, high_b, high_a]]
-        normals += [[na, nb, nb], [na, nb, na]]
-        for z, up in ((0.5, 1.0), (-0.5, -1.0)):
-            corners.append([(0.0, 0.0, z), (ax, ay, z), (bx, by, z)])
-            normals.append([(0.0, 0.0, up)] * 3)
-    order = {2: [0, 1, 2], 1: [0, 2, 1]}[axis]
-    return np.asarray(corners, np.float32)[..., order], np.asarray(normals, np.float32)[..., order]
+    width = 1.0 - (1.0 - top) * 0.55  # sides lean in less than front and back
+    upper = [(x * top + front, y * width) for x, y in _SQUARE]
+    return _faceted(upper, [(0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
 
 
 def _icosahedron() -> Floats:
@@ -99,7 +70,6 @@ def _ball(splits: int) -> Triangles:
 Profile = Sequence[tuple[float, float]]
 """Distance from the axis and height, in order: walking along it, the outside is on the right hand."""
 _SHARP_DEG = 35.0
-_SIDES = 28
 
 
 def _revolved(profile: Profile, *, closed: bool = False) -> Triangles:
@@ -116,9 +86,9 @@ def _revolved(profile: Profile, *, closed: bool = False) -> Triangles:
     return corners[area > 1e-9], normals[area > 1e-9]  # fields that end on the axis are triangles already
 
 
-def _turned(flat: NDArray[Any]) -> NDArray[Any]:
+def _turned(flat: NDArray[Any], sides: int = 28) -> NDArray[Any]:
     """Radius and height [K, 2] at every angle around: [K, sides + 1, 3]."""
-    angles = np.linspace(0, 2 * np.pi, _SIDES + 1)
+    angles = np.linspace(0, 2 * np.pi, sides + 1)
     return np.stack([flat[:, :1] * np.cos(angles), flat[:, :1] * np.sin(angles), flat[:, 1:] + 0 * angles], -1)
 
 
@@ -136,33 +106,19 @@ def _ring_triangles(start: NDArray[Any], end: NDArray[Any]) -> Floats:
     return np.concatenate(halves).astype(np.float32)
 
 
+def _cylinder(sides: int) -> Triangles:
+    """A closed cylinder along z, smooth around."""
+    low, high, out = _turned(np.array([(0.5, -0.5), (0.5, 0.5), (1.0, 0.0)]), sides)
+    corners, normals = [_ring_triangles(low[None], high[None])], [_ring_triangles(out[None], out[None])]
+    for rim, z in ((high, 1.0), (low, -1.0)):
+        corners.append(np.stack([np.broadcast_to((0, 0, z / 2), (sides, 3)), rim[:-1], rim[1:]], 1).astype(np.float32))
+        normals.append(np.broadcast_to(np.array((0, 0, z), np.float32), (sides, 3, 3)))
+    return np.concatenate(corners), np.concatenate(normals)
+
+
 def _arc(centre: tuple[float, float], radius: float, start_deg: float, end_deg: float, pieces: int) -> Profile:
     angles = np.radians(np.linspace(start_deg, end_deg, pieces + 1))
     return [(max(centre[0] + radius * float(np.cos(a)), 0.0), centre[1] + radius * float(np.sin(a))) for a in angles]
-
-
-_CAPSULE = [*_arc((0, -0.25), 0.25, -90, 0, 7), *_arc((0, 0.25), 0.25, 0, 90, 7)]
-_TORUS = _arc((0.36, 0), 0.14, 0, 360, 16)[:-1]
-_TUBE = [(0.34, -0.5), (0.5, -0.5), (0.5, 0.5), (0.34, 0.5)]
-_BOTTLE = [
-    *((0.0, -0.47), (0.1, -0.5), (0.16, -0.5), (0.18, -0.47), (0.18, 0.05), (0.165, 0.14), (0.12, 0.22), (0.075, 0.29)),
-    *((0.06, 0.36), (0.06, 0.44), (0.075, 0.44), (0.075, 0.5), (0.0, 0.5)),
-]
-_BOWL = [
-    *((0.0, -0.24), (0.2, -0.24), (0.22, -0.2), (0.36, -0.12), (0.46, 0.05), (0.5, 0.24)),
-    *((0.465, 0.24), (0.42, 0.06), (0.33, -0.07), (0.2, -0.15), (0.0, -0.17)),
-]
-_VASE = [
-    *((0.0, -0.5), (0.17, -0.5), (0.24, -0.4), (0.29, -0.24), (0.29, -0.08), (0.23, 0.1), (0.14, 0.25), (0.12, 0.35)),
-    *((0.15, 0.44), (0.21, 0.5), (0.18, 0.49), (0.12, 0.44), (0.09, 0.34), (0.09, 0.2), (0.0, 0.1)),
-]
-_SPOOL = [
-    *((0.0, -0.5), (0.4, -0.5), (0.42, -0.48), (0.42, -0.36), (0.4, -0.34), (0.2, -0.28), (0.17, 0.0), (0.2, 0.28)),
-    *((0.4, 0.34), (0.42, 0.36), (0.42, 0.48), (0.4, 0.5), (0.0, 0.5)),
-]
-_BARREL = [(0.0, -0.5), (0.33, -0.5), (0.39, -0.28), (0.41, 0.0), (0.39, 0.28), (0.33, 0.5), (0.0, 0.5)]
-_POT = [(0.0, -0.5), (0.34, -0.5), (0.46, 0.36), (0.5, 0.36), (0.5, 0.5), (0.42, 0.5), (0.3, -0.4), (0.0, -0.4)]
-_CONE = [(0.0, -0.5), (0.47, -0.5), (0.5, -0.48), (0.015, 0.49), (0.0, 0.5)]
 
 
 def _outward(triangles: Triangles) -> Triangles:
@@ -183,34 +139,47 @@ def shape(name: str) -> Triangles:
     size (2 r, 2 r, length) wants a length of 4 r for round ends), icosahedron. Convex too: barrel. Concave:
     torus (0.28 thick), tube, bottle (0.36 wide), bowl (0.48 high), vase (0.58 wide), spool, pot.
     """
-    return _outward(_CONVEX[name]()) if name in _CONVEX else _revolved(_TURNED[name], closed=name in ("torus", "tube"))
+    made = _MADE[name]() if name in _MADE else _revolved(_PROFILES[name], closed=name in ("torus", "tube"))
+    return _outward(made) if name in CONVEX else made
 
 
-_CONVEX = {
+_MADE: dict[str, Callable[[], Triangles]] = {
     "box": lambda: _hull(1.0),
     "taper": lambda: _hull(0.8),
     "cabin": lambda: _hull(0.68, -0.04),
     "nose": lambda: _hull(0.9, -0.05),
     "cone": lambda: _hull(0.05),
-    "gable": _gable,
-    "post": lambda: _round(6, 2),
-    "wheel": lambda: _round(10, 1),
+    "gable": lambda: _faceted([(-0.5, 0.0), (0.5, 0.0)], [(0, 3, 4), (1, 2, 5), (0, 1, 5, 4), (3, 2, 5, 4)]),
+    "post": lambda: _cylinder(6),
+    "wheel": lambda: (_cylinder(10)[0][..., [0, 2, 1]], _cylinder(10)[1][..., [0, 2, 1]]),
+    "cylinder": lambda: _cylinder(28),
     "ball": lambda: _ball(1),
     "sphere": lambda: _ball(3),
-    "cylinder": lambda: _round(_SIDES, 2),
-    "icosahedron": lambda: _flat((_icosahedron() * 0.5).tolist()),
-    "capsule": lambda: _revolved(_CAPSULE),
-    "round_cone": lambda: _revolved(_CONE),
-    "barrel": lambda: _revolved(_BARREL),
+    "icosahedron": lambda: _flat(_icosahedron() * 0.5),
 }
-_TURNED: dict[str, Profile] = {
-    "torus": _TORUS,
-    "tube": _TUBE,
-    "bottle": _BOTTLE,
-    "bowl": _BOWL,
-    "vase": _VASE,
-    "spool": _SPOOL,
-    "pot": _POT,
+_PROFILES: dict[str, Profile] = {
+    "capsule": [*_arc((0, -0.25), 0.25, -90, 0, 7), *_arc((0, 0.25), 0.25, 0, 90, 7)],
+    "round_cone": [(0.0, -0.5), (0.47, -0.5), (0.5, -0.48), (0.015, 0.49), (0.0, 0.5)],
+    "barrel": [(0.0, -0.5), (0.33, -0.5), (0.39, -0.28), (0.41, 0.0), (0.39, 0.28), (0.33, 0.5), (0.0, 0.5)],
+    "torus": _arc((0.36, 0), 0.14, 0, 360, 16)[:-1],
+    "tube": [(0.34, -0.5), (0.5, -0.5), (0.5, 0.5), (0.34, 0.5)],
+    "bottle": [
+        *((0.0, -0.47), (0.1, -0.5), (0.16, -0.5), (0.18, -0.47), (0.18, 0.05), (0.165, 0.14), (0.12, 0.22)),
+        *((0.075, 0.29), (0.06, 0.36), (0.06, 0.44), (0.075, 0.44), (0.075, 0.5), (0.0, 0.5)),
+    ],
+    "bowl": [
+        *((0.0, -0.24), (0.2, -0.24), (0.22, -0.2), (0.36, -0.12), (0.46, 0.05), (0.5, 0.24)),
+        *((0.465, 0.24), (0.42, 0.06), (0.33, -0.07), (0.2, -0.15), (0.0, -0.17)),
+    ],
+    "vase": [
+        *((0.0, -0.5), (0.17, -0.5), (0.24, -0.4), (0.29, -0.24), (0.29, -0.08), (0.23, 0.1), (0.14, 0.25)),
+        *((0.12, 0.35), (0.15, 0.44), (0.21, 0.5), (0.18, 0.49), (0.12, 0.44), (0.09, 0.34), (0.09, 0.2), (0.0, 0.1)),
+    ],
+    "spool": [
+        *((0.0, -0.5), (0.4, -0.5), (0.42, -0.48), (0.42, -0.36), (0.4, -0.34), (0.2, -0.28), (0.17, 0.0)),
+        *((0.2, 0.28), (0.4, 0.34), (0.42, 0.36), (0.42, 0.48), (0.4, 0.5), (0.0, 0.5)),
+    ],
+    "pot": [(0.0, -0.5), (0.34, -0.5), (0.46, 0.36), (0.5, 0.36), (0.5, 0.5), (0.42, 0.5), (0.3, -0.4), (0.0, -0.4)],
 }
-CONVEX = frozenset(_CONVEX)
-SHAPES = (*_CONVEX, *_TURNED)
+SHAPES = (*_MADE, *_PROFILES)
+CONVEX = frozenset({*_MADE, "capsule", "round_cone", "barrel"})

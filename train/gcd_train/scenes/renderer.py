@@ -59,22 +59,13 @@ _FIELDS = {"position": "3f4", "normal": "3f4", "colour": "4f1", "accent": "4f1",
 _BODIES = 256
 _LIFT = 0.06 / 55.0
 """Shadows are looked up this far off the surface, as a share of the shadow map's radius: half a shadow pixel."""
+_LIGHTS = ("sun_to", "sun", "sky", "ground", "horizon", "zenith")
+_NUMBERS = ("fog_m", "cloud", "exposure")
 _Frame = np.dtype(
     [
-        ("clip_from_world", "16f4"),  # matrices column by column, as OpenGL wants them
-        ("light_from_world", "16f4"),
-        ("eye", "4f4"),
-        ("ahead", "4f4"),
-        ("sun_to", "4f4"),
-        ("sun", "4f4"),
-        ("sky", "4f4"),
-        ("ground", "4f4"),
-        ("horizon", "4f4"),
-        ("zenith", "4f4"),
-        ("fog_m", "f4"),
-        ("cloud", "f4"),
-        ("exposure", "f4"),
-        ("shadow_lift", "f4"),
+        *((name, "16f4") for name in ("clip_from_world", "light_from_world")),  # column by column, as OpenGL wants them
+        *((name, "4f4") for name in ("eye", "ahead", *_LIGHTS)),
+        *((name, "f4") for name in (*_NUMBERS, "shadow_lift")),
     ]
 )
 
@@ -102,10 +93,6 @@ class _Uploaded:
     runs: tuple[tuple[Run, Any], ...]
     shadow: Any
 
-    def release(self) -> None:
-        for resource in (*(array for _, array in self.runs), self.shadow, *self.buffers):
-            resource.release()
-
 
 class Renderer:
     """Draws scenes at one size. Not thread-safe, and one scene at a time; each has an OpenGL context of its own.
@@ -117,7 +104,7 @@ class Renderer:
     def __init__(self, width: int, height: int, *, oversample: int = 2) -> None:
         self._width, self._height, self._oversample = width, height, oversample
         self._context = _context()
-        self._shadow_program = self._context.program(vertex_shader=SHADOW_VERTEX, fragment_shader=SHADOW_FRAGMENT)
+        self._shadow_program = self._program(SHADOW_VERTEX, SHADOW_FRAGMENT)
         self._programs: dict[tuple[int, bool], Any] = {}
         self._size = (width * oversample, height * oversample)
         colour = self._context.renderbuffer(self._size, 4)
@@ -168,7 +155,8 @@ class Renderer:
                     yield step, name, view
         finally:
             with self._context:
-                drawn.release()
+                for resource in (*(array for _, array in drawn.runs), drawn.shadow, *drawn.buffers):
+                    resource.release()
 
     def _uploaded(self, scene: FrozenScene) -> "_Uploaded":
         runs = runs_of(scene.vertices)
@@ -180,23 +168,27 @@ class Renderer:
             shadow=self._context.vertex_array(self._shadow_program, [_taking(buffer, "position", "tags")], index),
         )
 
+    def _program(self, vertex: str, fragment: str) -> Any:
+        program = self._context.program(vertex_shader=vertex, fragment_shader=fragment)
+        program["Frame"].binding = 0
+        for name, unit in (("bodies", 0), ("shadow", 1)):
+            if name in program:  # the compiler drops what a pattern does not use
+                program[name].value = unit
+        return program
+
     def _array(self, buffer: Any, index: Any, run: Run) -> Any:
         """The buffer as the program of a run reads it; programs are made when first needed."""
         key = run.pattern, run.glossy
         if key not in self._programs:
-            shader = fragment(run.pattern, glossy=run.glossy)
-            program = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=shader)
-            program["Frame"].binding = 0
-            _set(program, bodies=0, shadow=1)
-            self._programs[key] = program
+            self._programs[key] = self._program(VERTEX_SHADER, fragment(run.pattern, glossy=run.glossy))
         program = self._programs[key]
         wanted = [name for name in _FIELDS if name in program]
         return self._context.vertex_array(program, [_taking(buffer, *wanted)], index)
 
     def _set_scene(self, light: Light, extent: Extent) -> None:
-        for name in ("sun_to", "sun", "sky", "ground", "horizon", "zenith"):
+        for name in _LIGHTS:
             self._frame[name] = (*getattr(light, name), 0.0)
-        for name in ("fog_m", "cloud", "exposure"):
+        for name in _NUMBERS:
             self._frame[name] = getattr(light, name)
         self._frame["shadow_lift"] = _LIFT * extent.shadow_radius_m
         pixels = (extent.shadow_pixels, extent.shadow_pixels)
@@ -214,12 +206,16 @@ class Renderer:
     def _cast(self, scene: FrozenScene, step: int, drawn: _Uploaded) -> None:
         sun_to, focus = np.asarray(scene.light.sun_to), scene.focus[step].astype(np.float64)
         light_from_world = sunlight_from_world(sun_to, focus, scene.extent)
+        self._frame["light_from_world"] = light_from_world.T.ravel()
+        self._use_frame()
         self._shadow_target.use()
         self._context.enable_only(self._context.DEPTH_TEST)
         self._shadow_target.clear(depth=1.0)
-        _set(self._shadow_program, clip_from_world=light_from_world, bodies=0)
         drawn.shadow.render()
-        self._frame["light_from_world"] = light_from_world.T.ravel()
+
+    def _use_frame(self) -> None:
+        self._frame_block.write(self._frame.tobytes())
+        self._frame_block.bind_to_uniform_block(0)
 
     def _view(
         self, world_from_camera: NDArray[np.float64], hfov_deg: float, extent: Extent, drawn: _Uploaded
@@ -233,8 +229,7 @@ class Renderer:
         self._frame["clip_from_world"] = clip_from_world.T.ravel()
         self._frame["eye"][:3] = world_from_camera[:3, 3]
         self._frame["ahead"][:3] = world_from_camera[:3, 2]
-        self._frame_block.write(self._frame.tobytes())
-        self._frame_block.bind_to_uniform_block(0)
+        self._use_frame()
         for run, array in drawn.runs:
             array.render(vertices=run.count, first=run.first)
         return self._read()
@@ -301,12 +296,3 @@ def _averaged(colour: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
     size = (colour.shape[1] // n, colour.shape[0] // n)
     averaged = cv2.resize(opaque.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.rint(averaged).astype(np.uint8)
-
-
-def _set(program: Any, **uniforms: Any) -> None:
-    """Set what the compiler kept; matrices are given row by row, OpenGL wants columns."""
-    for name, value in uniforms.items():
-        if name not in program:
-            continue
-        array = np.asarray(value)
-        program[name].value = value if array.ndim == 0 else tuple(array.astype(float).T.flatten().tolist())

@@ -21,32 +21,29 @@ vec3 placed(vec4 point, uint body) {
 }
 """
 
-SHADELESS = (Pattern.SKY, *DOMES)
-"""What casts no shadow."""
-_NO_SHADOW = " || ".join(f"tags.w == {int(pattern)}u" for pattern in SHADELESS)
-
-SHADOW_VERTEX = (
-    _VERTEX_IN
-    + """
-in uvec4 tags;
-uniform mat4 clip_from_world;
-void main() {
-    gl_Position = clip_from_world * vec4(placed(vec4(position, 1.0), tags.z), 1.0);
-    if (NO_SHADOW) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // the sky casts no shadow
-}
-""".replace("NO_SHADOW", _NO_SHADOW)
-)
-SHADOW_FRAGMENT = """
-#version 330
-void main() {}
-"""
-
 _FRAME = """
 layout(std140) uniform Frame {  // as `renderer._Frame` writes it
     mat4 clip_from_world, light_from_world;
     vec4 eye_, ahead_, sun_to_, sun_, sky_, ground_, horizon_, zenith_;
     float fog_m, cloud, exposure, shadow_lift;
 };
+"""
+
+_NO_SHADOW = " || ".join(f"tags.w == {int(pattern)}u" for pattern in (Pattern.SKY, *DOMES))
+SHADOW_VERTEX = (
+    _VERTEX_IN
+    + _FRAME
+    + """
+in uvec4 tags;
+void main() {
+    gl_Position = light_from_world * vec4(placed(vec4(position, 1.0), tags.z), 1.0);
+    if (NO_SHADOW) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+}
+""".replace("NO_SHADOW", _NO_SHADOW)
+)
+SHADOW_FRAGMENT = """
+#version 330
+void main() {}
 """
 
 VERTEX = (

@@ -1,16 +1,30 @@
-"""The worlds there are, by name, as whole scenes in the published layouts."""
+"""The worlds there are, as whole scenes in the published layouts and as pairs of clips: what a folder of pairs says
+about itself, and how its clips are numbered.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from gcd_model.config import DRIVING_CLASSES, SemanticClass
+from gcd_model.errors import FileError
+from gcd_model.geometry import CameraMount
+from gcd_model.small_files import read_json
 from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.errors import RecipeError
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.files import write_whole
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving import EDITION, ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
+from gcd_train.scenes.driving import HFOV_DEG as DRIVING_HFOV_DEG
+from gcd_train.scenes.drop import HFOV_DEG as STAGE_HFOV_DEG
+from gcd_train.scenes.drop import drop_scene
+from gcd_train.scenes.tabletop import tabletop_scene
 
 Layout = Literal["kubric4d", "parallel_domain4d"]
 
@@ -41,21 +55,9 @@ class SceneWorld:
         return names.scene_name(seed)
 
 
-def _drop(seed: int, frames: int) -> Scene:
-    from gcd_train.scenes.drop import drop_scene  # its physics is an extra
-
-    return drop_scene(seed, frames=frames)
-
-
-def _tabletop(seed: int, frames: int) -> Scene:
-    from gcd_train.scenes.tabletop import tabletop_scene  # its physics is an extra
-
-    return tabletop_scene(seed, frames=frames)
-
-
 SCENE_WORLDS: dict[str, SceneWorld] = {
-    "drop": SceneWorld(name="drop", make=_drop),
-    "tabletop": SceneWorld(name="tabletop", make=_tabletop),
+    "drop": SceneWorld(name="drop", make=drop_scene),
+    "tabletop": SceneWorld(name="tabletop", make=tabletop_scene),
     "driving": SceneWorld(
         name="driving",
         make=driving_drive,
@@ -76,3 +78,153 @@ def scene_world(name: str) -> SceneWorld:
     if name not in SCENE_WORLDS:
         raise RecipeError(f"there is no world {name!r}; choose one of {', '.join(SCENE_WORLDS)}")
     return SCENE_WORLDS[name]
+
+
+# pairs of clips
+
+DEPTH_UNIT_M = 1 / 256
+"""Depth is stored in these, as 16 bit."""
+
+Numbers: TypeAlias = tuple[float, float, float]
+CameraWay: TypeAlias = Literal["gradual", "direct"]
+"""How the target camera reaches its goal: over the whole clip, or it stands there from the first frame on."""
+
+
+class WorldOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the source camera really sits, for studies of a wrong mount. height_m, tilt_deg: see CameraMount."""
+
+    height_m: float = CameraMount().height_m
+    tilt_deg: float = CameraMount().tilt_deg
+
+
+class Orbit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a clip of an orbit world was cut from its scene.
+
+    start: azimuth and elevation in degrees and radius in metres of the source. change: the same of target minus source,
+    at the end of the way. frame_numbers: the scene's time steps.
+    """
+
+    start: Numbers
+    change: Numbers
+    frame_numbers: tuple[int, ...]
+
+
+class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a data folder says about itself; all its shards were made alike.
+
+    width, height, frames, fps, hfov_deg: of the clips. oversample: see Renderer. options: what the generator was told.
+    classes: the ontology, empty where the world has none. format: of this layout. camera: "fixed", the path that the
+    world itself gives its target camera, or "orbit", a path over the sphere that is drawn for each clip.
+    clips_per_scene: how many clips are cut from what was simulated once; clip k of scene s has the number
+    s * clips_per_scene + k. edition: of the world, see `SceneWorld`. stride: time steps of the scene from one frame of
+    the clip to the next. path: how the target camera of a "fixed" world reaches its goal.
+    """
+
+    name: str
+    width: int
+    height: int
+    frames: int
+    fps: float
+    hfov_deg: float
+    oversample: int
+    clips_per_shard: int
+    options: WorldOptions = WorldOptions()
+    classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
+    format: int = 1
+    camera: Literal["fixed", "orbit"] = "fixed"
+    clips_per_scene: Annotated[int, Meta(ge=1)] = 1
+    edition: Annotated[int, Meta(ge=1)] = 1
+    stride: Annotated[int, Meta(ge=1)] = 1
+    path: CameraWay = "gradual"
+
+    @property
+    def move_time(self) -> int:
+        """The frame in which the target camera is at its goal."""
+        return 0 if self.path == "direct" else self.frames - 1
+
+    def scene_of(self, seed: int) -> int:
+        """The seed of the scene that a clip was cut from."""
+        return seed // self.clips_per_scene
+
+    def seeds_of(self, first_scene: int, clips: int) -> range:
+        """Numbers of so many clips, from the first one of a scene on."""
+        first = first_scene * self.clips_per_scene
+        return range(first, first + clips)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PairForm:
+    """How pairs of clips are drawn and stored. width, height: pixels. oversample: see Renderer."""
+
+    width: int = 192
+    height: int = 128
+    frames: int = 14
+    oversample: int = 2
+    clips_per_shard: int = 8
+
+
+def driving_world(form: PairForm, mount: WorldOptions, path: CameraWay = "gradual") -> World:
+    """Pairs of the forward camera and the path to the view from above.
+
+    mount: where the source camera really sits. path: how the target camera gets there.
+    Raises: PoseError if that is no mount.
+    """
+    CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
+    drive = SCENE_WORLDS["driving"]
+    return World(
+        name=drive.name,
+        **asdict(form),
+        fps=drive.fps,
+        hfov_deg=DRIVING_HFOV_DEG,
+        options=mount,
+        edition=drive.edition,
+        path=path,
+    )
+
+
+def orbit_world(scenes: SceneWorld, form: PairForm, *, stride: int = 2, clips_per_scene: int = 3) -> World:
+    """Pairs of clips of a world on Kubric-4D's stage: the source stands, the target goes over the sphere.
+
+    Raises:
+        RecipeError: this world has no stage, or its scenes are too short for such clips.
+    """
+    if scenes.layout != "kubric4d":
+        raise RecipeError(f"the world {scenes.name} has no stage to go round; choose drop or tabletop")
+    if (form.frames - 1) * stride + 2 > scenes.frames:  # its last frame stays out of reach, see `FrameSampling`
+        raise RecipeError(
+            f"a {scenes.name} scene has {scenes.frames} time steps, too few for {form.frames} frames at stride "
+            f"{stride}; ask for up to {(scenes.frames - 2) // stride + 1}"
+        )
+    return World(
+        name=scenes.name,
+        **asdict(form),
+        fps=scenes.fps / stride,
+        hfov_deg=STAGE_HFOV_DEG,
+        classes=(),
+        camera="orbit",
+        clips_per_scene=clips_per_scene,
+        edition=scenes.edition,
+        stride=stride,
+    )
+
+
+def read_world(folder: Path) -> World:
+    """What a data folder says about itself. Raises DataError."""
+    path = folder / "world.json"
+    if not path.exists():
+        raise DataError(
+            f"{folder} is no data folder: it has no world.json; make one with `gcd-train generate WORLD DIR --pairs`"
+        )
+    try:
+        return read_json(path, World)
+    except FileError as error:
+        raise DataError(f"{path} {error}; make the folder anew with this version") from error
+
+
+def agree(folder: Path, world: World) -> None:
+    """Write `world.json`, or make sure that the one that is there says the same. Raises DataError."""
+    path = folder / "world.json"
+    if not path.exists():
+        write_whole(path, msgspec.json.format(msgspec.json.encode(world)))
+    elif read_world(folder) != world:
+        raise DataError(f"{folder} holds clips of another world or size (see its world.json); choose another folder")

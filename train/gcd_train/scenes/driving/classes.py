@@ -41,17 +41,16 @@ class Label(IntEnum):
 
 
 _COARSE: dict[int, Label] = {
+    **dict.fromkeys((Label.MOTORCYCLIST, Label.BICYCLE, Label.MOTORCYCLE), Label.CYCLIST),
+    **dict.fromkeys((Label.TRAFFIC_LIGHT, Label.TRAFFIC_SIGN, Label.STREET_FURNITURE), Label.POLE),
+    **dict.fromkeys((Label.CROSSWALK, Label.STOP_LINE), Label.LANE_MARKING),
     Label.BUS: Label.TRUCK,
-    Label.MOTORCYCLIST: Label.CYCLIST,
-    Label.BICYCLE: Label.CYCLIST,
-    Label.MOTORCYCLE: Label.CYCLIST,
-    Label.TRAFFIC_LIGHT: Label.POLE,
-    Label.TRAFFIC_SIGN: Label.POLE,
-    Label.CROSSWALK: Label.LANE_MARKING,
-    Label.STOP_LINE: Label.LANE_MARKING,
     Label.KERB: Label.PAVEMENT,
     Label.FENCE: Label.BUILDING,
-    Label.STREET_FURNITURE: Label.POLE,
+}
+_ROAD_USERS = {
+    *(Label.BICYCLE, Label.BUS, Label.CAR, Label.CYCLIST, Label.MOTORCYCLE, Label.MOTORCYCLIST, Label.OWN_CAR),
+    *(Label.PERSON, Label.TRUCK),
 }
 
 
@@ -60,7 +59,7 @@ def coarse(label: int) -> int:
     return _COARSE.get(label, label)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class OntologyItem:
     """A class of ParallelDomain-4D. id: 0..254. name: as the data set spells it. colour: 8-bit RGB. label: our id."""
 
@@ -75,39 +74,32 @@ class OntologyItem:
         return self.label in _ROAD_USERS
 
 
-_ROAD_USERS = {
-    *(Label.BICYCLE, Label.BUS, Label.CAR, Label.CYCLIST, Label.MOTORCYCLE, Label.MOTORCYCLIST, Label.OWN_CAR),
-    *(Label.PERSON, Label.TRUCK),
-}
-
-
-_ITEMS: tuple[tuple[int, str, tuple[int, int, int], Label], ...] = (
-    (1, "Bicycle", (119, 11, 32), Label.BICYCLE),
-    (2, "Bicyclist", (64, 64, 64), Label.CYCLIST),
-    (3, "Building", (156, 110, 84), Label.BUILDING),
-    (4, "Bus", (0, 60, 100), Label.BUS),
-    (5, "Car", (0, 0, 142), Label.CAR),
-    (8, "CrossWalk", (255, 216, 128), Label.CROSSWALK),
-    (9, "Fence", (196, 92, 44), Label.FENCE),
-    (11, "LaneMarking", (246, 240, 196), Label.LANE_MARKING),
-    (12, "LimitLine", (204, 255, 255), Label.STOP_LINE),
-    (13, "Motorcycle", (0, 0, 230), Label.MOTORCYCLE),
-    (14, "Motorcyclist", (128, 128, 128), Label.MOTORCYCLIST),
-    (16, "OtherFixedStructure", (92, 20, 140), Label.STREET_FURNITURE),
-    (20, "OwnCar(EgoCar)", (128, 230, 128), Label.OWN_CAR),
-    (22, "Pedestrian", (220, 20, 60), Label.PERSON),
-    (24, "Road", (92, 88, 104), Label.ROAD),
-    (26, "RoadBoundary(Curb)", (170, 84, 170), Label.KERB),
-    (28, "SideWalk", (214, 140, 190), Label.PAVEMENT),
-    (29, "Sky", (122, 176, 230), Label.SKY),
-    (31, "Terrain", (150, 196, 104), Label.TERRAIN),
-    (33, "TrafficLight", (255, 112, 0), Label.TRAFFIC_LIGHT),
-    (34, "TrafficSign", (255, 255, 0), Label.TRAFFIC_SIGN),
-    (36, "Truck", (0, 0, 70), Label.TRUCK),
-    (37, "Vegetation", (36, 112, 62), Label.VEGETATION),
-    (38, "VerticalPole", (170, 170, 20), Label.POLE),
+ONTOLOGY = (
+    OntologyItem(1, "Bicycle", (119, 11, 32), Label.BICYCLE),
+    OntologyItem(2, "Bicyclist", (64, 64, 64), Label.CYCLIST),
+    OntologyItem(3, "Building", (156, 110, 84), Label.BUILDING),
+    OntologyItem(4, "Bus", (0, 60, 100), Label.BUS),
+    OntologyItem(5, "Car", (0, 0, 142), Label.CAR),
+    OntologyItem(8, "CrossWalk", (255, 216, 128), Label.CROSSWALK),
+    OntologyItem(9, "Fence", (196, 92, 44), Label.FENCE),
+    OntologyItem(11, "LaneMarking", (246, 240, 196), Label.LANE_MARKING),
+    OntologyItem(12, "LimitLine", (204, 255, 255), Label.STOP_LINE),
+    OntologyItem(13, "Motorcycle", (0, 0, 230), Label.MOTORCYCLE),
+    OntologyItem(14, "Motorcyclist", (128, 128, 128), Label.MOTORCYCLIST),
+    OntologyItem(16, "OtherFixedStructure", (92, 20, 140), Label.STREET_FURNITURE),
+    OntologyItem(20, "OwnCar(EgoCar)", (128, 230, 128), Label.OWN_CAR),
+    OntologyItem(22, "Pedestrian", (220, 20, 60), Label.PERSON),
+    OntologyItem(24, "Road", (92, 88, 104), Label.ROAD),
+    OntologyItem(26, "RoadBoundary(Curb)", (170, 84, 170), Label.KERB),
+    OntologyItem(28, "SideWalk", (214, 140, 190), Label.PAVEMENT),
+    OntologyItem(29, "Sky", (122, 176, 230), Label.SKY),
+    OntologyItem(31, "Terrain", (150, 196, 104), Label.TERRAIN),
+    OntologyItem(33, "TrafficLight", (255, 112, 0), Label.TRAFFIC_LIGHT),
+    OntologyItem(34, "TrafficSign", (255, 255, 0), Label.TRAFFIC_SIGN),
+    OntologyItem(36, "Truck", (0, 0, 70), Label.TRUCK),
+    OntologyItem(37, "Vegetation", (36, 112, 62), Label.VEGETATION),
+    OntologyItem(38, "VerticalPole", (170, 170, 20), Label.POLE),
 )
-ONTOLOGY = tuple(OntologyItem(id=id_, name=name, colour=colour, label=label) for id_, name, colour, label in _ITEMS)
 """In the order of their ids; each label has exactly one.
 
 Ids and names are those of the public ParallelDomain SDK. The colours of people and vehicles are the ones by which the

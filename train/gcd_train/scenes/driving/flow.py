@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gcd_train.scenes.description import Floats
+from gcd_train.scenes.description import Doubles, Floats
 from gcd_train.scenes.driving import vehicles
 from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.ground import PAVEMENT_M, stop_line_m, zebra_m
-from gcd_train.scenes.driving.roads import Crossing, Doubles, Road, Street
+from gcd_train.scenes.driving.roads import Crossing, Road, Street
 from gcd_train.scenes.driving.roadside import Footprints, holds_a_point, touches
 from gcd_train.scenes.driving.vehicles import Assembly, Lamps
 

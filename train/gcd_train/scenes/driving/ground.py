@@ -1,17 +1,18 @@
 """The ground of the driving world: asphalt, kerbs, rounded corners, pavements, marks, and what rain leaves."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Floats, Pattern, Sheet
+from gcd_train.scenes.description import Colour, Doubles, Floats, Paint, Pattern, Sheet, mixed, shaded
 from gcd_train.scenes.driving.classes import Label
-from gcd_train.scenes.driving.roads import Crossing, Doubles, Road, Street, fan, patches, quads, ribbon
+from gcd_train.scenes.driving.roads import Crossing, Road, Street, fan, patches, quads, ribbon
 
 ROAD_M, PATCH_M, MARK_M, PAVEMENT_M = 0.0, 0.004, 0.014, 0.12
 _KERB_WIDE_M, _KERB_SLOPE_M = 0.16, 0.05
 _CORNER_M, _COURT_M = 2.2, PAVEMENT_M - 0.03
 _MARKED_M = -70.0, 190.0
+_POOL_STEPS = 7
 
 
 def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random.Generator) -> list[Sheet]:
@@ -28,9 +29,9 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     sheets = [terrain(800.0, 200.0, grass if random.random() < 0.75 else dry, 0.3 * wetness)]
     if paved:
         court = [piece for road in street.roads for piece in _beside(road, 1.0, road.pavement_m + 16.0, _COURT_M)]
-        sheets.append(flat(np.concatenate(court), _times(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
+        sheets.append(flat(np.concatenate(court), shaded(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
     sheets.append(flat(_asphalt(street), asphalt, Label.ROAD, Pattern.SPECKLE, wetness))
-    sheets.append(flat(_repairs(street.main, random), _times(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
+    sheets.append(flat(_repairs(street.main, random), shaded(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
     if wetness > 0:
         sheets.append(flat(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
     stone = [piece for road in street.roads for piece in _beside(road, 0.0, road.pavement_m, PAVEMENT_M)]
@@ -41,19 +42,14 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     return [*sheets, *_marks(street, wetness, random)]
 
 
-def _times(colour: Colour, factor: float) -> Colour:
-    r, g, b = (min(channel * factor, 1.0) for channel in colour)
-    return r, g, b
-
-
 def flat(
     corners: Floats, colour: Colour, label: Label, pattern: Pattern = Pattern.PLAIN, wetness: float = 0.0
 ) -> Sheet:
     """Triangles turned so that they face up; what is wet is darker, and shines."""
     edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     upward = np.where((edges[:, 2] < 0)[:, None, None], corners[:, ::-1], corners).astype(np.float32)
-    dark = _times(colour, 1 - 0.35 * wetness) if label != Label.LANE_MARKING else colour
-    return Sheet(corners=upward, colour=dark, label=label, pattern=pattern, gloss=wetness)
+    dark = shaded(colour, 1 - 0.35 * wetness) if label != Label.LANE_MARKING else colour
+    return Sheet(upward, Paint(dark, pattern=pattern, gloss=wetness), label)
 
 
 def terrain(half_m: float, cell_m: float, colour: Colour, wetness: float = 0.0) -> Sheet:
@@ -203,3 +199,24 @@ def _stop_lines(road: Road, crossing: Crossing) -> Doubles:
     right, left = -road.lanes_right * road.lane_m, road.lanes_left * road.lane_m
     at = crossing.at_m
     return np.array([(at - away, at - away + 0.4, right, 0.0), (at + away - 0.4, at + away, 0.0, left)])
+
+
+def lamp_pools(spots: Iterable[tuple[float, float, float]], asphalt: Colour, strength: float) -> list[Sheet]:
+    """Light on the road: discs one within the other, each a little brighter, just above the asphalt.
+
+    The renderer has no lamps; lit ground is brighter paint, below the lane marks. spots: x, y and heading of their
+    middles. strength: 0..1.
+    """
+    sheets: list[Sheet] = []
+    turn, spots = np.linspace(0, 2 * np.pi, 15), list(spots)
+    for step in range(_POOL_STEPS):
+        radius, z = 6.5 * (1 - step / _POOL_STEPS), PATCH_M + 0.0008 * (1 + step)
+        along, aside = radius * 1.25 * np.cos(turn), radius * np.sin(turn)
+        pieces = [np.zeros((0, 3, 3), np.float32)]
+        for x, y, heading in spots:
+            cos, sin = np.cos(heading), np.sin(heading)
+            rim = np.stack([x + along * cos - aside * sin, y + along * sin + aside * cos, 0 * turn + z], -1)
+            pieces.append(fan(np.array([x, y, z]), rim))
+        colour = mixed(asphalt, strength * ((step + 1) / _POOL_STEPS) ** 2, (0.92, 0.74, 0.5))
+        sheets.append(Sheet(np.concatenate(pieces), Paint(colour), Label.ROAD))
+    return sheets

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Floats, Part
+from gcd_train.scenes.description import Doubles, Floats, Part
 
 STEP_M = 2.0
 _START_M, _END_M, _SIDE_M = -160.0, 340.0, 130.0
@@ -14,7 +13,6 @@ _APART_M = 48.0
 _CALM_M = 22.0
 _NEAR_STEP_M, _FAR_STEP_M, _NEAR_M = 5.0, 10.0, (-60.0, 180.0)
 
-Doubles = NDArray[np.float64]
 Span = tuple[float, float]
 
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Colour, Part
+from gcd_train.scenes.description import Colour, Doubles, Part
 from gcd_train.scenes.driving import things
-from gcd_train.scenes.driving.roads import Doubles, Road, Street
+from gcd_train.scenes.driving.roads import Road, Street
 from gcd_train.scenes.driving.things import District, tone
 
 CAMERA_ROOM_M = 0.6
@@ -108,7 +108,7 @@ class Plot:
     """The ground and what has been put on it; cameras: every place where one stands at some time, [N, 3]."""
 
     street: Street
-    cameras: NDArray[np.float64]
+    cameras: Doubles
     things: list[tuple[Part, ...]] = field(default_factory=list[tuple[Part, ...]])
     lamps: list[Place] = field(default_factory=list[Place])
     _taken: list[Footprints] = field(default_factory=list[Footprints])
@@ -210,7 +210,8 @@ def _houses(plot: Plot, place: Place, district: District, paved: bool, lit: bool
             if roof.shape == "gable":  # closed from below
                 below = (0.0, 0.0, roof.centre[2] - roof.size[2] / 2 - 0.05)
                 size = (roof.size[0], roof.size[1], 0.1)
-                house.append(replace(roof, shape="box", centre=below, size=size, colour=(0.7, 0.68, 0.64)))
+                soffit = replace(roof.paint, colour=(0.7, 0.68, 0.64))
+                house.append(replace(roof, shape="box", centre=below, size=size, paint=soffit))
             if paved and plot.shows_details(at):
                 house += things.shop(width, -place.side * depth / 2, lit, random)
             plot.put(at.put(house))

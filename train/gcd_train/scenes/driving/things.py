@@ -1,17 +1,18 @@
 """What stands beside roads: houses, trees, lamps, signals, shelters, hedges; x along the road, y to its left, z up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Part, Pattern, Point
+from gcd_train.scenes.description import Colour, Paint, Part, Pattern, Point, mixed, pick
 from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.roads import Road
 
 Pair = tuple[float, float]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class District:
     """The character of a neighbourhood: buildings' floors, width and distance, gaps, share of trees."""
 
@@ -25,23 +26,17 @@ class District:
 
 
 DISTRICTS = {
-    "city": District(
-        floors=(3, 12), width_m=(10, 28), setback_m=(0, 2), gap_m=(0, 2), built=0.95, trees_every_m=22, gabled=0.1
-    ),
-    "suburb": District(
-        floors=(1, 3), width_m=(7, 13), setback_m=(3, 9), gap_m=(3, 12), built=0.85, trees_every_m=11, gabled=0.8
-    ),
-    "business": District(
-        floors=(1, 5), width_m=(18, 45), setback_m=(4, 16), gap_m=(4, 20), built=0.8, trees_every_m=18, gabled=0.05
-    ),
-    "green": District(
-        floors=(1, 3), width_m=(8, 16), setback_m=(6, 20), gap_m=(10, 50), built=0.35, trees_every_m=7, gabled=0.6
-    ),
+    "city": District((3, 12), (10, 28), (0, 2), (0, 2), built=0.95, trees_every_m=22, gabled=0.1),
+    "suburb": District((1, 3), (7, 13), (3, 9), (3, 12), built=0.85, trees_every_m=11, gabled=0.8),
+    "business": District((1, 5), (18, 45), (4, 16), (4, 20), built=0.8, trees_every_m=18, gabled=0.05),
+    "green": District((1, 3), (8, 16), (6, 20), (10, 50), built=0.35, trees_every_m=7, gabled=0.6),
 }
 _WALLS: tuple[Colour, ...] = (
     (0.72, 0.68, 0.6), (0.6, 0.36, 0.28), (0.78, 0.76, 0.72), (0.5, 0.5, 0.53), (0.66, 0.55, 0.42), (0.42, 0.28, 0.24),
     (0.82, 0.78, 0.62), (0.48, 0.56, 0.62), (0.36, 0.38, 0.42), (0.7, 0.6, 0.62), (0.58, 0.62, 0.5), (0.86, 0.85, 0.82),
 )  # fmt: skip
+_WARM: tuple[Colour, ...] = ((0.95, 0.78, 0.45), (0.9, 0.7, 0.36), (0.85, 0.86, 0.8), (0.95, 0.85, 0.6))
+_MOST_WINDOWS = 6
 _BOARDS: tuple[Colour, ...] = (
     (0.6, 0.1, 0.1), (0.1, 0.25, 0.5), (0.15, 0.4, 0.2), (0.2, 0.2, 0.2), (0.8, 0.6, 0.15),
 )  # fmt: skip
@@ -65,13 +60,8 @@ def block(
     yaw: float = 0.0,
 ) -> Part:
     """One piece of a thing, a vehicle or a person. lit: it shines."""
-    painted = Pattern.LIT if lit else pattern
-    return Part(shape=shape, centre=at, size=size, colour=colour, label=label, gloss=gloss, pattern=painted, yaw=yaw)
-
-
-def picked(random: np.random.Generator, colours: tuple[Colour, ...]) -> Colour:
-    """Any of them, equally often."""
-    return colours[int(random.integers(len(colours)))]
+    paint = Paint(colour, pattern=Pattern.LIT if lit else pattern, gloss=gloss)
+    return Part(shape, at, size, paint, label, yaw=yaw)
 
 
 def tone(random: np.random.Generator, colour: Colour, spread: float = 0.15) -> Colour:
@@ -95,7 +85,7 @@ def sagitta(road: Road, s: float, width: float) -> float:
 
 def building(width: float, depth: float, district: District, random: np.random.Generator) -> list[Part]:
     """One house: its body with windows, then its roof; along x by its width."""
-    wall, label = tone(random, picked(random, _WALLS)), Label.BUILDING
+    wall, label = tone(random, pick(random, _WALLS)), Label.BUILDING
     height = float(random.integers(district.floors[0], district.floors[1] + 1)) * 3.1 + 0.8
     body = block((0, 0, height / 2), (width, depth, height), wall, label, pattern=Pattern.WINDOWS)
     dark = tone(random, (0.36, 0.25, 0.22) if random.random() < 0.5 else (0.3, 0.31, 0.33))
@@ -116,13 +106,40 @@ def shop(width: float, front: float, lit: bool, random: np.random.Generator) -> 
     if random.random() < 0.35:
         return []
     wide, label = width * float(random.uniform(0.5, 0.92)), Label.BUILDING
-    board = tone(random, picked(random, _BOARDS), 0.2)
+    board = tone(random, pick(random, _BOARDS), 0.2)
     shines = lit and random.random() < 0.6
     glass: Colour = (0.95, 0.8, 0.55) if shines else (0.1, 0.12, 0.14)
     return [
         block((0, front, 1.45), (wide, 0.16, 2.1), glass, label, gloss=0.7, lit=shines),
         block((0, front, 2.85), (wide + 0.3, 0.4, 0.5), board, label),
     ]
+
+
+def lit_windows(house: Sequence[Part], random: np.random.Generator) -> list[Part]:
+    """Some windows of a house's two long sides, bright; they lie where the shader paints the windows of that wall."""
+    wall = house[0]
+    if wall.paint.pattern != Pattern.WINDOWS:
+        return []
+    r, g, b = (round(255 * channel) / 255 for channel in wall.paint.colour)
+    wide, high = 2.2 + 2.0 * ((r * 37.0) % 1), 2.9 + 0.6 * ((g * 53.0) % 1)
+    size = ((0.35 + 0.45 * ((b * 71.0) % 1)) * wide * 0.96, 0.06, 0.5 * high * 0.96)
+    ahead = np.array([np.cos(wall.yaw), np.sin(wall.yaw)])
+    parts: list[Part] = []
+    for side in (-1.0, 1.0):
+        face = np.array(wall.centre[:2]) + side * wall.size[1] / 2 * np.array([-ahead[1], ahead[0]])
+        along = -side * ahead  # as the shader counts along a wall
+        start = float(face @ along)
+        columns = np.arange(np.ceil((start - wall.size[0] / 2) / wide), np.floor((start + wall.size[0] / 2) / wide))
+        floors = np.arange(0, np.floor(wall.size[2] / high - 0.4))
+        cells = [(float(c), float(f)) for c in columns for f in floors]
+        count = min(_MOST_WINDOWS, len(cells) // 3)
+        for index in random.choice(len(cells), count, replace=False) if count else []:
+            column, floor = cells[int(index)]
+            x, y = face + along * ((column + 0.5) * wide - start)
+            warm, share = pick(random, _WARM), float(random.uniform(0.35, 0.8))
+            at = (float(x), float(y), (floor + 0.55) * high)
+            parts.append(block(at, size, mixed((0.0, 0.0, 0.0), share, warm), Label.BUILDING, lit=True, yaw=wall.yaw))
+    return parts
 
 
 def leaf_colour(random: np.random.Generator) -> Colour:
@@ -176,7 +193,7 @@ def hedge(random: np.random.Generator, length: float) -> list[Part]:
 
 def fence(random: np.random.Generator, length: float) -> list[Part]:
     """Boards between posts, or a wall."""
-    colour = tone(random, picked(random, ((0.5, 0.36, 0.24), (0.75, 0.75, 0.72), (0.35, 0.37, 0.38))), 0.2)
+    colour = tone(random, pick(random, ((0.5, 0.36, 0.24), (0.75, 0.75, 0.72), (0.35, 0.37, 0.38))), 0.2)
     high = float(random.uniform(0.9, 1.8))
     ends = np.arange(-length / 2, length / 2 + 0.01, length / 3)
     return [
@@ -214,7 +231,7 @@ def signal(green: bool, grey: Colour) -> list[Part]:
 
 def sign(random: np.random.Generator, grey: Colour) -> list[Part]:
     """A traffic sign that shows its face against x."""
-    face = picked(random, ((0.8, 0.05, 0.06), (0.05, 0.2, 0.65), (0.92, 0.78, 0.08)))
+    face = pick(random, ((0.8, 0.05, 0.06), (0.05, 0.2, 0.65), (0.92, 0.78, 0.08)))
     size, high = float(random.uniform(0.5, 0.75)), float(random.uniform(2.1, 2.6))
     return [
         block((0, 0, high / 2), (0.08, 0.08, high), grey, Label.POLE, shape="post"),
@@ -238,7 +255,7 @@ def shelter(random: np.random.Generator, lit: bool) -> list[Part]:
 def kiosk(random: np.random.Generator, lit: bool) -> list[Part]:
     """A round advertising column or a small stall."""
     label = Label.STREET_FURNITURE
-    colour = tone(random, picked(random, ((0.6, 0.55, 0.45), (0.3, 0.45, 0.5), (0.7, 0.3, 0.25))), 0.2)
+    colour = tone(random, pick(random, ((0.6, 0.55, 0.45), (0.3, 0.45, 0.5), (0.7, 0.3, 0.25))), 0.2)
     if random.random() < 0.5:
         return [
             block((0, 0, 1.4), (1.2, 1.2, 2.8), colour, label, shape="post", lit=lit),

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Part, Point
+from gcd_train.scenes.description import Colour, Part, Point, pick, pick_by_share
 from gcd_train.scenes.driving.classes import Label
-from gcd_train.scenes.driving.things import block, picked
+from gcd_train.scenes.driving.things import block
 
 OWN_PAINT: Colour = (0.16, 0.24, 0.36)
 """The ego car's livery never changes: its own camera cannot see it, so nothing could tell another one."""
@@ -87,8 +87,7 @@ _CARS: tuple[tuple[_Style, float], ...] = (
 
 def random_car(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     """One of eight body styles in one of many paints."""
-    style = _CARS[int(random.choice(len(_CARS), p=[share for _, share in _CARS]))][0]
-    return _car(style, random_paint(random), lamps, near)
+    return _car(pick_by_share(random, _CARS), random_paint(random), lamps, near)
 
 
 def own_car() -> Assembly:
@@ -100,7 +99,7 @@ def own_car() -> Assembly:
 
 def random_paint(random: np.random.Generator) -> Colour:
     """A vehicle's colour, as often as it is seen."""
-    return varied(_PAINTS[int(random.choice(len(_PAINTS), p=[share for _, share in _PAINTS]))][0], random)
+    return varied(pick_by_share(random, _PAINTS), random)
 
 
 def varied(colour: Colour, random: np.random.Generator) -> Colour:
@@ -214,7 +213,7 @@ def random_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assem
 def random_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     """A city bus or a coach."""
     length, label = float(random.uniform(9.5, 12.2)), Label.BUS
-    paint = varied(picked(random, _LIVERIES), random)
+    paint = varied(pick(random, _LIVERIES), random)
     band: Colour = (0.9, 0.9, 0.88)
     parts = [
         block((0, 0, 0.95), (length, 2.5, 1.25), paint, label, gloss=0.4),
@@ -232,7 +231,7 @@ def random_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembl
 
 
 def _cloth(random: np.random.Generator) -> Colour:
-    return varied(picked(random, _CLOTHES), random)
+    return varied(pick(random, _CLOTHES), random)
 
 
 def random_person(random: np.random.Generator, walks: bool) -> Assembly:
@@ -248,7 +247,7 @@ def random_person(random: np.random.Generator, walks: bool) -> Assembly:
 def _figure(random: np.random.Generator, height: float, label: Label, stride: float, lift: float = 0.0) -> list[Part]:
     k = height / 1.7
     hip, coat, legs = 0.48 * height, _cloth(random), _cloth(random)
-    skin, hair = picked(random, _SKIN), varied(picked(random, _HAIR), random)
+    skin, hair = pick(random, _SKIN), varied(pick(random, _HAIR), random)
 
     def limb(at: Point, size: Point, colour: Colour, shape: str = "box") -> Part:
         return block((at[0], at[1], at[2] + lift), size, colour, label, shape=shape)

@@ -4,7 +4,8 @@ Source: Van Hoorick et al. 2024 (GCD), ParallelDomain-4D: a forward ego camera, 
 behind the car, 10 frames per second.
 """
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,14 +21,25 @@ from gcd_model.geometry import (
     driving_trajectory,
     look_at,
 )
-from gcd_train.scenes.description import Floats, Part, Point, Scene, upright
+from gcd_train.scenes.description import (
+    Colour,
+    Doubles,
+    Floats,
+    Light,
+    Part,
+    Point,
+    Scene,
+    mixed,
+    pick_by_share,
+    towards,
+    upright,
+)
 from gcd_train.scenes.driving.classes import Label, coarse
 from gcd_train.scenes.driving.flow import Crowd, RoadUser, fill, random_drive
-from gcd_train.scenes.driving.ground import ground_sheets
-from gcd_train.scenes.driving.roads import Doubles, random_street
+from gcd_train.scenes.driving.ground import PATCH_M, ground_sheets, lamp_pools
+from gcd_train.scenes.driving.roads import random_street
 from gcd_train.scenes.driving.roadside import CAMERA_ROOM_M, Plot, furnish
-from gcd_train.scenes.driving.things import DISTRICTS, random_district, sky_dome
-from gcd_train.scenes.driving.weather import beams, lamp_pools, lit_windows, random_weather, shadow_focus
+from gcd_train.scenes.driving.things import DISTRICTS, block, lit_windows, random_district, sky_dome
 
 HFOV_DEG = 85.0
 EDITION = 2
@@ -35,6 +47,10 @@ EDITION = 2
 _PATH_STEPS = 8
 _PAVED = ("city", "business")
 _SIDE_YAW_DEG, _SIDE_M = 60.0, 0.25
+_FOCUS_AHEAD_M = 28.0
+"""Shadows fall around a point that far ahead of the vehicle."""
+_POOLS_M = 70.0
+_BEAM_STEPS = 8
 _SURROUND: tuple[tuple[float, float, float, float, float], ...] = (
     (-4.0, 0.0, 4.6, 0.0, 42.0),
     (2.0, 3.5, 4.6, -45.0, 42.0),
@@ -110,20 +126,22 @@ def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
     crowd = Crowd(street=street, drive=drive, obstacles=plot.taken, cameras=cameras, camera_room_m=CAMERA_ROOM_M)
     fill(crowd, weather.lamps, moving)
     sheets = ground_sheets(street, weather.wetness, paved, ground)
-    asphalt = next(sheet.colour for sheet in sheets if sheet.label == Label.ROAD)
+    asphalt = next(sheet.paint.colour for sheet in sheets if sheet.label == Label.ROAD)
     parts = [sky_dome(), *(part for thing in plot.things for part in thing)]
     if weather.dark:
-        sheets += lamp_pools(plot.lamps, asphalt, 0.9 if weather.kind == "night" else 0.3)
+        lamps = [lamp for lamp in plot.lamps if abs(lamp.s) < _POOLS_M]
+        spots = [lamp.road.at(lamp.s, lamp.side * (lamp.away - 2.0)) for lamp in lamps]
+        sheets += lamp_pools(spots, asphalt, 0.9 if weather.kind == "night" else 0.3)
         parts += [part for thing in plot.things for part in lit_windows(thing, standing)]
     users, bodies = _users(crowd.users)
     parts += users
     if weather.kind == "night":
-        parts += beams(asphalt, body=1)
+        parts += _beams(asphalt, body=1)
     scene = Scene(
         parts=tuple(parts),
         sheets=tuple(sheets),
         poses=bodies,
-        focus=shadow_focus(drive.rows),
+        focus=(drive.rows[:, :3] + _FOCUS_AHEAD_M * bodies[:, 1, :, 0].astype(np.float64)).astype(np.float32),
         cameras={},
         hfov_deg=HFOV_DEG,
         light=weather.light,
@@ -201,3 +219,123 @@ def _turned(position: Point, azimuth_deg: float, down_deg: float) -> Doubles:
 
 def _looking(position: Point, target: Point) -> Doubles:
     return look_at(torch.tensor(position, dtype=torch.float64), torch.tensor(target, dtype=torch.float64)).numpy()
+
+
+def _beams(asphalt: Colour, body: int) -> list[Part]:
+    """The light of headlights on the road ahead of a vehicle, as very flat bodies that ride with it."""
+    parts: list[Part] = []
+    for step in range(_BEAM_STEPS):
+        share = (step + 1) / _BEAM_STEPS
+        size = (34.0 - 20.0 * share, 6.5 - 4.0 * share, 0.001)
+        colour = mixed(asphalt, 0.6 * share, (0.72, 0.7, 0.62))
+        centre = (1.4 + size[0] / 2, 0.0, PATCH_M + 0.0006 * step)
+        parts.append(block(centre, size, colour, Label.ROAD, shape="ball").of(instance=0, body=body))
+    return parts
+
+
+# weather
+
+_SHARES = {
+    "clear": 0.3, "cloudy": 0.18, "low sun": 0.12, "overcast": 0.12, "rain": 0.12, "fog": 0.06, "dusk": 0.06,
+    "night": 0.04,
+}  # fmt: skip
+WEATHERS = tuple(_SHARES)
+_DIM = {
+    "dusk": Light(
+        sun_to=(0.0, 0.0, 1.0),
+        sun=(0.16, 0.08, 0.05),
+        sky=(0.2, 0.2, 0.3),
+        ground=(0.08, 0.07, 0.07),
+        horizon=(0.62, 0.34, 0.26),
+        zenith=(0.1, 0.13, 0.27),
+        fog_m=420.0,
+        cloud=0.0,
+        exposure=1.5,
+    ),
+    "night": Light(
+        sun_to=(0.0, 0.0, 1.0),
+        sun=(0.035, 0.045, 0.07),
+        sky=(0.06, 0.065, 0.095),
+        ground=(0.03, 0.026, 0.022),
+        horizon=(0.055, 0.05, 0.06),
+        zenith=(0.008, 0.011, 0.026),
+        fog_m=240.0,
+        cloud=0.0,
+        exposure=1.9,
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Weather:
+    """kind: one of WEATHERS. wetness: of the ground, 0..1. lamps: whether vehicles have theirs lit. dark: whether
+    street lamps and windows are lit too.
+    """
+
+    kind: str
+    light: Light
+    wetness: float
+    lamps: bool
+    dark: bool
+
+
+def random_weather(random: np.random.Generator) -> Weather:
+    """Drawn at random; one in six is wet, one in ten dark."""
+    kind = pick_by_share(random, tuple(_SHARES.items()))
+    light = _light(kind, random)
+    wet = {"rain": float(random.uniform(0.7, 1.0)), "dusk": 0.3, "night": float(random.choice([0.0, 0.7]))}
+    return Weather(
+        kind=kind,
+        light=light,
+        wetness=wet.get(kind, 0.0),
+        lamps=kind in ("rain", "fog", "dusk", "night") or (kind == "overcast" and random.random() < 0.4),
+        dark=kind in _DIM,
+    )
+
+
+def _light(kind: str, random: np.random.Generator) -> Light:
+    azimuth = float(random.uniform(0, 2 * math.pi))
+    exposure = float(random.uniform(0.9, 1.12))
+    if kind in ("clear", "cloudy", "low sun"):
+        return _sunny(kind, azimuth, exposure, random)
+    if kind in _DIM:
+        sun_to = towards(math.radians(8.0 if kind == "dusk" else 40.0), azimuth)
+        return replace(_DIM[kind], sun_to=sun_to, exposure=_DIM[kind].exposure * exposure)
+    return _grey(kind, azimuth, exposure, random)
+
+
+def _sunny(kind: str, azimuth: float, exposure: float, random: np.random.Generator) -> Light:
+    height = float(random.uniform(9, 17) if kind == "low sun" else random.uniform(24, 66))
+    low = math.exp(-height / 18.0)  # how golden the light is
+    strength = 2.5 if kind != "cloudy" else 1.9
+    sun: Colour = (strength, strength * (1 - 0.3 * low), strength * (0.94 - 0.55 * low))
+    blue = float(random.uniform(0.6, 1.0)) * (1.0 if kind != "cloudy" else 0.6)
+    zenith: Colour = (0.5 - 0.42 * blue, 0.56 - 0.33 * blue, 0.68 + 0.02 * blue)
+    return Light(
+        sun_to=towards(math.radians(height), azimuth),
+        sun=sun,
+        sky=(0.38 - 0.06 * blue, 0.42, 0.48 + 0.06 * blue),
+        ground=(0.17, 0.16, 0.14),
+        horizon=(0.64 - 0.12 * blue + 0.34 * low, 0.68 - 0.04 * blue + 0.02 * low, 0.8 - 0.3 * low),
+        zenith=zenith,
+        fog_m=float(random.uniform(320, 800)),
+        cloud=float(random.uniform(0.7, 1.0)) if kind == "cloudy" else float(random.uniform(0, 0.45)),
+        exposure=1.45 * exposure,
+    )
+
+
+def _grey(kind: str, azimuth: float, exposure: float, random: np.random.Generator) -> Light:
+    far = {"overcast": random.uniform(220, 600), "rain": random.uniform(110, 220), "fog": random.uniform(38, 75)}
+    grey = {"overcast": 0.72, "rain": 0.5, "fog": 0.66}[kind]
+    sky: Colour = (grey * 0.96, grey * 0.99, grey * 1.03)
+    return Light(
+        sun_to=towards(math.radians(float(random.uniform(45, 75))), azimuth),
+        sun=(0.12, 0.12, 0.11),
+        sky=(0.86 * grey + 0.16, 0.88 * grey + 0.16, 0.92 * grey + 0.16),
+        ground=(0.3 * grey, 0.29 * grey, 0.28 * grey),
+        horizon=sky,
+        zenith=(0.82 * sky[0], 0.85 * sky[1], 0.9 * sky[2]),
+        fog_m=float(far[kind]),
+        cloud=0.25 if kind == "rain" else 0.1,
+        exposure=1.5 * exposure,
+    )

@@ -7,22 +7,45 @@ twelve at 5.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gcd_model.geometry import sphere_poses
 from gcd_train.errors import DataError, RenderError
-from gcd_train.scenes.description import ORBIT, Floats, Part, Scene, SceneObject, rotations
-from gcd_train.scenes.drop.looks import DropLabel, random_light, random_surroundings
-from gcd_train.scenes.drop.things import Thing, random_thing, turned
+from gcd_train.scenes.description import (
+    ORBIT,
+    Colour,
+    Doubles,
+    Light,
+    Paint,
+    Part,
+    Pattern,
+    Scene,
+    SceneObject,
+    Sheet,
+    Thing,
+    Tracks,
+    pick,
+    pick_by_share,
+    rotations,
+    shaded,
+    square,
+    towards,
+    with_world,
+    yawed,
+)
+from gcd_train.scenes.drop.things import DropLabel, random_thing
 from gcd_train.scenes.primitives import shape
 
-Doubles = NDArray[np.float64]
-SETTLING_S = 4.0
+FPS = 24.0
+HFOV_DEG = math.degrees(2 * math.atan(0.5))
+_RADIUS_M = 15.0
+_ATTEMPTS = 12
+_SIDES_M = (1.0, 2.75)
+_SETTLING_S = 4.0
 _LONGEST_SETTLING_S = 10.0
 _STILL_M_S = 0.06
 _SYRUP_HZ = 0.7
@@ -39,43 +62,30 @@ class UnsoundSceneError(Exception):
     """A simulation that no clip should show: something flew off, sank in or never came to rest."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Tracks:
-    """The motion of N things in T time steps.
+def require_sound(tracks: Tracks, deepest_m: float, settled: Sequence[int]) -> None:
+    """Raises UnsoundSceneError if something is not finite, below the floor, too fast, too deep in another, or away.
 
-    positions, velocities, angular_velocities: [T, N, 3] in the world; metres, metres a second, radians a second.
-    quaternions: [T, N, 4], w, x, y, z, world_from_thing. deepest_m: how far solids overlapped at most.
+    deepest_m: how far solids overlapped at most. settled: which things lay still when the clip began.
     """
-
-    positions: Doubles
-    quaternions: Doubles
-    velocities: Doubles
-    angular_velocities: Doubles
-    deepest_m: float
-
-    def require_sound(self, settled: Sequence[int]) -> None:
-        """Raises UnsoundSceneError if something is not finite, below the floor, too fast, too deep in another, or away.
-
-        settled: which things lay still when the clip began.
-        """
-        if not all(np.isfinite(a).all() for a in (self.positions, self.quaternions, self.velocities)):
-            raise UnsoundSceneError("a position or a speed is not a number")
-        level = np.linalg.norm(self.positions[..., :2], axis=-1)
-        for wrong, reason in (
-            (self.positions[..., 2].min() < 0, "something is below the floor"),
-            (np.linalg.norm(self.velocities, axis=-1).max() > _FASTEST_M_S, "something exploded"),
-            (self.deepest_m > _DEEPEST_M, f"solids overlap by {self.deepest_m:.3f} m"),
-            (level.max() > _WORLD_M, f"something left the stage, by {level.max():.1f} m"),
-            (level[0, list(settled)].max(initial=0.0) > _STAGE_M, "something settled off the stage"),
-        ):
-            if wrong:
-                raise UnsoundSceneError(reason)
+    if not all(np.isfinite(a).all() for a in (tracks.positions, tracks.quaternions, tracks.velocities)):
+        raise UnsoundSceneError("a position or a speed is not a number")
+    level = np.linalg.norm(tracks.positions[..., :2], axis=-1)
+    for wrong, reason in (
+        (tracks.positions[..., 2].min() < 0, "something is below the floor"),
+        (np.linalg.norm(tracks.velocities, axis=-1).max() > _FASTEST_M_S, "something exploded"),
+        (deepest_m > _DEEPEST_M, f"solids overlap by {deepest_m:.3f} m"),
+        (level.max() > _WORLD_M, f"something left the stage, by {level.max():.1f} m"),
+        (level[0, list(settled)].max(initial=0.0) > _STAGE_M, "something settled off the stage"),
+    ):
+        if wrong:
+            raise UnsoundSceneError(reason)
 
 
-def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: int, fps: float) -> Tracks:
+def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: int) -> tuple[Tracks, float]:
     """Let the settled things come to rest, throw the others in, and watch.
 
-    Returns: where they are at `frames` time steps; the first is the moment of throwing.
+    Returns: their motion over `frames` time steps, the first being the moment of throwing; and how far solids
+        overlapped at most, metres.
     Raises: UnsoundSceneError if no free place was found or something never came to rest; RenderError without MuJoCo.
     """
     stage = _Stage(things)
@@ -90,14 +100,14 @@ def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: in
             place = stage.put(i, random, (-5.0, -5.0, 1.0), (5.0, 5.0, 6.0))
             pull = np.array([place[0], place[1], 0.0])  # Kubric's throw: anywhere, and towards the middle
             stage.throw(i, random.uniform((-4, -4, 0), (4, 4, 0)) - pull, random.uniform(-2.5, 2.5, 3))
-    return stage.watch(frames, fps)
+    return stage.watch(frames)
 
 
 class _Stage:
     """A floor and things on it; the only owner of MuJoCo's state."""
 
     def __init__(self, things: Sequence[Thing]) -> None:
-        self._mujoco = _mujoco()
+        self._mujoco = load_mujoco()
         self._things = things
         self._model: Any = _compiled(self._mujoco, things)
         self._data: Any = self._mujoco.MjData(self._model)
@@ -121,9 +131,9 @@ class _Stage:
         """Until all of them lie still, which is then made exact. Air as thick as syrup saves waiting for what rolls."""
         mass, inertia = self._model.body_mass[1:, None], self._model.body_inertia[1:]
         self._model.dof_damping[:] = _SYRUP_HZ * np.concatenate([mass, mass, mass, inertia], 1).ravel()
-        self._run(SETTLING_S)
+        self._run(_SETTLING_S)
         rows = [6 * i + k for i in which for k in range(6)]
-        waited = SETTLING_S
+        waited = _SETTLING_S
         while np.abs(self._data.qvel[rows]).max(initial=0.0) > _STILL_M_S:
             if waited >= _LONGEST_SETTLING_S:
                 raise UnsoundSceneError(f"something still moves after {waited:.0f} s")
@@ -136,20 +146,20 @@ class _Stage:
         """Give it a velocity, metres a second, and a spin about its own axes, radians a second."""
         self._data.qvel[6 * i : 6 * i + 6] = np.concatenate([velocity, spin])
 
-    def watch(self, frames: int, fps: float) -> Tracks:
-        """Its states at the frames' times, beginning now."""
-        states, deepest = [self._state()], 0.0
-        for _ in range(frames - 1):
-            deepest = max(deepest, self._run(1 / fps))
-            states.append(self._state())
-        q, v = (np.stack(rows) for rows in zip(*states, strict=True))  # [T, N, 7], [T, N, 6]
-        return Tracks(
-            positions=q[..., :3],
-            quaternions=q[..., 3:],
-            velocities=v[..., :3],
-            angular_velocities=(rotations(q[..., 3:]) @ v[..., 3:, None])[..., 0],  # MuJoCo's are in the body's frame
-            deepest_m=deepest,
+    def watch(self, frames: int) -> tuple[Tracks, float]:
+        """The motion from now on, and how deep solids overlapped at most."""
+        deepest, q, v = 0.0, [], []
+        for frame in range(frames):
+            if frame:
+                deepest = max(deepest, self._run(1 / FPS))
+            q.append(self._data.qpos.reshape(-1, 7).copy())
+            v.append(self._data.qvel.reshape(-1, 6).copy())
+        q, v = np.stack(q), np.stack(v)  # [T, N, 7], [T, N, 6]
+        spin = rotations(q[..., 3:]) @ v[..., 3:, None]  # MuJoCo's are in the body's frame
+        tracks = Tracks(
+            positions=q[..., :3], quaternions=q[..., 3:], velocities=v[..., :3], angular_velocities=spin[..., 0]
         )
+        return tracks, deepest
 
     def _run(self, seconds: float) -> float:
         """Let time pass. Returns how deep solids overlapped at most. Raises UnsoundSceneError if it diverged."""
@@ -169,15 +179,13 @@ class _Stage:
         contact = self._data.contact
         return bool((self._model.geom_bodyid[contact.geom] == i + 1).any())
 
-    def _state(self) -> tuple[Doubles, Doubles]:
-        return self._data.qpos.reshape(-1, 7).copy(), self._data.qvel.reshape(-1, 6).copy()
 
-
-def _mujoco() -> Any:
+def load_mujoco() -> Any:
+    """The library, an optional dependency: only generating needs it. Raises RenderError if it is not installed."""
     try:
-        import mujoco  # an optional dependency: only generating needs it
+        import mujoco
     except ImportError as error:
-        raise RenderError("falling things need the extra `scenes`: pip install 'gcd-node[scenes]'") from error
+        raise RenderError("this world needs the extra `scenes`: pip install 'gcd-node[scenes]'") from error
     return mujoco
 
 
@@ -196,7 +204,7 @@ def _compiled(mujoco: Any, things: Sequence[Thing]) -> Any:
             body.add_geom(
                 **_geometry(mujoco, spec, part),
                 pos=part.centre,
-                quat=turned(part),
+                quat=yawed(np.array(part.turn), part.yaw),
                 mass=thing.mass_kg * share,
                 **_surface(thing.friction, thing.restitution, side),
             )
@@ -234,14 +242,7 @@ def _geometry(mujoco: Any, spec: Any, part: Part) -> dict[str, Any]:
     return {"type": kind.mjGEOM_MESH, "meshname": mesh.name}
 
 
-FPS = 24.0
-HFOV_DEG = math.degrees(2 * math.atan(0.5))
-RADIUS_M = 15.0
-_ATTEMPTS = 12
-_SIDES_M = (1.0, 2.75)
-
-
-def drop_scene(seed: int, *, frames: int = 60) -> Scene:
+def drop_scene(seed: int, frames: int = 60) -> Scene:
     """A scene that depends on nothing but its arguments.
 
     Args:
@@ -259,8 +260,8 @@ def drop_scene(seed: int, *, frames: int = 60) -> Scene:
         things = _random_things(random)
         settled = [i for i, thing in enumerate(things) if not thing.dynamic]
         try:
-            tracks = simulate(things, random, frames=frames, fps=FPS)
-            tracks.require_sound(settled)
+            tracks, deepest_m = simulate(things, random, frames=frames)
+            require_sound(tracks, deepest_m, settled)
             _require_free_cameras(things, tracks)
         except UnsoundSceneError as error:
             reasons.append(str(error))
@@ -269,9 +270,9 @@ def drop_scene(seed: int, *, frames: int = 60) -> Scene:
     raise RenderError(f"drop scene {seed}: no sound simulation in {_ATTEMPTS} attempts ({'; '.join(reasons)}); skip it")
 
 
-def orbit_cameras(frames: int) -> dict[str, NDArray[np.float64]]:
+def orbit_cameras(frames: int) -> dict[str, Doubles]:
     """Kubric-4D's cameras, "view0" to "view15", which stand still: world_from_camera [T, 4, 4]."""
-    ring = [(90.0 * k, 45.0, RADIUS_M) for k in range(4)] + [(15.0 + 30.0 * k, 5.0, RADIUS_M) for k in range(12)]
+    ring = [(90.0 * k, 45.0, _RADIUS_M) for k in range(4)] + [(15.0 + 30.0 * k, 5.0, _RADIUS_M) for k in range(12)]
     poses = sphere_poses(torch.tensor(ring, dtype=torch.float64)).numpy()
     return {f"view{i}": np.tile(pose, (frames, 1, 1)) for i, pose in enumerate(poses)}
 
@@ -297,44 +298,92 @@ def _scene(things: list[Thing], tracks: Tracks, random: np.random.Generator, fac
     surroundings, dome, floor = random_surroundings(random)
     thrown = sum(thing.dynamic for thing in things)
     return Scene(
-        parts=(dome, *_parts(things)),
+        parts=(dome, *(part.of(instance=i, body=i) for i, thing in enumerate(things, 1) for part in thing.parts)),
         sheets=(floor,),
-        poses=_poses(tracks),
+        poses=with_world(rotations(tracks.quaternions), tracks.positions),
         focus=np.zeros((frames, 3), np.float32),
         cameras=orbit_cameras(frames),
         hfov_deg=HFOV_DEG,
         light=random_light(random),
         facts={**facts, "surroundings": surroundings, "settled": len(things) - thrown, "thrown": thrown},
-        objects=tuple(_object(thing, i, tracks) for i, thing in enumerate(things)),
+        objects=tuple(
+            SceneObject.of(thing, tracks, i, instance=i + 1, body=i + 1, label=DropLabel.OBJECT)
+            for i, thing in enumerate(things)
+        ),
         extent=ORBIT,
     )
 
 
-def _parts(things: list[Thing]) -> list[Part]:
-    """Thing i is instance and body i + 1."""
-    return [part.of(instance=i + 1, body=i + 1) for i, thing in enumerate(things) for part in thing.parts]
+DOME_M = 40.0
+"""Radius of the dome. The farthest that a camera at 18 m sees is 58 m, below the 64 m at which splats are weighted
+differently."""
+_FLOORS = {
+    "planks": Paint((0.66, 0.47, 0.3), (0.42, 0.28, 0.17), Pattern.PLANKS, 0.55, 0.12),
+    "pale planks": Paint((0.8, 0.7, 0.56), (0.62, 0.5, 0.37), Pattern.PLANKS, 0.7, 0.1),
+    "terrazzo": Paint((0.72, 0.7, 0.66), (0.5, 0.3, 0.22), Pattern.TERRAZZO, 0.5, 0.15),
+    "checker": Paint((0.82, 0.8, 0.76), (0.3, 0.33, 0.36), Pattern.CHECKER, 1.6, 0.12),
+    "marble": Paint((0.83, 0.81, 0.78), (0.62, 0.6, 0.58), Pattern.MARBLE, 2.4, 0.15),
+    "grass": Paint((0.4, 0.5, 0.2), (0.2, 0.3, 0.1), Pattern.CLOUDY, 0.25),
+    "sand": Paint((0.8, 0.68, 0.5), (0.66, 0.53, 0.36), Pattern.CLOUDY, 0.5),
+    "concrete": Paint((0.58, 0.57, 0.55), (0.46, 0.45, 0.44), Pattern.CLOUDY, 1.2),
+    "asphalt": Paint((0.3, 0.3, 0.32), (0.22, 0.22, 0.23), Pattern.CLOUDY, 0.25),
+    "carpet": Paint((0.52, 0.2, 0.2), (0.62, 0.48, 0.34), Pattern.STRIPES, 2.4),
+    "dotted rug": Paint((0.28, 0.36, 0.5), (0.7, 0.68, 0.6), Pattern.DOTS, 1.4),
+}
+_BACKDROPS: dict[str, tuple[float, Pattern, tuple[str, ...]]] = {
+    "hills": (0.3, Pattern.HILLS, ("grass", "sand", "concrete", "asphalt", "pale planks")),
+    "houses": (0.25, Pattern.HOUSES, ("concrete", "asphalt", "checker", "grass", "terrazzo")),
+    "hall": (
+        0.25,
+        Pattern.HALL,
+        ("planks", "pale planks", "checker", "terrazzo", "marble", "carpet", "dotted rug"),
+    ),
+    "studio": (0.2, Pattern.STUDIO, ("planks", "marble", "carpet", "dotted rug", "concrete", "checker", "sand")),
+}
+"""What stands around: how often, how it is painted, and the floors that suit it."""
+_WALLS: tuple[tuple[Colour, Colour], ...] = (
+    ((0.82, 0.78, 0.7), (0.5, 0.36, 0.24)),
+    ((0.62, 0.7, 0.74), (0.36, 0.42, 0.47)),
+    ((0.78, 0.62, 0.5), (0.44, 0.24, 0.18)),
+    ((0.6, 0.68, 0.56), (0.3, 0.36, 0.26)),
+    ((0.8, 0.8, 0.82), (0.42, 0.42, 0.48)),
+)
+_HILLS: tuple[Colour, Colour] = ((0.42, 0.5, 0.5), (0.2, 0.3, 0.14))
 
 
-def _poses(tracks: Tracks) -> Floats:
-    """World_from_body [T, 1 + N, 3, 4]; body 0 is the world itself."""
-    moving = np.concatenate([rotations(tracks.quaternions), tracks.positions[..., None]], -1)
-    still = np.broadcast_to(np.eye(4)[:3], (len(moving), 1, 3, 4))
-    return np.concatenate([still, moving], 1).astype(np.float32)
+def random_surroundings(random: np.random.Generator) -> tuple[str, Part, Sheet]:
+    """What they are called, the dome and the floor.
+
+    The dome has a real distance, so that every pixel of a view is a point of the world and a point cloud has no holes
+    at the top; what is painted on it is seen alike from everywhere. Its inside faces the cameras, hence the negative
+    side.
+    """
+    backdrop = pick_by_share(random, [(name, share) for name, (share, _, _) in _BACKDROPS.items()])
+    _, pattern, floors = _BACKDROPS[backdrop]
+    name = pick(random, floors)
+    colour, accent = _HILLS if backdrop == "hills" else pick(random, _WALLS)
+    side, bright, floor = 2 * DOME_M, float(random.uniform(0.85, 1.12)), _FLOORS[name]
+    dome = Part("sphere", (0, 0, 0), (-side, side, side), Paint(colour, accent, pattern), DropLabel.BACKGROUND)
+    lit = replace(floor, colour=shaded(floor.colour, bright), accent=shaded(floor.accent, bright))
+    return f"{name}, {backdrop}", dome, Sheet(square(DOME_M + 1.0, 0.0), lit, DropLabel.BACKGROUND)
 
 
-def _object(thing: Thing, i: int, tracks: Tracks) -> SceneObject:
-    return SceneObject(
-        name=thing.name,
-        instance=i + 1,
-        body=i + 1,
-        label=DropLabel.OBJECT,
-        size=thing.size,
-        dynamic=thing.dynamic,
-        mass_kg=thing.mass_kg,
-        friction=thing.friction,
-        restitution=thing.restitution,
-        positions=tracks.positions[:, i],
-        quaternions=tracks.quaternions[:, i],
-        velocities=tracks.velocities[:, i],
-        angular_velocities=tracks.angular_velocities[:, i],
+def random_light(random: np.random.Generator) -> Light:
+    """A sun at some height, warmer when low, or a bright overcast sky."""
+    overcast = random.random() < 0.2
+    height, round_ = float(random.uniform(math.radians(28), math.radians(72))), float(random.uniform(0, 2 * math.pi))
+    warm = float(random.uniform(0, 1)) * (1.1 - math.sin(height))
+    strength = 0.55 if overcast else float(random.uniform(1.3, 1.9))
+    fill = 0.85 if overcast else float(random.uniform(0.45, 0.62))
+    blue = 0.15 if overcast else float(random.uniform(0.4, 1.0))
+    return Light(
+        sun_to=towards(height, round_),
+        sun=(strength, strength * (1 - 0.3 * warm), strength * (0.95 - 0.6 * warm)),
+        sky=(fill * (1 - 0.12 * blue), fill, fill * (1 + 0.12 * blue)),
+        ground=(0.5 * fill, 0.46 * fill, 0.42 * fill),
+        horizon=(0.74 + 0.12 * warm, 0.77, 0.8 - 0.1 * warm),
+        zenith=(0.62 - 0.42 * blue, 0.68 - 0.32 * blue, 0.8 - 0.02 * blue),
+        fog_m=float(random.uniform(70, 160)),
+        cloud=float(random.uniform(0.2, 0.9)),
+        exposure=float(random.uniform(1.35, 1.75)),
     )

@@ -1,16 +1,26 @@
 """The arm, six hinges and a parallel gripper, and the physics: arm, table and things as one MuJoCo model, in metres."""
 
+import math
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcd_train.errors import RenderError
-from gcd_train.scenes.description import Colour, Part, Point, rotations
-from gcd_train.scenes.tabletop.furniture import FLOOR_M
-from gcd_train.scenes.tabletop.things import Placed, Setting, TabletopClass, Thing
+from gcd_train.scenes.description import Colour, Part, Point, pick, rotations
+from gcd_train.scenes.drop.world import load_mujoco
+from gcd_train.scenes.tabletop.things import (
+    FLOOR_M,
+    TABLE_M,
+    Placed,
+    Setting,
+    TableThing,
+    TabletopClass,
+    plain,
+    random_clutter,
+    random_table,
+    random_thing,
+)
 
 BASE = (-0.36, 0.0, 0.0)
 """Where the arm is bolted to the table, metres from the middle of its surface."""
@@ -24,6 +34,12 @@ OPEN_M = 0.052
 REACH_M = (0.27, 0.55)
 """Nearest and farthest distance from the base at which the arm grasps from above."""
 STEP_S = 1 / 480
+FINGER_ROOM_M = 0.085
+"""How far the open gripper reaches from the middle of what it takes."""
+_WIDEST_AZIMUTH = 1.15
+_GAP_M, _DROP_M, _TRIES = 0.015, 0.002, 400
+_SPANS_M = ((-0.3, TABLE_M[0] - 0.1), (0.1 - TABLE_M[1], TABLE_M[1] - 0.1))
+"""Where on the table things lie: along x and along y."""
 
 _LIVERIES: tuple[tuple[Colour, Colour], ...] = (
     ((0.93, 0.93, 0.91), (0.16, 0.17, 0.19)),
@@ -74,13 +90,55 @@ _DEFAULTS = """
 _MOVED_ALIKE = '<joint joint1="slide_right" joint2="slide_left" polycoef="0 1 0 0 0" solref="0.005 1"/>'
 
 
+def random_setting(random: np.random.Generator) -> Setting:
+    """An arm, a table with clutter, and things that the arm can take."""
+    arm, table, clutter = random_arm(random), random_table(random), random_clutter(random)
+    return Setting(arm=arm, table=table, clutter=clutter, things=_random_things(random, clutter))
+
+
+def _random_things(random: np.random.Generator, clutter: tuple[Placed, ...]) -> tuple[Placed, ...]:
+    """Five to twelve loose things; the first four or so stand apart and within reach, so that they can be taken."""
+    wanted = int(random.integers(5, 13))
+    placed: list[Placed] = []
+    for _ in range(_TRIES):
+        if len(placed) == wanted:
+            break
+        first = len(placed) < 4
+        thing = random_thing(random, 2 * OPEN_M - 0.022)
+        x, y = reachable_spot(random) if first else tuple(float(random.uniform(*span)) for span in _SPANS_M)
+        gap = FINGER_ROOM_M - 0.02 if first else _GAP_M
+        if _is_free(x, y, thing.radius_m + gap, (*placed, *clutter)):
+            place = (x, y, thing.size[2] / 2 + _DROP_M)
+            placed.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-math.pi, math.pi))))
+    return tuple(placed)
+
+
+def reachable_spot(random: np.random.Generator) -> tuple[float, float]:
+    """A point of the table, x and y in metres, that the arm can grasp at from above."""
+    radius = float(random.uniform(REACH_M[0] + 0.02, REACH_M[1] - 0.02))
+    azimuth = float(random.uniform(-_WIDEST_AZIMUTH, _WIDEST_AZIMUTH))
+    return BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth)
+
+
+def _is_free(x: float, y: float, radius: float, others: tuple[Placed, ...]) -> bool:
+    apart = math.hypot(x - BASE[0], y - BASE[1]) > 0.2 + radius
+    return apart and all(
+        math.hypot(x - other.place[0], y - other.place[1]) > radius + other.thing.radius_m for other in others
+    )
+
+
+def is_reachable(x: float, y: float) -> bool:
+    """Whether the arm can grasp from above at a point of the table, metres."""
+    return REACH_M[0] <= math.hypot(x - BASE[0], y - BASE[1]) <= REACH_M[1]
+
+
 def random_arm(random: np.random.Generator) -> str:
     """An arm in one of several liveries and slightly varied in length and girth, as MJCF.
 
     Its body stands at the origin, x ahead; its site "tool" is the point between the fingertips, z out of the hand, y
     from finger to finger.
     """
-    shell, joint = _LIVERIES[int(random.integers(len(_LIVERIES)))]
+    shell, joint = pick(random, _LIVERIES)
     upper, fore = float(random.uniform(0.33, 0.37)), float(random.uniform(0.30, 0.34))
     r, s, j = 0.045 * float(random.uniform(0.9, 1.15)), _rgba(shell), _rgba(joint)
     return f"""
@@ -169,10 +227,7 @@ class Model:
 
 def build_model(setting: Setting) -> Model:
     """Compile everything. Raises RenderError without MuJoCo."""
-    try:
-        mujoco: Any = import_module("mujoco")  # an optional dependency: only generating needs it
-    except ImportError as error:
-        raise RenderError("the tabletop world needs the extra `scenes`: pip install 'gcd-node[scenes]'") from error
+    mujoco = load_mujoco()
     model = mujoco.MjModel.from_xml_string(_xml(setting))
     return Model(
         mujoco=mujoco,
@@ -187,12 +242,12 @@ def build_model(setting: Setting) -> Model:
     )
 
 
-def arm_links(model: Model) -> list[tuple[Thing, int, TabletopClass]]:
+def arm_links(model: Model) -> list[tuple[TableThing, int, TabletopClass]]:
     """The arm's links, the gripper's last, each with its body's number and its class.
 
     Their names tell the class too, for layouts that keep no classes: robot_arm/upper_arm, gripper/palm.
     """
-    found: list[tuple[Thing, int, TabletopClass]] = []
+    found: list[tuple[TableThing, int, TabletopClass]] = []
     for body_name, name in _LINKS.items():
         label = TabletopClass.GRIPPER if body_name in _GRIPPER else TabletopClass.ROBOT_ARM
         body = model.model.body(body_name).id
@@ -200,7 +255,7 @@ def arm_links(model: Model) -> list[tuple[Thing, int, TabletopClass]]:
         middle, size = _bounding_box(parts)
         mass_kg = float(model.model.body_mass[body])
         name = f"{label.name.lower()}/{name}"
-        link = Thing(name=name, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
+        link = TableThing(name=name, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
         found.append((link, body, label))
     return found
 
@@ -214,17 +269,9 @@ def _parts_of_body(model: Model, body: int, label: TabletopClass) -> tuple[Part,
     for geom in range(first, first + compiled.body_geomnum[body]):
         shape = shapes[kinds(compiled.geom_type[geom])]
         x, y, z = (2 * compiled.geom_size[geom]).tolist()
-        part = Part(
-            shape=shape,
-            size=(x, y, z) if shape == "box" else (x, x, y),
-            centre=tuple(compiled.geom_pos[geom].tolist()),
-            turn=tuple(compiled.geom_quat[geom].tolist()),
-            colour=tuple(compiled.geom_rgba[geom][:3].tolist()),
-            gloss=0.25,
-            grain_m=0.05,
-            label=label,
-        )
-        found.append(part)
+        size = (x, y, z) if shape == "box" else (x, x, y)
+        colour, place = tuple(compiled.geom_rgba[geom][:3].tolist()), tuple(compiled.geom_pos[geom].tolist())
+        found.append(Part(shape, place, size, plain(colour, 0.25), label, tuple(compiled.geom_quat[geom].tolist())))
     return tuple(found)
 
 

@@ -10,21 +10,42 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Extent, Part, Point, Scene, SceneObject, rotations
+from gcd_train.scenes.description import (
+    Colour,
+    Doubles,
+    Extent,
+    Floats,
+    Light,
+    Paint,
+    Part,
+    Pattern,
+    Point,
+    Scene,
+    SceneObject,
+    Sheet,
+    Tracks,
+    pick,
+    rotations,
+    shaded,
+    square,
+    towards,
+    with_world,
+    yawed,
+)
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model
-from gcd_train.scenes.tabletop.furniture import TABLE_Z_M, UNITS_A_METRE, random_light, room
+from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
-from gcd_train.scenes.tabletop.tasks import random_setting
-from gcd_train.scenes.tabletop.things import Placed, Setting, TabletopClass, Thing
+from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TabletopClass
 
+UNITS_A_METRE = 10.0
 _EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
 _TABLE = 1
 """The scene's body that carries table, clutter and, one number further each, the bodies of the physics model."""
-
-Floats = NDArray[np.float64]
+_TABLE_Z_M = -0.12
+"""Height of the table's surface in the world: arm and things are then in the middle of the pictures."""
+_WALL, _WALL_TOP = 36.0, 19.0  # units
+_WALLS: tuple[Colour, ...] = ((0.85, 0.83, 0.78), (0.68, 0.74, 0.76), (0.78, 0.70, 0.62), (0.60, 0.64, 0.58))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,12 +58,12 @@ class Episode:
 
     scene: Scene
     motion: Motion
-    wrist: Floats
-    world_from_base: Floats
+    wrist: Doubles
+    world_from_base: Doubles
     task: str
 
 
-def tabletop_scene(seed: int, *, frames: int = 60) -> Scene:
+def tabletop_scene(seed: int, frames: int = 60) -> Scene:
     """A scene that depends on nothing but its arguments.
 
     Args:
@@ -65,18 +86,19 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     drawn_s, speed = float(random.uniform(0, 1.4)), float(random.uniform(0.5, 0.9))
     motion = Simulation(model, setting.things, random, speed).run(frames, drawn_s if skipped_s is None else skipped_s)
     world_from_table = _table_pose(float(random.uniform(-math.pi, math.pi)))
-    walls, sheets = room(random)
-    task, counted = _in_words(motion, setting), _counted(model, setting)
+    walls, floor = room(random)
+    task = _in_words(motion, setting)
+    parts, objects = _counted(model, setting, motion, world_from_table)
     scene = Scene(
-        parts=(*walls, *_parts(setting, counted)),
-        sheets=sheets,
+        parts=(*walls, *parts),
+        sheets=(floor,),
         poses=_poses(motion, world_from_table),
         focus=np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (frames, 1)),
         cameras=orbit_cameras(frames),
         hfov_deg=HFOV_DEG,
         light=random_light(random),
         facts=_facts(seed, setting, motion) | {"task": task},
-        objects=tuple(each.as_object(i, motion, world_from_table) for i, each in enumerate(counted, start=1)),
+        objects=tuple(objects),
         extent=_EXTENT,
     )
     return Episode(
@@ -88,79 +110,49 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Counted:
-    """A thing, a link or a piece of clutter; its instance is its number from 1 on.
+def _counted(
+    model: Model, setting: Setting, motion: Motion, world_from_table: Doubles
+) -> tuple[list[Part], list[SceneObject]]:
+    """The table's parts; those of things, links and clutter, and what metadata tells of them, in scene units.
 
-    body: of the physics model. stands: where on the table, of clutter, which has no body of its own.
+    Their instances are their numbers from 1 on. Clutter stands on the table's body.
     """
-
-    thing: Thing
-    label: TabletopClass
-    body: int
-    stands: Placed | None = None
-
-    def parts(self, instance: int) -> Iterator[Part]:
-        """Its parts, in scene units."""
-        for part in self.thing.parts:
-            for piece in _drawn(part):
-                counted = piece.of(instance=instance, body=_TABLE + self.body)
-                if self.stands is not None:
-                    x, y, z = _scaled(self.stands.place)
-                    counted = counted.placed(x, y, z, self.stands.yaw)
-                yield counted
-
-    def as_object(self, instance: int, motion: Motion, world_from_table: Floats) -> SceneObject:
-        """What metadata tells of it."""
-        turn = world_from_table[:3, :3]
-        if self.stands is None:
-            positions = _moved(world_from_table, motion.positions[:, self.body])
-            quaternions, velocities = motion.quaternions[:, self.body], motion.velocities[:, self.body] @ turn.T
-            angular_velocities = motion.angular_velocities[:, self.body] @ turn.T
-        else:
-            frames, half = len(motion.steps), self.stands.yaw / 2
-            positions = np.tile(_moved(world_from_table, np.asarray(self.stands.place)), (frames, 1))
-            quaternions = np.tile([math.cos(half), 0.0, 0.0, math.sin(half)], (frames, 1))
-            velocities = angular_velocities = np.zeros((frames, 3))
-        return SceneObject(
-            name=self.thing.name if self.stands is None else f"clutter/{self.thing.name}",
-            instance=instance,
-            body=_TABLE + self.body,
-            label=self.label,
-            size=_scaled(self.thing.size),
-            middle=_scaled(self.thing.middle),
-            dynamic=self.stands is None,
-            mass_kg=self.thing.mass_kg,
-            friction=self.thing.friction,
-            restitution=0.0,
-            positions=UNITS_A_METRE * positions,
-            quaternions=_turned(world_from_table, quaternions),
-            velocities=UNITS_A_METRE * velocities,
-            angular_velocities=angular_velocities,
-        )
-
-
-def _counted(model: Model, setting: Setting) -> list[_Counted]:
-    """Things, links and clutter."""
+    parts = [piece.of(instance=0, body=_TABLE) for part in setting.table for piece in _drawn(part)]
+    objects: list[SceneObject] = []
+    tracks = _in_world(motion.tracks, setting.clutter, world_from_table)
     things = [
-        _Counted(placed.thing, TabletopClass.OBJECT, body)
-        for placed, body in zip(setting.things, model.things, strict=True)
+        (placed.thing, body, TabletopClass.OBJECT) for placed, body in zip(setting.things, model.things, strict=True)
     ]
-    links = [_Counted(link, label, body) for link, body, label in arm_links(model)]
-    return [*things, *links, *(_Counted(each.thing, TabletopClass.CLUTTER, 0, each) for each in setting.clutter)]
+    rows = [(*row, row[1], None) for row in (*things, *arm_links(model))]
+    bodies = motion.tracks.positions.shape[1]
+    rows += [(each.thing, 0, TabletopClass.CLUTTER, bodies + k, each) for k, each in enumerate(setting.clutter)]
+    for instance, (thing, body, label, track, stands) in enumerate(rows, start=1):
+        pieces = [piece.of(instance=instance, body=_TABLE + body) for part in thing.parts for piece in _drawn(part)]
+        if stands is not None:
+            pieces = [piece.placed(*_scaled(stands.place), stands.yaw) for piece in pieces]
+        parts += pieces
+        sized = replace(thing, size=_scaled(thing.size), middle=_scaled(thing.middle))
+        objects.append(SceneObject.of(sized, tracks, track, instance=instance, body=_TABLE + body, label=label))
+    return parts, objects
 
 
-def _parts(setting: Setting, counted: list[_Counted]) -> Iterator[Part]:
-    """The table, and all that is counted, in scene units."""
-    for part in setting.table:
-        yield from (piece.of(instance=0, body=_TABLE) for piece in _drawn(part))
-    for instance, each in enumerate(counted, start=1):
-        yield from each.parts(instance)
+def _in_world(moving: Tracks, clutter: tuple[Placed, ...], world_from_table: Doubles) -> Tracks:
+    """The tracks of all bodies and, after them, of the clutter, from the table's frame to the world's, scene units."""
+    turn, still = world_from_table[:3, :3], np.zeros((len(moving.positions), len(clutter), 3))
+    places = still + np.stack([_moved(world_from_table, np.array(each.place)) for each in clutter])
+    turned = still[..., :1] + np.stack([yawed(np.eye(4)[0], each.yaw) for each in clutter])
+    return Tracks(
+        positions=UNITS_A_METRE * np.concatenate([_moved(world_from_table, moving.positions), places], 1),
+        quaternions=yawed(np.concatenate([moving.quaternions, turned], 1), math.atan2(turn[1, 0], turn[0, 0])),
+        velocities=UNITS_A_METRE * np.concatenate([moving.velocities @ turn.T, still], 1),
+        angular_velocities=np.concatenate([moving.angular_velocities @ turn.T, still], 1),
+    )
 
 
 def _drawn(part: Part) -> Iterator[Part]:
     """What is drawn of a part, in scene units; a capsule is a cylinder and two spheres."""
-    scaled = replace(part, centre=_scaled(part.centre), size=_scaled(part.size), grain_m=part.grain_m * UNITS_A_METRE)
+    paint = replace(part.paint, grain_m=part.paint.grain_m * UNITS_A_METRE)
+    scaled = replace(part, centre=_scaled(part.centre), size=_scaled(part.size), paint=paint)
     if part.shape != "capsule":
         yield scaled
         return
@@ -172,37 +164,34 @@ def _drawn(part: Part) -> Iterator[Part]:
         yield replace(scaled, shape="sphere", centre=_scaled((x, y, z)), size=(scaled.size[0],) * 3)
 
 
-def _poses(motion: Motion, world_from_table: Floats) -> NDArray[np.float32]:
+def _poses(motion: Motion, world_from_table: Doubles) -> Floats:
     """world_from_body [T, 1 + B, 3, 4]: the world, then the physics model's bodies, its own world being the table."""
-    frames, bodies = motion.positions.shape[:2]
-    poses = np.zeros((frames, 1 + bodies, 3, 4))
-    poses[:, 0, :, :3] = np.eye(3)
-    poses[:, 1:, :, :3] = world_from_table[:3, :3] @ rotations(motion.quaternions)
-    poses[:, 1:, :, 3] = UNITS_A_METRE * _moved(world_from_table, motion.positions)
-    return poses.astype(np.float32)
+    turns = world_from_table[:3, :3] @ rotations(motion.tracks.quaternions)
+    places = UNITS_A_METRE * _moved(world_from_table, motion.tracks.positions)
+    return with_world(turns, places)
 
 
-def _table_pose(yaw: float) -> Floats:
+def _table_pose(yaw: float) -> Doubles:
     """world_from_table [4, 4]: turned about the vertical, metres."""
     turn = np.eye(4)
     turn[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    turn[2, 3] = TABLE_Z_M
+    turn[2, 3] = _TABLE_Z_M
     return turn
 
 
-def _world_from_base(world_from_table: Floats) -> Floats:
+def _world_from_base(world_from_table: Doubles) -> Doubles:
     """[4, 4], decimetres."""
     table_from_base = np.eye(4)
     table_from_base[:3, 3] = BASE
     return _in_units(world_from_table @ table_from_base)
 
 
-def upright_base() -> Floats:
+def upright_base() -> Doubles:
     """world_from_base [4, 4] of an arm whose table is not turned, decimetres."""
     return _world_from_base(_table_pose(0.0))
 
 
-def _hand_from_camera() -> Floats:
+def _hand_from_camera() -> Doubles:
     """A camera before the palm that looks past the fingers: in the tool's frame, metres."""
     eye, target = np.array([-0.11, 0.0, -0.17]), np.array([0.0, 0.0, 0.02])
     ahead = (target - eye) / np.linalg.norm(target - eye)
@@ -213,7 +202,7 @@ def _hand_from_camera() -> Floats:
     return pose
 
 
-def _in_units(poses: Floats) -> Floats:
+def _in_units(poses: Doubles) -> Doubles:
     """Metres to decimetres."""
     scaled = poses.copy()
     scaled[..., :3, 3] *= UNITS_A_METRE
@@ -224,17 +213,9 @@ def _scaled(point: Point) -> Point:
     return point[0] * UNITS_A_METRE, point[1] * UNITS_A_METRE, point[2] * UNITS_A_METRE
 
 
-def _moved(world_from_table: Floats, points: Floats) -> Floats:
+def _moved(world_from_table: Doubles, points: Doubles) -> Doubles:
     """Points [..., 3] of the table's frame in the world."""
     return points @ world_from_table[:3, :3].T + world_from_table[:3, 3]
-
-
-def _turned(world_from_table: Floats, quaternions: Floats) -> Floats:
-    """What each becomes after the table's turn; w, x, y, z."""
-    half = math.atan2(world_from_table[1, 0], world_from_table[0, 0]) / 2
-    c, s = math.cos(half), math.sin(half)
-    w, x, y, z = np.moveaxis(quaternions, -1, 0)
-    return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
 
 
 def _facts(seed: int, setting: Setting, motion: Motion) -> dict[str, float | str]:
@@ -255,3 +236,52 @@ def _in_words(motion: Motion, setting: Setting) -> str:
     verbs = {"lift": "pick up the {} and place it elsewhere", "push": "push the {} aside"}
     told = [verbs[name].format(setting.things[index].thing.name) for name, index in motion.tasks]
     return ", then ".join(told) or "move over the table"
+
+
+def room(random: np.random.Generator) -> tuple[list[Part], Sheet]:
+    """Four walls with the sky above them, and the floor, in scene units; lower than the sun at the table."""
+    low, colour = (FLOOR_M + _TABLE_Z_M) * UNITS_A_METRE, pick(random, _WALLS)
+    middle, height = (low + _WALL_TOP) / 2, _WALL_TOP - low
+    paint = Paint(colour, (0.9 * colour[0], 0.9 * colour[1], 0.92 * colour[2]), Pattern.CLOUDY, 5.0)
+    parts: list[Part] = []
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        size = (1.0 if x else 2 * _WALL, 1.0 if y else 2 * _WALL, height)
+        parts.append(Part("box", (x * _WALL, y * _WALL, middle), size, paint, TabletopClass.WALL))
+    parts += _panels(random, low)
+    size = (-5.5 * _WALL, 5.5 * _WALL, 5.5 * _WALL)  # its inside faces the cameras, hence the negative size
+    parts.append(Part("ball", (0, 0, 0), size, Paint((1, 1, 1), pattern=Pattern.SKY), TabletopClass.SKY))
+    pattern = pick(random, (Pattern.PLANKS, Pattern.TERRAZZO, Pattern.CHECKER, Pattern.CLOUDY))
+    colour = pick(random, WOODS if pattern == Pattern.PLANKS else FLATS)
+    return parts, Sheet(square(_WALL, low), Paint(colour, shaded(colour, 0.8), pattern, 3.0, 0.1), TabletopClass.FLOOR)
+
+
+def _panels(random: np.random.Generator, low: float) -> Iterator[Part]:
+    """Cupboards, pictures and doors along the walls, so that the background tells where it is."""
+    for side in range(4):
+        for along in np.arange(-0.75, 0.76, 0.5) + random.uniform(-0.12, 0.12, 4):
+            wide, deep, high = (float(random.uniform(*sides)) for sides in ((5, 11), (0.6, 4.5), (6, 22)))
+            red, green, blue = (float(random.uniform(0.2, most)) for most in (0.85, 0.8, 0.8))
+            lift, grey = 0.0 if deep > 1.5 else 8.0, 0.5 * (red + green)
+            colour = ((red + grey) / 2, (green + grey) / 2, (blue + grey) / 2)
+            paint = Paint(colour, (0.4, 0.35, 0.3), pick(random, (Pattern.PLAIN, Pattern.WOOD, Pattern.STRIPES)), 2.0)
+            centre = (float(along) * _WALL, _WALL - 0.5 - deep / 2, low + lift + high / 2)
+            panel = Part("box", centre, (wide, deep, high), paint, TabletopClass.WALL)
+            yield panel.placed(0.0, 0.0, 0.0, side * math.pi / 2)
+
+
+def random_light(random: np.random.Generator) -> Light:
+    """A lamp high above, as parallel light, and the bright room around it."""
+    height, round_ = float(random.uniform(0.85, 1.35)), float(random.uniform(0, 2 * math.pi))
+    warm, strength = float(random.uniform(0.0, 0.3)), float(random.uniform(0.8, 1.5))
+    fill = float(random.uniform(0.55, 0.85))
+    return Light(
+        sun_to=towards(height, round_),
+        sun=(strength, strength * (1 - 0.4 * warm), strength * (1 - 0.8 * warm)),
+        sky=(fill, fill * (1 - 0.1 * warm), fill * (1 - 0.2 * warm)),
+        ground=(0.45 * fill, 0.43 * fill, 0.40 * fill),
+        horizon=(0.72, 0.72, 0.70),
+        zenith=(0.80, 0.80, 0.79),
+        fog_m=4000.0,
+        cloud=0.0,
+        exposure=float(random.uniform(1.1, 1.5)),
+    )

@@ -1,16 +1,18 @@
-"""The running world: the controller follows the planned steps, the physics answers, frames are kept."""
+"""The arm at work: tasks become steps of its tool, the controller follows them, the physics answers, frames are kept.
+
+A task is planned when the last one is done, from where things are by then.
+"""
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.tabletop.arm import BASE, HOME, OPEN_M, STEP_S, Model
-from gcd_train.scenes.tabletop.tasks import Planner, Step
+from gcd_train.scenes.description import Doubles, Point, Tracks
+from gcd_train.scenes.tabletop.arm import BASE, FINGER_ROOM_M, HOME, OPEN_M, STEP_S, Model, is_reachable, reachable_spot
 from gcd_train.scenes.tabletop.things import Placed
 
 FPS = 24.0
@@ -21,8 +23,22 @@ _SETTLE_S = 0.5
 _LEAD_S = 0.03
 """Joints are told where to be a little later, since they follow with this delay."""
 _SLIP_M = 0.03
+_LOWEST_M, _ABOVE_M = 0.021, 0.11
+_ROUNDS, _DAMPING, _LARGEST_TURN, _HOMING = 2, 0.03, 0.25, 0.02
 
-Floats = NDArray[np.float64]
+
+class Step(NamedTuple):
+    """One leg of the way: where the tool is at its end, metres, its x axis at `yaw` radians.
+
+    name: reach, descend, close, lift, carry, lower, open, retreat, push or wait. opening: of the gripper at the end,
+    0..1. thing: index of what it is about, -1 for none.
+    """
+
+    name: str
+    place: Point
+    yaw: float
+    opening: float
+    thing: int = -1
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,18 +63,14 @@ class Grasp:
 class Motion:
     """What happened, a row a frame; metres, radians, seconds, in the frame of the table.
 
-    positions [T, B, 3], quaternions [T, B, 4] (w, x, y, z), velocities and angular_velocities [T, B, 3]: of all bodies
-    of the model. tool: [T, 4, 4], table_from_tool. state, action: [T, J + 2], joints and fingers: where they are and
-    where they are told to be. steps: name of the step of each frame.
+    tracks: of all bodies of the model. tool: [T, 4, 4], table_from_tool. state, action: [T, J + 2], joints and fingers:
+    where they are and where they are told to be. steps: name of the step of each frame.
     """
 
-    positions: Floats
-    quaternions: Floats
-    velocities: Floats
-    angular_velocities: Floats
-    tool: Floats
-    state: Floats
-    action: Floats
+    tracks: Tracks
+    tool: Doubles
+    state: Doubles
+    action: Doubles
     steps: tuple[str, ...]
     grasps: tuple[Grasp, ...]
     tasks: tuple[tuple[str, int], ...]
@@ -69,11 +81,11 @@ class Simulation:
 
     def __init__(self, model: Model, things: tuple[Placed, ...], random: np.random.Generator, speed: float) -> None:
         self._m, self._data = model, model.mujoco.MjData(model.model)
-        self._solver, self._joints = _ToolSolver(model), np.asarray(HOME)
-        self._planner = Planner(model, self._data, things, random, speed)
-        self._opening = 1.0
+        self._scratch, self._joints = model.mujoco.MjData(model.model), np.asarray(HOME)
+        self._planner = _Planner(model, self._data, things, random)
+        self._speed, self._opening = speed, 1.0
         self._watch = _Watch(model, self._data)
-        self._rows: list[dict[str, Floats]] = []
+        self._rows: list[tuple[Doubles, ...]] = []
         self._names: list[str] = []
 
     def run(self, frames: int, skipped_s: float) -> Motion:
@@ -99,32 +111,66 @@ class Simulation:
         kinds = (faults.mjWARN_BADQPOS, faults.mjWARN_BADQVEL, faults.mjWARN_BADQACC)
         if any(data.warning[int(kind)].number for kind in kinds):
             raise RenderError("the physics of this tabletop scene became unstable; leave its seed out")
-        kept = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
-        grasps, tasks = tuple(self._watch.grasps), tuple(self._watch.tasks)
-        return Motion(**kept, steps=tuple(self._names), grasps=grasps, tasks=tasks)
+        positions, quaternions, rates, tool, state, action = (np.stack(rows) for rows in zip(*self._rows, strict=True))
+        tracks = Tracks(
+            positions=positions, quaternions=quaternions, velocities=rates[..., 3:], angular_velocities=rates[..., :3]
+        )
+        return Motion(
+            tracks=tracks,
+            tool=tool,
+            state=state,
+            action=action,
+            steps=tuple(self._names),
+            grasps=tuple(self._watch.grasps),
+            tasks=tuple(self._watch.tasks),
+        )
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""
-        m = self._m
-        here = _polar(self._data.site_xpos[m.site])
-        yaw = math.atan2(*self._data.site_xmat[m.site][[3, 0]].tolist())
-        for step in self._planner.steps():
-            self._watch.begin(step)
-            goal, turn = _polar(np.asarray(step.place)), yaw + (step.yaw - yaw + math.pi) % (2 * math.pi) - math.pi
-            opening = self._opening
-            ticks = max(1, math.ceil(step.seconds / _TICK_S))
-            for tick in range(1, ticks + 1):
-                share = tick / ticks
-                share = share**3 * (10 - 15 * share + 6 * share**2)  # minimum jerk: at rest at both ends
-                self._opening = opening + share * (step.opening - opening)
-                place = _from_polar(here + share * (goal - here))
-                before = self._joints
-                self._joints = self._solver.solve(before, place, yaw + share * (turn - yaw))
-                self._command(self._joints + (self._joints - before) * (_LEAD_S / _TICK_S))
-                yield step
-            here, yaw = goal, turn
+        x, y, z = self._data.site_xpos[self._m.site].tolist()
+        place: Point = (x, y, z)
+        here, yaw = _polar(place), math.atan2(*self._data.site_xmat[self._m.site][[3, 0]].tolist())
+        while True:
+            for step in self._planner.task(place):
+                self._watch.begin(step)
+                goal, turn = _polar(step.place), yaw + (step.yaw - yaw + math.pi) % (2 * math.pi) - math.pi
+                opening = self._opening
+                ticks = max(1, math.ceil(max(0.22, math.dist(step.place, place) / self._speed) / _TICK_S))
+                for tick in range(1, ticks + 1):
+                    share = tick / ticks
+                    share = share**3 * (10 - 15 * share + 6 * share**2)  # minimum jerk: at rest at both ends
+                    self._opening = opening + share * (step.opening - opening)
+                    before = self._joints
+                    self._joints = self._solved(_from_polar(here + share * (goal - here)), yaw + share * (turn - yaw))
+                    self._command(self._joints + (self._joints - before) * (_LEAD_S / _TICK_S))
+                    yield step
+                here, yaw, place = goal, turn, step.place
 
-    def _command(self, joints: Floats) -> None:
+    def _solved(self, place: Doubles, yaw: float) -> Doubles:
+        """Joint angles [J] nearer to the tool at `place` [3], pointing down, its x axis at `yaw` radians.
+
+        Damped least squares on the arm's Jacobian, from wherever the joints were last. Source: Buss and Kim,
+        "Selectively damped least squares for inverse kinematics" (2005), section 2: the plain damped form, with the
+        pull towards the home pose in the null space.
+        """
+        m, model, data, joints = self._m, self._m.model, self._scratch, self._joints
+        limits, cos, sin = model.jnt_range[model.dof_jntid[m.rates]].T, np.cos(yaw), np.sin(yaw)
+        wanted = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])  # the tool's axes as columns
+        for _ in range(_ROUNDS):
+            data.qpos[m.joints] = joints
+            m.mujoco.mj_kinematics(model, data)
+            m.mujoco.mj_comPos(model, data)
+            full = np.zeros((6, model.nv))
+            m.mujoco.mj_jacSite(model, data, full[:3], full[3:], m.site)
+            twist = 0.5 * np.cross(data.site_xmat[m.site].reshape(3, 3), wanted, axis=0).sum(1)
+            error, jacobian = np.concatenate([place - data.site_xpos[m.site], twist]), full[:, m.rates]
+            square = jacobian @ jacobian.T + _DAMPING**2 * np.eye(6)
+            pull = _HOMING * (np.asarray(HOME) - joints)
+            move = pull + jacobian.T @ np.linalg.solve(square, error - jacobian @ pull)
+            joints = np.clip(joints + np.clip(move, -_LARGEST_TURN, _LARGEST_TURN), *limits)
+        return joints
+
+    def _command(self, joints: Doubles) -> None:
         m = self._m
         self._data.ctrl[m.controls] = joints
         self._data.ctrl[m.grips] = self._opening * OPEN_M
@@ -137,18 +183,9 @@ class Simulation:
             m.mujoco.mj_objectVelocity(m.model, data, m.mujoco.mjtObj.mjOBJ_BODY, body, rates[body], 0)
         tool = np.eye(4)
         tool[:3, :3], tool[:3, 3] = data.site_xmat[m.site].reshape(3, 3), data.site_xpos[m.site]
-        numbers = np.concatenate([m.joints, m.fingers])
-        self._rows.append(
-            {
-                "positions": data.xpos.copy(),
-                "quaternions": data.xquat.copy(),
-                "velocities": rates[:, 3:],
-                "angular_velocities": rates[:, :3],
-                "tool": tool,
-                "state": data.qpos[numbers].copy(),
-                "action": np.concatenate([self._joints, data.ctrl[m.grips]]),
-            }
-        )
+        state = data.qpos[np.concatenate([m.joints, m.fingers])].copy()
+        action = np.concatenate([self._joints, data.ctrl[m.grips]])
+        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, state, action))
         self._names.append(step.name)
 
 
@@ -187,7 +224,7 @@ class _Watch:
             self.grasps.append(Grasp(thing=self._thing, lifted=self._lifted, slip=self._slip))
         self._thing = -1
 
-    def _in_hand(self) -> Floats:
+    def _in_hand(self) -> Doubles:
         """The thing's origin in the tool's frame."""
         data, site = self._data, self._m.site
         turned = data.site_xmat[site].reshape(3, 3)
@@ -197,53 +234,119 @@ class _Watch:
         return float(self._data.xpos[self._m.things[self._thing]][2])
 
 
-def _polar(place: Floats) -> Floats:
+def _polar(place: Point) -> Doubles:
     """Azimuth, distance and height about the base: the arm's own way of moving."""
     x, y = place[0] - BASE[0], place[1] - BASE[1]
     return np.array([math.atan2(y, x), math.hypot(x, y), place[2]])
 
 
-def _from_polar(polar: Floats) -> Floats:
+def _from_polar(polar: Doubles) -> Doubles:
     azimuth, radius, height = polar
     return np.array([BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth), height])
 
 
-_ROUNDS, _DAMPING, _LARGEST_TURN, _HOMING = 2, 0.03, 0.25, 0.02
+# tasks
 
 
-class _ToolSolver:
-    """Damped least squares on the arm's Jacobian, from wherever the joints were last.
+@dataclass(frozen=True, slots=True)
+class _Planner:
+    """Chooses tasks at random and turns them into steps; reads the things' places from the running simulation."""
 
-    Source: Buss and Kim, "Selectively damped least squares for inverse kinematics" (2005), section 2: the plain damped
-    form, with the pull towards the home pose in the null space.
-    """
+    model: Model
+    data: Any
+    things: tuple[Placed, ...]
+    random: np.random.Generator
 
-    def __init__(self, model: Model) -> None:
-        self._model = model
-        self._data = model.mujoco.MjData(model.model)
-        self._home = np.asarray(HOME)
-        self._limits = model.model.jnt_range[model.model.dof_jntid[model.rates]].T
+    def task(self, here: Point) -> list[Step]:
+        """The next one's steps, from where things are by now; the arm at `here` waits where nothing can be done."""
+        order = self.random.permutation(len(self.things)).tolist()
+        if self.random.random() < 0.25:
+            pushed = next((i for i in order if self._push(i)), None)
+            if pushed is not None:
+                return self._push(pushed)
+        taken = next((i for i in order if self._can_take(i)), None)
+        return [Step("wait", here, _natural_yaw(here), 1.0)] if taken is None else self._pick_and_place(taken)
 
-    def solve(self, joints: Floats, place: Floats, yaw: float) -> Floats:
-        """Joint angles [J] nearer to the tool at `place` [3], pointing down, its x axis at `yaw` radians."""
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        wanted = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])  # the tool's axes as columns
-        for _ in range(_ROUNDS):
-            error, jacobian = self._seen_from(joints, place, wanted)
-            square = jacobian @ jacobian.T + _DAMPING**2 * np.eye(6)
-            pull = _HOMING * (self._home - joints)
-            move = pull + jacobian.T @ np.linalg.solve(square, error - jacobian @ pull)
-            joints = np.clip(joints + np.clip(move, -_LARGEST_TURN, _LARGEST_TURN), *self._limits)
-        return joints
+    def _pick_and_place(self, index: int) -> list[Step]:
+        thing = self.things[index].thing
+        (x, y, z), yaw = self._pose(index)
+        level = max(z + thing.grip_z, _LOWEST_M)
+        above, grip = max(level + _ABOVE_M, 0.16), (x, y, level)
+        natural = _natural_yaw(grip)
+        if thing.any_yaw:
+            turn = natural + float(self.random.uniform(-0.4, 0.4))
+        else:  # fingers across the thing's y axis, with the least turn of the wrist
+            turn = natural + (yaw - natural + math.pi / 2) % math.pi - math.pi / 2
+        lifted = level + float(self.random.uniform(0.10, 0.17))
+        to_x, to_y = self._free_spot(index)
+        carried, down = (to_x, to_y, lifted), (to_x, to_y, level + 0.003)
+        turned = _natural_yaw(carried) + (turn - natural) * float(self.random.uniform(0, 1))
+        opening = min(1.0, (thing.size[1] / 2 + 0.018) / OPEN_M)
+        return [
+            Step("reach", (x, y, above), turn, opening, index),
+            Step("descend", grip, turn, opening, index),
+            Step("close", grip, turn, 0.0, index),
+            Step("lift", (x, y, lifted), turn, 0.0, index),
+            Step("carry", carried, turned, 0.0, index),
+            Step("lower", down, turned, 0.0, index),
+            Step("open", down, turned, opening, index),
+            Step("retreat", (to_x, to_y, above), turned, opening, index),
+        ]
 
-    def _seen_from(self, joints: Floats, place: Floats, wanted: Floats) -> tuple[Floats, Floats]:
-        """What is missing in place and turn [6], and the Jacobian [6, J]."""
-        m, model, data = self._model, self._model.model, self._data
-        data.qpos[m.joints] = joints
-        m.mujoco.mj_kinematics(model, data)
-        m.mujoco.mj_comPos(model, data)
-        jacobian = np.zeros((6, model.nv))
-        m.mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], m.site)
-        turned = data.site_xmat[m.site].reshape(3, 3)
-        twist = 0.5 * np.cross(turned, wanted, axis=0).sum(1)
-        return np.concatenate([place - data.site_xpos[m.site], twist]), jacobian[:, m.rates]
+    def _push(self, index: int) -> list[Step]:
+        """A thing is pushed with closed fingers, sideways to the arm, if there is room; no steps else."""
+        (x, y, z), _ = self._pose(index)
+        radius, low = self.things[index].thing.radius_m, max(_LOWEST_M, min(z, 0.05))
+        for turn in self.random.permutation([0.5 * math.pi, -0.5 * math.pi, 0.25 * math.pi, -0.25 * math.pi]).tolist():
+            yaw = math.atan2(y - BASE[1], x - BASE[0]) + turn
+            ahead = np.array([math.cos(yaw), math.sin(yaw)])
+            before, after = np.array([x, y]) - (radius + 0.035) * ahead, np.array([x, y]) + (0.10 - radius) * ahead
+            inside = is_reachable(*before) and is_reachable(*after)
+            free = self._clearance(before, index) > 0.06 and self._clearance(after + radius * ahead, index) > 0.03
+            if inside and free:
+                (x, y), (to_x, to_y) = before.tolist(), after.tolist()
+                return [
+                    Step("reach", (x, y, low + 0.13), yaw, 0.1, index),
+                    Step("descend", (x, y, low), yaw, 0.1, index),
+                    Step("push", (to_x, to_y, low), yaw, 0.1, index),
+                    Step("retreat", (to_x, to_y, low + 0.13), yaw, 0.1, index),
+                ]
+        return []
+
+    def _can_take(self, index: int) -> bool:
+        (x, y, z), _ = self._pose(index)
+        thing = self.things[index].thing
+        upright = self.data.xmat[self.model.things[index]][8] > 0.98
+        stands = upright and abs(z - thing.size[2] / 2) < 0.01
+        return stands and is_reachable(x, y) and self._clearance(np.array([x, y]), index) > 0.06
+
+    def _free_spot(self, index: int) -> tuple[float, float]:
+        """A spot near by with room for the thing and the hand; where it is, if a few tries find none."""
+        (x, y, _), _ = self._pose(index)
+        apart = max(FINGER_ROOM_M, self.things[index].thing.radius_m + 0.03)
+        for spot in [reachable_spot(self.random) for _ in range(40)]:
+            way = math.hypot(spot[0] - x, spot[1] - y)
+            if 0.12 < way < 0.45 and self._clearance(np.array(spot), index) > apart:
+                return spot
+        return x, y
+
+    def _clearance(self, spot: Doubles, but: int) -> float:
+        """Distance from a point of the table to the nearest other loose thing's circle, metres."""
+        gaps = [
+            math.hypot(*(spot - np.array(self._pose(i)[0][:2]))) - self.things[i].thing.radius_m
+            for i in range(len(self.things))
+            if i != but
+        ]
+        return min(gaps, default=1.0)
+
+    def _pose(self, index: int) -> tuple[Point, float]:
+        """Place and yaw of a thing now."""
+        body = self.model.things[index]
+        x, y, z = self.data.xpos[body].tolist()
+        turned = self.data.xmat[body].reshape(3, 3)
+        return (x, y, z), math.atan2(turned[1, 0], turned[0, 0])
+
+
+def _natural_yaw(place: Point) -> float:
+    """The tool's yaw when the wrist is not turned: its x axis points back to the base."""
+    return math.atan2(place[1] - BASE[1], place[0] - BASE[0]) + math.pi

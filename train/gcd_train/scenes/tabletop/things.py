@@ -1,4 +1,4 @@
-"""What a tabletop scene is made of: classes, things of parts, and the loose ones that the gripper can take or push.
+"""What stands and lies on the table: the table itself, clutter, and loose things that the gripper can take or push.
 
 Everything here is in metres; `Part` is used as in every world, but a capsule's third size is that of its cylinder
 alone, as MuJoCo has it.
@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from gcd_train.scenes.description import Colour, Part, Pattern, Point, Quaternion
+from gcd_train.scenes.description import Colour, Paint, Part, Pattern, Point, Quaternion, Thing, pick, shaded
 
 _Random = np.random.Generator
 
@@ -30,20 +30,13 @@ class TabletopClass(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Thing:
-    """Something made of parts, in its own frame.
+class TableThing(Thing):
+    """A thing, a link of the arm or a piece of clutter; the origin is the middle of all but links.
 
-    size, middle: of the bounding box along its own axes, metres; `middle` is the origin but for links of the arm.
     grip_z: where on its own z axis fingers hold it, across its y axis. any_yaw: it may be grasped from any side.
     rolls: it is stopped from rolling for ever.
     """
 
-    name: str
-    parts: tuple[Part, ...]
-    size: Point
-    mass_kg: float
-    friction: float
-    middle: Point = (0.0, 0.0, 0.0)
     grip_z: float = 0.0
     any_yaw: bool = False
     rolls: bool = False
@@ -58,7 +51,7 @@ class Thing:
 class Placed:
     """A thing and where it stands: origin x, y, z in metres and its turn about the vertical, radians."""
 
-    thing: Thing
+    thing: TableThing
     place: Point
     yaw: float
 
@@ -73,49 +66,113 @@ class Setting:
     things: tuple[Placed, ...]
 
 
-def solid(
-    label: TabletopClass,
-    shape: str,
-    size: Point,
-    centre: Point = (0.0, 0.0, 0.0),
-    *,
-    colour: Colour,
-    gloss: float = 0.1,
-) -> Part:
-    """A part of one plain colour."""
-    return Part(shape=shape, centre=centre, size=size, colour=colour, gloss=gloss, grain_m=0.05, label=label)
+def plain(colour: Colour, gloss: float = 0.1) -> Paint:
+    """One colour without a pattern."""
+    return Paint(colour, grain_m=0.05, gloss=gloss)
 
 
-def shaped(paint: Part, shape: str, size: Point, centre: Point = (0.0, 0.0, 0.0)) -> Part:
-    """Another part that is painted as `paint` is."""
-    return replace(paint, shape=shape, size=size, centre=centre)
+# table and clutter
 
+TABLE_M = (0.66, 0.72)
+"""Half length along x and half width along y of the table top; its surface is at z = 0."""
+FLOOR_M = -0.76
+WOODS: tuple[Colour, ...] = ((0.62, 0.43, 0.26), (0.78, 0.62, 0.42), (0.45, 0.29, 0.18), (0.83, 0.74, 0.60))
+FLATS: tuple[Colour, ...] = ((0.86, 0.86, 0.84), (0.36, 0.38, 0.40), (0.55, 0.62, 0.60), (0.24, 0.30, 0.36))
+_CLUTTER_SPOTS = ((0.45, 0.5), (0.48, 0.0), (0.45, -0.5), (-0.05, 0.58), (-0.05, -0.58), (-0.5, 0.52))
+"""Along the edges of the table, out of the arm's way."""
+
+
+def random_table(random: _Random) -> tuple[Part, ...]:
+    """A table with four legs, or a closed bench; origin in the middle of its surface."""
+    wooden = random.random() < 0.6
+    colour = pick(random, WOODS if wooden else FLATS)
+    dark, pattern = shaded(colour, 0.7), Pattern.PLANKS if wooden else Pattern.PLAIN
+    paint = Paint(colour, dark, pattern, float(random.uniform(0.09, 0.2)), float(random.uniform(0.05, 0.3)))
+    (x, y), half = TABLE_M, (-FLOOR_M - 0.04) / 2
+    top = Part("box", (0.0, 0.0, -0.02), (2 * x, 2 * y, 0.04), paint, TabletopClass.TABLE)
+    if random.random() < 0.4:
+        size = (2 * (x - 0.05), 2 * (y - 0.05), 2 * half)
+        return top, Part("box", (0.0, 0.0, -0.04 - half), size, plain(dark), TabletopClass.TABLE)
+    at = [(a, b, -0.04 - half) for a in (0.07 - x, x - 0.07) for b in (0.07 - y, y - 0.07)]
+    return top, *(Part("box", foot, (0.06, 0.06, 2 * half), plain(dark), TabletopClass.TABLE) for foot in at)
+
+
+def random_clutter(random: _Random) -> tuple[Placed, ...]:
+    """Two to five large things."""
+    made: list[Placed] = []
+    for index in random.choice(len(_CLUTTER_SPOTS), int(random.integers(2, 6)), replace=False):
+        thing = _clutter_thing(random)
+        x, y = _CLUTTER_SPOTS[int(index)]
+        place = (x + float(random.uniform(-0.03, 0.03)), y + float(random.uniform(-0.03, 0.03)), thing.size[2] / 2)
+        made.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-0.4, 0.4))))
+    return tuple(made)
+
+
+def _clutter_thing(random: _Random) -> TableThing:
+    kind = int(random.integers(4))
+    red, green, blue = (float(random.uniform(0.15, most)) for most in (0.9, 0.85, 0.85))
+    colour = (red, green, blue)
+    if kind == 1:
+        return _books(random)
+    if kind == 2:
+        across, high = 2 * float(random.uniform(0.04, 0.07)), 2 * float(random.uniform(0.05, 0.11))
+        body = _clutter("cylinder", (across, across, high), plain(colour, 0.5))
+        lid_size, lid_at = (across * 1.04, across * 1.04, 0.012), (0, 0, high / 2 - 0.006)
+        return _still("tin", (body, _clutter("cylinder", lid_size, plain((0.75, 0.76, 0.78)), lid_at)), body.size)
+    bounds = ((0.07, 0.10), (0.08, 0.13), (0.03, 0.06)) if kind == 0 else ((0.05, 0.09), (0.06, 0.11), (0.04, 0.12))
+    x, y, z = (2 * float(random.uniform(low, high)) for low, high in bounds)
+    if kind == 0:  # an open crate: a floor and four walls
+        plates: tuple[tuple[Point, Point], ...] = (
+            ((x, y, 0.008), (0, 0, 0.004 - z / 2)),
+            ((0.008, y, z), (0.004 - x / 2, 0, 0)),
+            ((0.008, y, z), (x / 2 - 0.004, 0, 0)),
+            ((x, 0.008, z), (0, 0.004 - y / 2, 0)),
+            ((x, 0.008, z), (0, y / 2 - 0.004, 0)),
+        )
+        return _still("bin", tuple(_clutter("box", size, plain(colour, 0.3), at) for size, at in plates), (x, y, z))
+    tape = _clutter("box", (x + 0.002, 0.03, z + 0.002), plain((0.85, 0.78, 0.62), 0.3))
+    return _still("box", (_clutter("box", (x, y, z), plain((0.72, 0.56, 0.38))), tape), (x, y, z))
+
+
+def _books(random: _Random) -> TableThing:
+    """A pile of books, each turned a little by its size."""
+    thick = random.uniform(0.010, 0.022, int(random.integers(2, 5)))
+    low = -float(thick.sum())
+    books: list[Part] = []
+    for half in thick.tolist():
+        size = (2 * float(random.uniform(0.06, 0.085)), 2 * float(random.uniform(0.09, 0.12)), 2 * half)
+        colour = (float(random.uniform(0.1, 0.8)), float(random.uniform(0.1, 0.6)), float(random.uniform(0.1, 0.7)))
+        shift = (float(random.uniform(-0.01, 0.01)), float(random.uniform(-0.01, 0.01)), low + half)
+        books.append(_clutter("box", size, plain(colour, 0.15), shift))
+        low += 2 * half
+    return _still("books", tuple(books), (0.19, 0.26, 2 * float(thick.sum())))
+
+
+def _clutter(shape: str, size: Point, paint: Paint, centre: Point = (0, 0, 0)) -> Part:
+    return Part(shape, centre, size, paint, TabletopClass.CLUTTER)
+
+
+def _still(name: str, parts: tuple[Part, ...], size: Point) -> TableThing:
+    return TableThing(name=f"clutter/{name}", parts=parts, size=size, mass_kg=1.0, friction=0.8, dynamic=False)
+
+
+# loose things
 
 _COLOURS: tuple[Colour, ...] = (
-    (0.80, 0.16, 0.14),
-    (0.92, 0.55, 0.12),
-    (0.95, 0.80, 0.20),
-    (0.22, 0.58, 0.27),
-    (0.13, 0.45, 0.62),
-    (0.20, 0.26, 0.60),
-    (0.52, 0.24, 0.55),
-    (0.90, 0.88, 0.84),
-    (0.24, 0.24, 0.26),
-    (0.86, 0.46, 0.52),
-    (0.45, 0.70, 0.70),
-    (0.62, 0.44, 0.28),
-)
+    (0.80, 0.16, 0.14), (0.92, 0.55, 0.12), (0.95, 0.80, 0.20), (0.22, 0.58, 0.27),
+    (0.13, 0.45, 0.62), (0.20, 0.26, 0.60), (0.52, 0.24, 0.55), (0.90, 0.88, 0.84),
+    (0.24, 0.24, 0.26), (0.86, 0.46, 0.52), (0.45, 0.70, 0.70), (0.62, 0.44, 0.28),
+)  # fmt: skip
 _PATTERNS = (Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.CHECKER, Pattern.DOTS, Pattern.CLOUDY, Pattern.WOOD)
 
 
-def _paints(random: _Random) -> tuple[Part, Part]:
-    """Two paints of one thing, to be given to `shaped`: a patterned one, and its second colour alone."""
+def _paints(random: _Random) -> tuple[Paint, Paint]:
+    """Two paints of one thing: a patterned one, and its second colour alone."""
     first, second = random.choice(len(_COLOURS), 2, replace=False)
     colour, accent = _tinted(_COLOURS[int(first)], random), _tinted(_COLOURS[int(second)], random)
-    pattern = _PATTERNS[int(random.integers(len(_PATTERNS)))]
+    pattern = pick(random, _PATTERNS)
     grain_m, gloss = float(random.uniform(0.02, 0.06)), float(random.uniform(0.0, 0.5))
-    plain = solid(TabletopClass.OBJECT, "box", (1.0, 1.0, 1.0), colour=accent, gloss=gloss)
-    return replace(plain, colour=colour, accent=accent, pattern=pattern, grain_m=grain_m), plain
+    return Paint(colour, accent, pattern, grain_m, gloss), plain(accent, gloss)
 
 
 def _tinted(colour: Colour, random: _Random) -> Colour:
@@ -123,89 +180,97 @@ def _tinted(colour: Colour, random: _Random) -> Colour:
     return red, green, blue
 
 
-def random_thing(random: _Random, widest: float) -> Thing:
+def random_thing(random: _Random, widest: float) -> TableThing:
     """A thing a gripper that opens a little more than `widest` metres can hold."""
-    return _MAKERS[int(random.integers(len(_MAKERS)))](random, widest)
+    return pick(random, _MAKERS)(random, widest)
 
 
-def _block(random: _Random, widest: float) -> Thing:
+def _block(random: _Random, widest: float) -> TableThing:
     """A block or a carton, at most `widest` across its y axis."""
     wide, deep = float(random.uniform(0.035, widest)), float(random.uniform(0.04, 0.12))
     size = (deep, wide, float(random.uniform(0.04, 0.15)))
-    paint, _ = _paints(random)
+    body = _part("box", size, _paints(random)[0])
     name = "block" if size[2] < 0.08 else "carton"
-    return _loose(name, (shaped(paint, "box", size),), size, deep * wide * size[2], random, grip_z=_below_top(size[2]))
+    return _loose(random, name, (body,), size, deep * wide * size[2], grip_z=_below_top(size[2]))
 
 
-def _can(random: _Random, widest: float) -> Thing:
+def _can(random: _Random, widest: float) -> TableThing:
     radius, high = float(random.uniform(0.022, widest / 2)), float(random.uniform(0.05, 0.13))
-    paint, plain = _paints(random)
-    body = _cylinder(paint, radius, high - 0.006, -0.003)
-    return _round("can", (body, _cylinder(plain, radius * 0.94, 0.008, high / 2 - 0.004)), radius, high, random)
+    paint, lid = _paints(random)
+    parts = (_cylinder(paint, radius, high - 0.006, -0.003), _cylinder(lid, radius * 0.94, 0.008, high / 2 - 0.004))
+    return _round(random, "can", parts, radius, high)
 
 
-def _bottle(random: _Random, widest: float) -> Thing:
+def _bottle(random: _Random, widest: float) -> TableThing:
     radius, high = float(random.uniform(0.022, min(widest / 2, 0.034))), float(random.uniform(0.13, 0.155))
-    paint, plain = _paints(random)
-    body = _cylinder(paint, radius, 0.62 * high, -0.19 * high)
-    shoulder = _sphere(paint, radius * 0.985, 0.12 * high)
-    neck = _cylinder(plain, radius * 0.4, 0.38 * high, 0.31 * high)
-    bottle = _round("bottle", (body, shoulder, neck), radius, high, random)
-    return replace(bottle, grip_z=0.12 * high - 0.010)
+    paint, cap = _paints(random)
+    parts = (
+        _cylinder(paint, radius, 0.62 * high, -0.19 * high),
+        _sphere(paint, radius * 0.985, 0.12 * high),
+        _cylinder(cap, radius * 0.4, 0.38 * high, 0.31 * high),
+    )
+    return replace(_round(random, "bottle", parts, radius, high), grip_z=0.12 * high - 0.010)
 
 
-def _mug(random: _Random, widest: float) -> Thing:
+def _mug(random: _Random, widest: float) -> TableThing:
     """The handle points along x, so that the fingers come from the sides."""
     radius, high = float(random.uniform(0.42 * widest, widest / 2)), float(random.uniform(0.07, 0.10))
-    (paint, plain), reach = _paints(random), 0.026
+    (paint, inside), reach = _paints(random), 0.026
     x = radius + reach / 2
-    handle = (
-        shaped(paint, "box", (reach, 0.01, 0.012), (x, 0, 0.25 * high)),
-        shaped(paint, "box", (reach, 0.01, 0.012), (x, 0, -0.25 * high)),
-        shaped(paint, "box", (0.01, 0.012, 2 * (0.25 * high + 0.006)), (radius + reach, 0, 0)),
+    parts = (
+        _cylinder(paint, radius, high),
+        _cylinder(inside, radius * 0.85, 0.004, high / 2),
+        _part("box", (reach, 0.01, 0.012), paint, (x, 0, 0.25 * high)),
+        _part("box", (reach, 0.01, 0.012), paint, (x, 0, -0.25 * high)),
+        _part("box", (0.01, 0.012, 2 * (0.25 * high + 0.006)), paint, (radius + reach, 0, 0)),
     )
-    parts = (_cylinder(paint, radius, high), _cylinder(plain, radius * 0.85, 0.004, high / 2), *handle)
-    mug = _round("mug", parts, radius, high, random)
+    mug = _round(random, "mug", parts, radius, high)
     return replace(mug, size=(2 * (radius + reach), 2 * radius, high), any_yaw=False)
 
 
-def _ball(random: _Random, widest: float) -> Thing:
+def _ball(random: _Random, widest: float) -> TableThing:
     radius = float(random.uniform(0.025, widest / 2))
     ball = _sphere(_paints(random)[0], radius)
-    return _loose("ball", (ball,), ball.size, 4 * radius**3, random, any_yaw=True, rolls=True)
+    return _loose(random, "ball", (ball,), ball.size, 4 * radius**3, any_yaw=True, rolls=True)
 
 
-def _bar(random: _Random, widest: float) -> Thing:
+def _bar(random: _Random, widest: float) -> TableThing:
     """A thick stick that lies along x: a sausage, a marker, a roll."""
     radius, half = float(random.uniform(0.018, min(widest / 2, 0.03))), float(random.uniform(0.03, 0.07))
     lying: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
-    stick = replace(shaped(_paints(random)[0], "capsule", (2 * radius, 2 * radius, 2 * half)), turn=lying)
+    stick = replace(_part("capsule", (2 * radius, 2 * radius, 2 * half), _paints(random)[0]), turn=lying)
     size = (2 * (half + radius), 2 * radius, 2 * radius)
-    return _loose("bar", (stick,), size, 6 * half * radius**2, random, rolls=True)
+    return _loose(random, "bar", (stick,), size, 6 * half * radius**2, rolls=True)
 
 
-def _bridge(random: _Random, widest: float) -> Thing:
+def _bridge(random: _Random, widest: float) -> TableThing:
     """A toy of three blocks: two feet and a beam."""
     wide, long, high = float(random.uniform(0.03, min(widest, 0.05))), float(random.uniform(0.09, 0.13)), 0.075
-    paint, plain = _paints(random)
-    beam = shaped(paint, "box", (long, wide, 0.028), (0, 0, high / 2 - 0.014))
-    feet = [
-        shaped(plain, "box", (0.03, wide, 2 * (high / 2 - 0.014)), (x, 0, -0.014))
-        for x in (0.015 - long / 2, long / 2 - 0.015)
-    ]
+    paint, other = _paints(random)
+    foot = (0.03, wide, 2 * (high / 2 - 0.014))
+    parts = (
+        _part("box", (long, wide, 0.028), paint, (0, 0, high / 2 - 0.014)),
+        *(_part("box", foot, other, (x, 0, -0.014)) for x in (0.015 - long / 2, long / 2 - 0.015)),
+    )
     size = (long, wide, high)
-    return _loose("bridge", (beam, *feet), size, long * wide * 0.05, random, grip_z=high / 2 - 0.018)
+    return _loose(random, "bridge", parts, size, long * wide * 0.05, grip_z=high / 2 - 0.018)
 
 
-_MAKERS: tuple[Callable[[_Random, float], Thing], ...] = (_block, _block, _can, _bottle, _mug, _ball, _bar, _bridge)
+_MAKERS: tuple[Callable[[_Random, float], TableThing], ...] = (
+    *(_block, _block, _can, _bottle, _mug, _ball, _bar, _bridge),
+)
 
 
-def _cylinder(paint: Part, radius: float, high: float, z: float = 0.0) -> Part:
-    return shaped(paint, "cylinder", (2 * radius, 2 * radius, high), (0, 0, z))
+def _part(shape: str, size: Point, paint: Paint, centre: Point = (0.0, 0.0, 0.0)) -> Part:
+    return Part(shape, centre, size, paint, TabletopClass.OBJECT)
 
 
-def _sphere(paint: Part, radius: float, z: float = 0.0) -> Part:
-    return shaped(paint, "sphere", (2 * radius, 2 * radius, 2 * radius), (0, 0, z))
+def _cylinder(paint: Paint, radius: float, high: float, z: float = 0.0) -> Part:
+    return _part("cylinder", (2 * radius, 2 * radius, high), paint, (0, 0, z))
+
+
+def _sphere(paint: Paint, radius: float, z: float = 0.0) -> Part:
+    return _part("sphere", (2 * radius, 2 * radius, 2 * radius), paint, (0, 0, z))
 
 
 def _below_top(high: float) -> float:
@@ -213,24 +278,24 @@ def _below_top(high: float) -> float:
     return max(0.0, high / 2 - 0.035)
 
 
-def _round(name: str, parts: tuple[Part, ...], radius: float, high: float, random: _Random) -> Thing:
+def _round(random: _Random, name: str, parts: tuple[Part, ...], radius: float, high: float) -> TableThing:
     size, volume = (2 * radius, 2 * radius, high), math.pi * radius**2 * high
-    return _loose(name, parts, size, volume, random, grip_z=_below_top(high), any_yaw=True)
+    return _loose(random, name, parts, size, volume, grip_z=_below_top(high), any_yaw=True)
 
 
 def _loose(
+    random: _Random,
     name: str,
     parts: tuple[Part, ...],
     size: Point,
     volume: float,
-    random: _Random,
     *,
     grip_z: float = 0.0,
     any_yaw: bool = False,
     rolls: bool = False,
-) -> Thing:
+) -> TableThing:
     """A thing with a density between balsa and water. volume: m3, roughly."""
-    return Thing(
+    return TableThing(
         name=name,
         parts=parts,
         size=size,
