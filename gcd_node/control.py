@@ -254,6 +254,6 @@ class FloodGuard:
             since_s, count = now_s, 0
         is_flood = count == _MOST_BAD_PER_S
         self._bad[peer] = (now_s if is_flood else since_s, count + 1)
-        if len(self._bad) > _MOST_PEERS:
-            self._bad.popitem(last=False)
+        if len(self._bad) > _MOST_PEERS:  # who is ignored is forgotten last
+            del self._bad[min(self._bad, key=lambda each: self.ignores(each, now_s))]
         return is_flood

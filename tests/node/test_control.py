@@ -143,6 +143,7 @@ def test_f16_the_guard_counts_each_peer_by_itself_and_only_the_last_second() -> 
     guard = FloodGuard(5.0)
     assert not any(guard.bad(b"slow", 0.06 * i) for i in range(200))
     assert [guard.bad(b"fast", 0.01 * i) for i in range(21)] == [False] * 20 + [True]
+    assert not any(guard.bad(b"%d" % i, 0.3) for i in range(300))
     assert guard.ignores(b"fast", 5.1)
     assert not guard.ignores(b"slow", 5.1)
     assert not guard.ignores(b"fast", 5.21)

@@ -233,12 +233,13 @@ def test_a_recording_stops_before_the_room_is_gone_that_it_must_leave(tmp_path: 
         folder = tmp_path / code
         folder.mkdir()
         (folder / "older.mcap").write_bytes(bytes(600_000))
+        (folder / "vanished.mcap").symlink_to("nowhere")
         config = recorder_config(folder, record=f"max_total_mb = {most_mb}", keep_free_mb=keep_free_mb)
         _, box = recorded(config, FakeSource(14))
         (done,) = (fields for topic, fields in box.notes if topic == "event" and fields["code"] == "REC_STOPPED")
         assert (done["reason"], done["file"], done["level"]) == (code, None, 1)
         assert (done["finished"], done["written"]) == (False, 0)  # it never began
-        assert [each.name for each in folder.iterdir()] == ["older.mcap"]
+        assert {each.name for each in folder.iterdir()} == {"older.mcap", "vanished.mcap"}
         assert box.of("win")
 
 

@@ -29,7 +29,7 @@ from gcd_node.errors import (
 from gcd_node.frame import Frame
 from gcd_node.inference import WindowReport
 from gcd_node.replay.lockstep import digest_of, lockstep_config, replay
-from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, open_run, pixel_digest
+from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, new_folder, open_run, pixel_digest
 from gcd_node.stream_context import config_digest
 
 pytestmark = pytest.mark.timeout(60)
@@ -198,10 +198,12 @@ def test_a_replay_that_fails_leaves_nothing(
 def test_a_full_disk_ends_a_replay_with_what_could_not_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, _: bytes) -> None:
+    def full(path: Path, _: Path) -> None:
         raise OSError(28, "No space left on device", path)
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(FileNotFoundError), new_folder(tmp_path / "run"):
+        (tmp_path / "drive.mp4").read_bytes()  # an input is no output
+    monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OutputError, match="No space left"):
         made_run(tmp_path / "run")
     assert list(tmp_path.iterdir()) == []

@@ -80,6 +80,16 @@ def test_an_update_makes_a_run_anew_byte_for_byte_or_in_place_of_a_damaged_one_a
     run_test(project, "--gcd-update").stdout.fnmatch_lines(["*OutputError*no empty folder*"])
     mine.unlink()
     run_test(project, "--gcd-update").assert_outcomes(passed=1)
+    inner = project.makepyfile(
+        inner="""
+        def test_drive(gcd_replay):
+            run = gcd_replay("launch.toml")
+            (run.folder / "away").symlink_to("nowhere")
+            run.assert_same_as("golden/other")
+    """
+    )
+    result = project.runpytest_inprocess("-p", "gcd_node.testing", "--gcd-update", inner)
+    result.stdout.fnmatch_lines(["*OutputError*No such file*"])
     first = {path.name: path.read_bytes() for path in mine.parent.rglob("*.*")}
     run_test(project, "--gcd-update")
     assert {path.name: path.read_bytes() for path in mine.parent.rglob("*.*")} == first
