@@ -24,7 +24,6 @@ from gcd_node.session import open_session
 from gcd_node.sources import SourceConfig
 
 CAMERA = 'kind = "v4l2"'
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 _LOOK_MS, _SILENT_LOOKS = 50, 6
 """How long a reader waits for more, and how often in vain once the node is done: once, after a last word."""
 

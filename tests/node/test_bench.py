@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tiny_weights import write_tiny
+from fakes import write_tiny
 
 from gcd_node.cli.bench import Arrival, view_figures
 from gcd_node.cli.main import run_app

@@ -116,9 +116,7 @@ def test_the_last_window_is_not_forgotten_at_the_end() -> None:
 
 def test_a_fault_in_the_source_is_not_swallowed() -> None:
     slot = WindowSlot()
-    source = FakeSource(0)
-    source.fails = ZeroDivisionError("bug")
-    read(source, builder(), slot)
+    read(FakeSource(0, fails=ZeroDivisionError("bug")), builder(), slot)
     with pytest.raises(ReaderError) as caught:
         slot.take()
     assert isinstance(caught.value.__cause__, ZeroDivisionError)

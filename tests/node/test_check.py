@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes import write_tiny
 from media import write_video
-from tiny_weights import write_tiny
 
 from gcd_node.check import check_launch
 from gcd_node.cli.main import run_app

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fakes import FakeSynthesizer, live_traits
+from fakes import HEIGHT, WIDTH, FakeSynthesizer, live_traits, write_tiny
 from media import environment, noise
-from tiny_weights import HEIGHT, WIDTH, write_tiny
 from typer.main import get_command
 
 from gcd_model import ASSUMED_SOURCE, CameraMount, SphericalDelta

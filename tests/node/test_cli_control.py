@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from control_fakes import FakeNode
+from fakes import FakeNode
 
 from gcd_client.endpoints import fingerprint, read_key_pair
 from gcd_node.auth import load_server_security

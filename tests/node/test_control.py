@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zmq
 from cameras import until
-from control_fakes import FakeNode
+from fakes import FakeNode
 
 from gcd_client.control import ControlClient, Reply, decode_reply
 from gcd_client.protocol import PROTO

@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fakes import Box, FakeSource, FakeSynthesizer, traits
-from rig import LOCKSTEP, Rig
+from fakes import LOCKSTEP, Box, FakeSource, FakeSynthesizer, traits
+from rig import Rig
 
 from gcd_model import DeviceMemoryError, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
 from gcd_node.config import ModelSection

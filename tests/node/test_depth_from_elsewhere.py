@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, live_traits, made_node, traits
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, live_traits, run, traits
 from media import noise
 from msgspec.structs import replace as struct_replace
 
@@ -33,29 +33,18 @@ def video(tmp_path: Path) -> Path:
     return tmp_path / "v.mkv"
 
 
-def numbered_depth(frames: int = 30) -> np.ndarray:
-    """Metres: the number of the frame, plus a hundredth of the column."""
-    return (np.arange(1, frames + 1)[:, None, None] + np.zeros((HEIGHT, 1)) + np.arange(2 * WIDTH) / 100).astype(
-        np.float32
-    )
-
-
 def read(path: Path, **request: Any) -> Clip:
     return read_clip(path, ClipRequest(**request), LIVE)
 
 
-def as_folder(folder: Path, depth: np.ndarray) -> Path:
-    folder.mkdir()
-    for i, each in enumerate(depth):
-        cv2.imwrite(str(folder / f"{i}.png"), np.rint(each * 1000).astype(np.uint16))
-    return folder
-
-
 def test_depth_takes_the_way_of_its_pictures_from_a_file_as_from_a_folder(video: Path, tmp_path: Path) -> None:
-    np.save(tmp_path / "d.npy", numbered_depth())
-    folder = as_folder(tmp_path / "d", numbered_depth())
-    wanted = numbered_depth()[1 : 1 + 2 * FRAMES : 2, :, WIDTH // 2 : 3 * WIDTH // 2]
-    for path in (tmp_path / "d.npy", folder):
+    depth = np.arange(1, 31)[:, None, None] + np.zeros((HEIGHT, 1)) + np.arange(2 * WIDTH) / 100  # metres
+    np.save(tmp_path / "d.npy", depth.astype(np.float32))
+    (tmp_path / "d").mkdir()
+    for i, each in enumerate(depth):
+        cv2.imwrite(str(tmp_path / "d" / f"{i}.png"), np.rint(each * 1000).astype(np.uint16))
+    wanted = depth[1 : 1 + 2 * FRAMES : 2, :, WIDTH // 2 : 3 * WIDTH // 2]
+    for path in (tmp_path / "d.npy", tmp_path / "d"):
         clip = read(video, depth=path, start=1, stride=2)
         assert clip.depth is not None
         assert np.allclose(clip.depth.numpy(), wanted, atol=6e-4)
@@ -154,34 +143,32 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> set[int]:
     return failing
 
 
-def run(model: FakeSynthesizer, more: str, frames: int = 28) -> Box:
-    box = Box()
-    made_node(fake_config(more), model, FakeSource(frames, fps=10.0), box).run()
-    return box
+def played(model: FakeSynthesizer, *changes: str, frames: int = 28) -> Box:
+    return run(fake_config(*changes), model, FakeSource(frames, fps=10.0))
 
 
-def statuses(box: Box) -> list[dict[str, Any]]:
-    return [dict(fields) for topic, fields in box.notes if topic == "status"]
+def reasons(box: Box) -> list[str]:
+    """In the last status."""
+    return box.told("status")[-1]["reasons"]
 
 
 def test_a_network_beside_the_model_gives_every_frame_its_depth(bad: set[int]) -> None:
     model = FakeSynthesizer(LIVE)
     bad |= {0, 3}  # and frame 0 is 0 m everywhere: all holes
-    box = run(model, 'depth_model = "net.onnx"')
+    box = played(model, "model.depth_model=net.onnx")
     depths = [None if clip.depth is None else int(clip.depth.unique().item()) for clip in model.clips]
     assert depths == [None, 1, 2, None, *range(4, 28)]
-    assert [message.header.window_id for message in box.of("win")] == [0, 1]
-    events = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "DEPTH_BAD"]
-    assert [event["message"] for event in events] == ["no depth today"]
-    assert statuses(box)[-1]["model"]["bad_depths"] == 2
-    assert "DEPTH_BAD" not in statuses(box)[-1]["reasons"]  # the second window had none
+    assert box.ids() == [0, 1]
+    assert [event["message"] for event in box.events("DEPTH_BAD")] == ["no depth today"]
+    assert box.told("status")[-1]["model"]["bad_depths"] == 2
+    assert "DEPTH_BAD" not in reasons(box)  # the second window had none
 
 
 def test_windows_without_the_right_depth_are_dropped_where_that_is_asked_for(bad: set[int]) -> None:
     bad.add(5)
-    box = run(FakeSynthesizer(LIVE), 'depth_model = "net.onnx"\non_bad_depth = "stop"', frames=42)
-    assert [message.header.window_id for message in box.of("win")] == [1, 2]
-    assert statuses(box)[-1]["drops"]["model"] == 1
+    box = played(FakeSynthesizer(LIVE), "model.depth_model=net.onnx", "model.on_bad_depth=stop", frames=42)
+    assert box.ids() == [1, 2]
+    assert box.told("status")[-1]["drops"]["model"] == 1
 
 
 class Measuring(FakeSource):
@@ -203,8 +190,8 @@ def test_what_a_source_measures_reaches_the_live_model_frame_by_frame() -> None:
     holes, far, torn = np.zeros((HEIGHT, 2 * WIDTH), np.float32), np.eye(4), np.full((4, 4), np.nan)
     far[0, 3] = 100.0
     streaming = replace(LIVE, config=struct_replace(LIVE.config, frames=1))
-    model, box = FakeSynthesizer(streaming), Box()
-    made_node(fake_config(), model, Measuring(14, {3: holes}, {5: far, 9: torn}), box).run()
+    model = FakeSynthesizer(streaming)
+    box = run(fake_config(), model, Measuring(14, {3: holes}, {5: far, 9: torn}))
     assert [n for n, clip in enumerate(model.clips) if clip.depth is None] == [3]
     assert [n for n, clip in enumerate(model.clips) if clip.odometry is None] == [5, 6, 9]  # there and back
     depth, pose = model.clips[-1].depth, model.clips[-1].odometry
@@ -212,21 +199,17 @@ def test_what_a_source_measures_reaches_the_live_model_frame_by_frame() -> None:
     assert pose is not None
     assert np.array_equal(depth[0, 0].numpy(), np.arange(WIDTH / 2, 3 * WIDTH / 2))  # cut as its picture
     assert pose[0, 2, 3].item() == pytest.approx(1.3)
-    codes = [fields["code"] for topic, fields in box.notes if topic == "event"]
-    assert (codes.count("DEPTH_BAD"), codes.count("ODOMETRY_BAD")) == (1, 2)
+    assert [len(box.events(code)) for code in ("DEPTH_BAD", "ODOMETRY_BAD")] == [1, 2]
     assert len(box.of("win")) == 14
-
-
-def test_other_models_are_given_neither() -> None:
-    model = FakeSynthesizer(traits())
-    made_node(fake_config(), model, Measuring(28, {}, {}), Box()).run()
+    model = FakeSynthesizer(traits())  # others are given neither
+    run(fake_config(), model, Measuring(28, {}, {}))
     assert {(clip.depth, clip.odometry) for clip in model.clips} == {(None, None)}
 
 
 @pytest.mark.parametrize(("made", "kind"), [(traits(), "metric"), (LIVE, "metric"), (LIVE, "inverse")])
 def test_a_node_refuses_depth_that_it_cannot_use(made: Traits, kind: str) -> None:
     with pytest.raises(ConfigError):
-        run(FakeSynthesizer(made), f'depth_model = "missing.onnx"\ndepth_kind = "{kind}"')
+        played(FakeSynthesizer(made), "model.depth_model=missing.onnx", f"model.depth_kind={kind}")
 
 
 class Telling(FakeSynthesizer):
@@ -246,30 +229,25 @@ class Telling(FakeSynthesizer):
 def test_a_source_of_another_world_is_flagged_as_long_as_it_lasts() -> None:
     assert LIVE.ood_threshold is not None
     above, below = LIVE.ood_threshold + 0.2, LIVE.ood_threshold - 0.2
-    box = run(Telling({"ood": below}, {"ood": above}), "")
+    box = played(Telling({"ood": below}, {"ood": above}))
     headers = [message.header for message in box.of("win")]
     assert [header.quality.ood_score for header in headers] == [below, above]
     assert ["world" in header.quality.ood for header in headers] == [False, True]
-    status = statuses(box)[-1]
-    assert "world" in status["reasons"]
-    assert [fields["code"] for topic, fields in box.notes if topic == "event"].count("world") == 1
-    assert status["model"]["ood_score"] == round(above, 3)
-    again = statuses(run(Telling({"ood": above}, {"ood": below}), ""))[-1]
-    assert "world" not in again["reasons"]
+    assert "world" in reasons(box)
+    assert len(box.events("world")) == 1
+    assert box.told("status")[-1]["model"]["ood_score"] == round(above, 3)
+    assert "world" not in reasons(played(Telling({"ood": above}, {"ood": below})))
+    box = played(FakeSynthesizer(traits()))  # which cannot tell
+    header = box.of("win")[0].header
+    assert set(to_json(header)["quality"]) == {"nan_frames", "ood", "steps", "seed"}
+    assert "world" not in header.quality.ood
+    assert "ood_score" not in box.told("status")[-1]["model"]
 
 
 def test_a_motion_that_is_lost_is_told_when_it_begins_and_over_with_the_next_window() -> None:
     lost, known = {"lost": ("the odometry jumps by 100 m", "too few points")}, {"lost": ()}
-    box = run(Telling(lost, lost, known), "", frames=42)
-    events = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "MOTION_LOST"]
-    assert [(event["message"], event["frames"]) for event in events] == [("the odometry jumps by 100 m", 2)]
-    assert "MOTION_LOST" not in statuses(box)[-1]["reasons"]
-    assert "MOTION_LOST" in statuses(run(Telling(known, lost), ""))[-1]["reasons"]
-
-
-def test_a_model_that_cannot_tell_says_nothing_of_it() -> None:
-    box = run(FakeSynthesizer(traits()), "")
-    header = box.of("win")[0].header
-    assert set(to_json(header)["quality"]) == {"nan_frames", "ood", "steps", "seed"}
-    assert "world" not in header.quality.ood
-    assert "ood_score" not in statuses(box)[-1]["model"]
+    box = played(Telling(lost, lost, known), frames=42)
+    events = [(event["message"], event["frames"]) for event in box.events("MOTION_LOST")]
+    assert events == [("the odometry jumps by 100 m", 2)]
+    assert "MOTION_LOST" not in reasons(box)
+    assert "MOTION_LOST" in reasons(played(Telling(known, lost)))

@@ -1,23 +1,20 @@
 """Frames are encoded while their window fills, and once for all windows that hold them: exactly, and not in vain."""
 
 import functools
-import queue
 import random
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from dataclasses import replace as changed
 
 import numpy as np
 import pytest
 import torch
 from cameras import until
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, made_node, traits
+from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, run, traits
 from media import frames_at
 
 from gcd_model import Augmentation, CameraMount, Clip, RenderOptions, SourceFeatures, load_synthesizer
-from gcd_node.config import NodeConfig, parse_config
+from gcd_node.config import NodeConfig
 from gcd_node.encoded_frames import EncodedFrames
 from gcd_node.frame import Frame
 from gcd_node.stream_context import StreamContext, prepare_stream
@@ -34,7 +31,6 @@ class Encoder(FakeSynthesizer):
     ) -> None:
         super().__init__(traits(), act)
         self.encoded: list[int] = []
-        self.seeds: list[int] = []
         self._before = before
 
     def encode(
@@ -48,75 +44,15 @@ class Encoder(FakeSynthesizer):
         if self._before is not None:
             self._before(seq)
         self.encoded.append(seq)
-        self.seeds.append(augmentation.seed)
         noise = torch.randn(clip.video.shape, generator=torch.Generator().manual_seed(augmentation.seed))
         return changed(features, latents=clip.video + (augmentation.strength or 0.0) * noise)
 
 
-class Fed(FakeSource):
-    """Gives frames when a test says so. wanted: which frame is asked for; everything was done with those before."""
-
-    def __init__(self) -> None:
-        super().__init__(10_000)
-        self.wanted = -1
-        self._allowed: queue.SimpleQueue[bool] = queue.SimpleQueue()
-
-    def feed(self, count: int) -> None:
-        for _ in range(count):
-            self._allowed.put(True)
-
-    def end(self) -> None:
-        self._allowed.put(False)
-
-    def frames(self) -> Iterator[Frame]:
-        for frame in super().frames():
-            self.wanted = frame.seq
-            if not self._allowed.get():
-                return
-            yield frame
-
-
-def config(more: str = "", *, stride: int = T, pace: str = "lockstep") -> NodeConfig:
-    text = f"""
-        {more}
-        [source]
-        kind = "synthetic"
-        pace = "{pace}"
-        [window]
-        stride = {stride}
-        [model]
-        weights = "fake"
-        cond_aug = 0.1
-        [view.main]
-    """
-    return parse_config(text.encode(), "test")
+def config(stride: int = T, *more: str) -> NodeConfig:
+    return fake_config(f"window.stride={stride}", "model.cond_aug=0.1", *more)
 
 
 CONTEXT = prepare_stream(config(), traits(), FakeSource(1).info)
-
-
-@dataclass
-class Life:
-    """A node whose source and model a test controls, in a thread of its own."""
-
-    settings: NodeConfig
-    model: Encoder
-    source: Fed = field(default_factory=Fed)
-    box: Box = field(default_factory=Box)
-
-    def __enter__(self) -> "Life":
-        self._thread = threading.Thread(target=made_node(self.settings, self.model, self.source, self.box).run)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.source.end()
-        self._thread.join(60)
-        assert not self._thread.is_alive(), "the node did not end"
-
-    @property
-    def windows(self) -> dict[int, bytes]:
-        return pixels(self.box)
 
 
 def pixels(box: Box) -> dict[int, bytes]:
@@ -160,9 +96,7 @@ def test_windows_that_overlap_agree_to_the_last_bit_on_the_frames_they_share() -
 @functools.cache
 def undisturbed(stride: int) -> dict[int, bytes]:
     """The windows of 40 frames that were all there at once."""
-    box = Box()
-    made_node(config(stride=stride), Encoder(), FakeSource(40), box).run()
-    return pixels(box)
+    return pixels(run(config(stride), Encoder(), FakeSource(40)))
 
 
 @pytest.mark.parametrize(("stride", "pace"), [(5, "lockstep"), (T, "realtime"), (17, "lockstep")])
@@ -174,10 +108,8 @@ def test_views_are_the_same_to_the_last_bit_whatever_the_timing(stride: int, pac
     def dawdle(_: object) -> None:
         time.sleep(chance.choice([0.0, 0.0, 0.001, 0.02]))
 
-    model, source, box = Encoder(dawdle, dawdle), FakeSource(40), Box()
-    source.period_s = 0.004
-    made_node(config(stride=stride, pace=pace), model, source, box).run()
-    found = pixels(box)
+    settings, source = config(stride, f"source.pace={pace}"), FakeSource(40, period_s=0.004)
+    found = pixels(run(settings, Encoder(dawdle, dawdle), source))
     assert found == (wanted if pace == "lockstep" else {number: wanted[number] for number in found})
     assert max(found) == max(wanted)
 
@@ -201,15 +133,18 @@ def test_it_makes_no_difference_in_what_order_frames_are_encoded(seed: int) -> N
 
 
 def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> None:
-    model, begun = Encoder(), threading.Event()
-    with Life(config(), model) as life:
-        life.source.feed(T - 1)
-        until(lambda: len(model.encoded) == T - 1)
-        assert model.asked == []
-        model._before = lambda _: begun.set()
-        life.source.feed(1)
-        until(lambda: len(life.windows) == 1)
-        assert begun.is_set()
+    class Waiting(FakeSource):
+        """Gives its last frame when all those before it are encoded."""
+
+        def frames(self) -> Iterator[Frame]:
+            for frame in super().frames():
+                if frame.seq == T - 1:
+                    until(lambda: len(model.encoded) == T - 1)
+                    assert model.asked == []
+                yield frame
+
+    model = Encoder()
+    assert run(config(), model, Waiting(T)).ids() == [0]
     assert model.encoded == list(range(T))
 
 
@@ -218,7 +153,7 @@ def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> No
 
 @pytest.mark.parametrize(
     "other",
-    [changed(CONTEXT, config=config("strict = true", stride=5)), changed(CONTEXT, mount=CameraMount(height_m=2.0))],
+    [changed(CONTEXT, config=config(5, "strict=true")), changed(CONTEXT, mount=CameraMount(height_m=2.0))],
 )
 def test_what_was_encoded_on_other_terms_is_encoded_anew(other: StreamContext) -> None:
     (window,) = placed(ten_fps(T))

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
-from fakes import Box, FakeSource, FakeSynthesizer, Steady, fake_config, made_node, traits
-from rig import LOCKSTEP, Rig, service_manager
+from fakes import LOCKSTEP, Box, FakeSource, FakeSynthesizer, Steady, fake_config, made_node, traits
+from rig import Rig, service_manager
 
 from gcd_client.control import Code
 from gcd_client.subscriber import ViewSubscriber

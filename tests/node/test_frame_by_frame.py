@@ -9,11 +9,11 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from fakes import Box, FakeSource, FakeSynthesizer, fake_config, made_node, traits
+from fakes import Box, FakeSource, FakeSynthesizer, fake_config, run, traits
 from msgspec.structs import replace as struct_replace
 
 from gcd_model import DeviceMemoryError, NonFiniteError, RenderOptions, SourceFeatures, Trajectory, View
-from gcd_node.config import ModelSection, NodeConfig
+from gcd_node.config import ModelSection
 from gcd_node.errors import ModelFailedError
 from gcd_node.frame import Frame
 from gcd_node.lifecycle import Parts
@@ -54,23 +54,27 @@ class Stepping(FakeSource):
 
 
 def test_every_frame_gives_a_view_and_a_break_of_the_source_is_a_beginning() -> None:
-    model, box = Streaming(), Box()
-    made_node(fake_config(), model, Stepping(20), box).run()
-    assert [message.header.src.seq for message in box.of("win")] == [(seq,) for seq in range(20)]
-    assert [message.header.window_id for message in box.of("win")] == list(range(20))
+    model = Streaming()
+    box = run(fake_config(), model, Stepping(20))
+    assert box.seqs() == box.ids() == list(range(20))
     assert model.resets == [0, 10]
 
 
-def test_a_frame_that_is_rendered_again_is_the_first_one_then() -> None:
+def failing_once(after: int) -> Streaming:
+    """With NaN, once it has drawn so many."""
     failing = iter([True])
 
-    def act(options: RenderOptions) -> None:
-        if len(model.asked) == 5 and next(failing, False):
+    def act(_: RenderOptions) -> None:
+        if len(model.asked) > after and next(failing, False):
             raise NonFiniteError("for once")
 
-    model, box = Streaming(act), Box()
-    made_node(fake_config(), model, FakeSource(8), box).run()
-    assert [message.header.src.seq for message in box.of("win")] == [(seq,) for seq in range(8)]
+    model = Streaming(act)
+    return model
+
+
+def test_a_frame_that_is_rendered_again_is_the_first_one_then() -> None:
+    model = failing_once(4)
+    assert run(fake_config(), model, FakeSource(8)).seqs() == list(range(8))
     assert model.resets == [0, 5]
 
 
@@ -106,15 +110,9 @@ class SideBySide(Streaming):
         return super().paint(placed, trajectories, options)
 
 
-def live_config() -> NodeConfig:
-    config = fake_config()
-    return struct_replace(config, source=struct_replace(config.source, pace="realtime"))
-
-
-def slowly(count: int) -> FakeSource:
-    source = FakeSource(count)
-    source.period_s = 0.05
-    return source
+def live(model: Streaming, frames: int = 12) -> Box:
+    """Beside a live source, 20 frames a second."""
+    return run(fake_config("source.pace=realtime"), model, FakeSource(frames, period_s=0.05))
 
 
 @pytest.fixture(autouse=True)
@@ -126,26 +124,18 @@ def cores(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> in
 
 @pytest.mark.parametrize("cores", [2, 4], indirect=True)
 def test_beside_a_live_source_three_frames_are_in_work_at_once_and_on_two_cores_two(cores: int) -> None:
-    model, box = SideBySide(min(cores, 3)), Box()
-    made_node(live_config(), model, slowly(12), box).run()
+    model = SideBySide(min(cores, 3))
+    seqs = live(model).seqs()
     assert model.met
     assert model.threads == {"see": {"model"}, "place": {"placer"}, "paint": {"painter"}}
-    seqs = [message.header.src.seq[0] for message in box.of("win")]
     assert seqs == sorted(set(seqs))
     assert seqs[-1] == 11
     assert not {"painter", "placer"} & {thread.name for thread in threading.enumerate()}
 
 
 def test_what_fails_in_the_painter_is_done_again_or_ends_the_node() -> None:
-    failing = iter([True])
-
-    def once(_: RenderOptions) -> None:
-        if len(model.asked) > 5 and next(failing, False):
-            raise NonFiniteError("for once")
-
-    model, box = Streaming(once), Box()
-    made_node(live_config(), model, slowly(12), box).run()
-    assert box.of("win")[-1].header.src.seq == (11,)
+    model = failing_once(5)
+    assert live(model).seqs()[-1] == 11
     assert len(model.resets) == 2
 
     def broken(_: RenderOptions) -> None:
@@ -154,7 +144,7 @@ def test_what_fails_in_the_painter_is_done_again_or_ends_the_node() -> None:
 
     model = Streaming(broken)
     with pytest.raises(ModelFailedError, match="broken"):
-        made_node(live_config(), model, slowly(1000), Box()).run()
+        live(model, 1000)
 
 
 class Remembering(Streaming):
@@ -198,12 +188,9 @@ class Remembering(Streaming):
 
 @pytest.mark.parametrize("error", [NonFiniteError("for once"), DeviceMemoryError("for once")])
 def test_frames_that_were_in_work_when_the_memory_began_anew_are_left_out(error: Exception) -> None:
-    model, box = Remembering(error), Box()
-    made_node(live_config(), model, slowly(12), box).run()
-    assert model.strays == []
-    seqs = [message.header.src.seq[0] for message in box.of("win")]
-    assert seqs[:4] == [0, 1, 2, 5]
-    assert seqs[-1] == 11
+    model = Remembering(error)
+    seqs = live(model).seqs()
+    assert (seqs[:4], seqs[-1], model.strays) == ([0, 1, 2, 5], 11, [])
 
 
 def test_a_model_that_is_loaded_in_half_precision_is_loaded_once_and_is_not_hung_meanwhile() -> None:
@@ -219,9 +206,8 @@ def test_a_model_that_is_loaded_in_half_precision_is_loaded_once_and_is_not_hung
     def full() -> None:
         raise DeviceMemoryError("full")
 
-    config, box, source = live_config(), Box(), slowly(30)
-    config = struct_replace(config, life=struct_replace(config.life, hang_s=0.3))
+    config, box, source = fake_config("source.pace=realtime", "life.hang_s=0.3"), Box(), FakeSource(30, period_s=0.05)
     Node(config, Parts(open_source=lambda _: source, load_model=load), box).run()
     assert loaded == [None, "bfloat16"]
-    assert [fields["code"] for topic, fields in box.notes if topic == "event"] == ["GPU_OOM", "SRC_ENDED"]
+    assert [fields["code"] for fields in box.told("event")] == ["GPU_OOM", "SRC_ENDED"]
     assert box.of("win")[-1].header.model.precision == "bfloat16"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import zmq
 from cameras import until
-from fakes import FakeSynthesizer, Steady, painting_traits, traits
-from rig import LOCKSTEP, Rig
+from fakes import LOCKSTEP, FakeSynthesizer, Steady, painting_traits, traits
+from rig import Rig
 
 from gcd_client.control import Code
 from gcd_client.protocol import EndMessage, StatusMessage, ViewMessage, decode

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_weights import write_tiny
+from fakes import write_tiny
 
 from gcd_model.errors import CheckpointError
 from gcd_model.weights.adapter import Adapter, base_digest

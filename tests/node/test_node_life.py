@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 from cameras import Bench, Camera, until
-from fakes import FakeSource, FakeSynthesizer, Steady, traits
-from rig import LOCKSTEP, Rig
+from fakes import LOCKSTEP, FakeSource, FakeSynthesizer, Steady, traits
+from rig import Rig
 
 from gcd_client.control import Code
 from gcd_model import RenderOptions, SphericalDelta

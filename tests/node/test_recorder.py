@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
-from fakes import Box, FakeSource, painting_traits
+from fakes import LOCKSTEP, Box, FakeSource, painting_traits
 from recordings import (
     LENS,
     SECOND_NS,
@@ -29,7 +29,7 @@ from recordings import (
     said,
     salvaged,
 )
-from rig import LOCKSTEP, Rig
+from rig import Rig
 from wire_messages import origin
 
 from gcd_client.control import Code

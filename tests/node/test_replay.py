@@ -188,10 +188,8 @@ def test_a_folder_in_use_is_refused_before_anything_is_loaded_and_an_empty_one_t
 def test_a_replay_that_fails_leaves_nothing(
     frames: int, fails: Exception | None, nan: tuple[int, ...], error: type[NodeError], tmp_path: Path
 ) -> None:
-    source = FakeSource(frames)
-    source.fails = fails
     with pytest.raises(error):
-        made_run(tmp_path / "run", nan_model(set(nan)), source)
+        made_run(tmp_path / "run", nan_model(set(nan)), FakeSource(frames, fails=fails))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from cameras import until
-from control_fakes import FakeNode
+from fakes import FakeNode
 from wire_messages import window
 
 from gcd_client.control import ControlClient

@@ -3,17 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from fakes import (
-    Box,
-    FakeSource,
-    FakeSynthesizer,
-    fake_classes,
-    fake_config,
-    fake_maps,
-    made_node,
-    painting_traits,
-    traits,
-)
+from fakes import Box, FakeSource, FakeSynthesizer, fake_classes, fake_config, fake_maps, painting_traits, run, traits
 
 from gcd_client.images import depth_m, images, inverse_depth
 from gcd_node.messages import ontology
@@ -22,12 +12,9 @@ pytestmark = pytest.mark.timeout(30)
 HELD = ("visibility", "inverse_depth")
 
 
-def published(*holds: str, frames: int = 28, **options: int | str) -> Box:
-    box = Box()
-    made_node(
-        fake_config(**options), FakeSynthesizer(painting_traits(), holds=holds), FakeSource(frames, fps=10.0), box
-    ).run()
-    return box
+def published(*holds: str, frames: int = 28, encoding: str = "rgb8") -> Box:
+    model = FakeSynthesizer(painting_traits(), holds=holds)
+    return run(fake_config(f"publish.encoding={encoding}"), model, FakeSource(frames, fps=10.0))
 
 
 def test_every_window_of_a_view_that_holds_them_comes_with_its_own() -> None:
@@ -45,16 +32,16 @@ def test_every_window_of_a_view_that_holds_them_comes_with_its_own() -> None:
     assert told is not None
     assert np.array_equal(images(box.of("cls")[0])[..., 0], drawn[0].numpy())
     assert told == ontology(made)
-    meta = next(fields for topic, fields in box.notes if topic == "meta")
-    assert meta["classes"] == [{"id": each.id, "name": each.name, "colour": each.colour} for each in told]
+    assert box.told("meta")[0]["classes"] == [
+        {"id": each.id, "name": each.name, "colour": each.colour} for each in told
+    ]
 
 
 @pytest.mark.parametrize("family", ["kubric90", "driving", "svd"])
 def test_a_model_without_a_class_head_publishes_no_class_map(family: str) -> None:
-    box = Box()
-    made_node(fake_config(), FakeSynthesizer(traits(family)), FakeSource(28, fps=10.0), box).run()
+    box = run(fake_config(), FakeSynthesizer(traits(family)), FakeSource(28, fps=10.0))
     assert "view/main/cls" not in {message.topic for message in (*box.views, *box.ends)}
-    assert next(fields for topic, fields in box.notes if topic == "meta")["classes"] == []
+    assert box.told("meta")[0]["classes"] == []
 
 
 def test_depth_loses_less_than_a_thousandth_from_0_3_to_200_m_and_none_stays_none() -> None:
@@ -93,9 +80,9 @@ def test_they_are_never_made_lossy() -> None:
 
 
 def test_a_kind_that_views_hold_no_longer_ends_once() -> None:
-    box, windows = Box(), iter((HELD, ("visibility",), ("visibility",)))
+    windows = iter((HELD, ("visibility",), ("visibility",)))
     model = FakeSynthesizer(traits(), lambda _: setattr(model, "holds", next(windows)))
-    made_node(fake_config(), model, FakeSource(42), box).run()
+    box = run(fake_config(), model, FakeSource(42))
     assert [message.header.window_id for message in box.of("depth")] == [0]
     ends = {message.topic: message.header.window_id for message in box.ends}
     assert ends == {"view/main/win": 2, "view/main/frm": 2, "view/main/vis": 2, "view/main/depth": 1}

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from cameras import Bench, until
-from fakes import FakeSource, FakeSynthesizer, traits
-from rig import LOCKSTEP, Rig
+from fakes import LOCKSTEP, FakeSource, FakeSynthesizer, traits
+from rig import Rig
 from torch import nn
 
 from gcd_client.control import Code

@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.skipif(not CHROMIUM.exists(), reason="needs the Debian package chromium"),
     pytest.mark.skipif(not DRIVER.exists(), reason="needs the Debian package chromium-driver"),
 ]
-PROCESS = Path(__file__).with_name("viewer_process.py")
+PROCESS = Path(__file__).with_name("node_process.py")
 LOOK_MS = 100  # of the page: TICK_MS in main.js
 
 
@@ -91,7 +91,7 @@ class Page:
 @pytest.fixture(scope="module")
 def node(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[subprocess.Popen[str]]":
     """Steered by angles, in a process of its own; may still be starting."""
-    command = [sys.executable, str(PROCESS), str(tmp_path_factory.mktemp("steered"))]
+    command = [sys.executable, str(PROCESS), str(tmp_path_factory.mktemp("steered")), "steer"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         yield process
         process.kill()
@@ -124,7 +124,7 @@ def operator_url(node: "subprocess.Popen[str]") -> Iterator[str]:
     """Of the node's page, which is served by another process."""
     assert node.stdout is not None
     assert node.stdout.readline() == "there\n", "the node did not start"
-    folder = str(node.args[-1])  # type: ignore[index]
+    folder = str(node.args[-2])  # type: ignore[index]
     endpoints = [f"--{name}=ipc://{folder}/{name}" for name in ("data", "status", "control")]
     command = [sys.executable, "-m", "gcd_node", "viewer", "--http", "127.0.0.1:0", *endpoints]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as viewer:
