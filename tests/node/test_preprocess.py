@@ -9,47 +9,27 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, traits
+from fakes import HEIGHT, WIDTH, fake_config, traits
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics, center_crop_box
-from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.frame import Image, LensModel, SourceInfo
 from gcd_node.preprocess import Fit, Rectifier, project, to_clip_tensor, widest_camera
-from gcd_node.stream_context import prepare_stream
+from gcd_node.stream_context import StreamContext, prepare_stream
 
-BARREL = LensModel(
-    width=1280,
-    height=720,
-    fx=820.0,
-    fy=818.0,
-    cx=652.3,
-    cy=349.1,
-    distortion="plumb_bob",
-    coefficients=(-0.31, 0.11, 0.0007, -0.0004, -0.018),
-)
-RATIONAL = LensModel(
-    width=1280,
-    height=800,
-    fx=800.0,
-    fy=800.0,
-    cx=640.0,
-    cy=405.0,
-    distortion="rational_polynomial",
-    coefficients=(2.1, -1.3, 0.0004, -0.0002, 0.6, 2.4, -1.0, 0.3),
-)
-FISH_EYE = LensModel(
-    width=1280,
-    height=960,
-    fx=560.0,
-    fy=560.0,
-    cx=640.0,
-    cy=480.0,
-    distortion="equidistant",
-    coefficients=(0.01, -0.004, 0.001, -0.0002),
-)
-IDEAL = LensModel(width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5)
+
+def lens_of(width: int, height: int, kind: Any = "none", *coefficients: float, **matrix: float) -> LensModel:
+    centre = {"fx": 300.0, "fy": 300.0, "cx": width / 2, "cy": height / 2}
+    return LensModel(width=width, height=height, distortion=kind, coefficients=coefficients, **centre | matrix)
+
+
+PLUMB = (-0.31, 0.11, 0.0007, -0.0004, -0.018)
+BARREL = lens_of(1280, 720, "plumb_bob", *PLUMB, fx=820.0, fy=818.0, cx=652.3, cy=349.1)
+WIDE = (2.1, -1.3, 0.0004, -0.0002, 0.6, 2.4, -1.0, 0.3)
+RATIONAL = lens_of(1280, 800, "rational_polynomial", *WIDE, fx=800.0, fy=800.0, cy=405.0)
+FISH_EYE = lens_of(1280, 960, "equidistant", 0.01, -0.004, 0.001, -0.0002, fx=560.0, fy=560.0)
+IDEAL = lens_of(1280, 720, fx=900.0, fy=900.0, cx=639.5, cy=359.5)
 ALL_LENSES = pytest.mark.parametrize("lens", [BARREL, RATIONAL, FISH_EYE, IDEAL], ids=lambda lens: lens.distortion)
 
 
@@ -142,24 +122,13 @@ def test_a_narrow_lens_gives_the_widest_view_it_fills_to_the_last_pixel(lens: Le
     assert out.min() == 255
 
 
-def test_a_polynomial_that_turns_back_beyond_the_picture_is_not_followed() -> None:
-    lens = LensModel(
-        width=640, height=480, fx=300.0, fy=300.0, cx=320.0, cy=240.0, distortion="plumb_bob",
-        coefficients=(-0.5, 0.0, 0.0, 0.0, 0.0),
-    )  # fmt: skip
-    camera = widest_camera(lens, 384, 256, 120.0)
+def test_a_polynomial_that_turns_back_is_not_followed_and_a_calibration_that_sees_nothing_refused() -> None:
+    camera = widest_camera(lens_of(640, 480, "plumb_bob", -0.5, 0.0, 0.0, 0.0, 0.0), 384, 256, 120.0)
     turning_point = math.sqrt(1 / (3 * 0.5))  # where r (1 - r^2 / 2) is largest
     corner = math.hypot(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)
     assert 0.9 * turning_point < corner < 1.02 * turning_point
-
-
-def test_a_calibration_that_sees_nothing_is_refused() -> None:
-    lens = LensModel(
-        width=640, height=480, fx=300.0, fy=300.0, cx=0.0, cy=0.0, distortion="plumb_bob",
-        coefficients=(-9e9, 0.0, 0.0, 0.0, 0.0),
-    )  # fmt: skip
     with pytest.raises(ConfigError):
-        widest_camera(lens, 384, 256, 53.0)
+        widest_camera(lens_of(640, 480, "plumb_bob", -9e9, 0.0, 0.0, 0.0, 0.0, cx=0.0, cy=0.0), 384, 256, 53.0)
 
 
 def detailed_texture(width: int, height: int) -> Image:
@@ -211,82 +180,71 @@ distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.01, 1e-05, 0, 0]}}
 """
 
 
-def config(source: str = "", top: str = "") -> NodeConfig:
-    text = f'{top}\n[model]\nweights = "x"\n[view.main]\n[source]\nkind = "synthetic"\n{source}'
-    return parse_config(text.encode(), "test")
+def camera_file(folder: Path, fx: float = 800.0) -> str:
+    (folder / "front.yaml").write_text(CALIBRATION.format(fx=fx))
+    return f"source.calibration={folder}/front.yaml"
 
 
-def camera_file(folder: Path, fx: float) -> str:
-    path = folder / "front.yaml"
-    path.write_text(CALIBRATION.format(fx=fx))
-    return f'calibration = "{path}"'
+def prepared(
+    *changes: str, width: int = 1280, height: int = 720, lens: LensModel | None = None, before: Any = None
+) -> StreamContext:
+    size = {"width": width, "height": height}
+    info = SourceInfo(kind="synthetic", id="x", fps_nominal=24.0, clock="replay", lens=lens, **size)
+    return prepare_stream(fake_config(*changes), traits(), info, before=before)
 
 
-def info(lens: LensModel | None = None, width: int = 1280, height: int = 720) -> SourceInfo:
-    return SourceInfo(kind="synthetic", id="x", width=width, height=height, fps_nominal=24.0, clock="replay", lens=lens)
+def hfov_deg(context: StreamContext) -> float:
+    assert context.intrinsics is not None
+    return context.intrinsics.hfov_deg
 
 
-def test_a_calibration_file_cuts_to_the_trained_field_of_view_and_publishes_it(tmp_path: Path) -> None:
-    run = prepare_stream(config(camera_file(tmp_path, fx=800.0)), traits(), info())
-    assert run.intrinsics is not None
-    assert run.intrinsics.hfov_deg == pytest.approx(53.13)
+def test_a_calibration_file_cuts_to_the_trained_field_of_view_and_one_too_narrow_is_flagged_or_refused(
+    tmp_path: Path,
+) -> None:
+    stated = camera_file(tmp_path)
+    run = prepared(stated)
+    assert hfov_deg(run) == pytest.approx(53.13)
     assert (run.fit.resize, run.ood) == ("remap2x_area", ())
+    with pytest.raises(ConfigError):  # they contradict each other
+        prepared(stated, "source.hfov_deg=60.0")
+    camera_file(tmp_path, fx=2400.0)
+    after = prepared(stated, width=640, height=360, before=run)  # a running node does not follow an edited file
+    assert (after.lens, after.intrinsics) == (run.lens, run.intrinsics)
+    run = prepared(stated)
+    assert (run.ood, run.fit.resize) == (("hfov",), "remap2x_area")
+    assert hfov_deg(run) < 30.0
+    with pytest.raises(ConfigError):
+        prepared(stated, "strict=true")
 
 
-def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one() -> None:
-    run = prepare_stream(config("hfov_deg = 90.0"), traits(), info())
-    assert run.intrinsics is not None
-    assert run.intrinsics.hfov_deg == pytest.approx(53.13, abs=0.05)
+def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one_where_pixels_are_left() -> None:
+    run = prepared("source.hfov_deg=90.0")
+    assert hfov_deg(run) == pytest.approx(53.13, abs=0.05)
     assert run.ood == ()
-    fit = run.fit
-    assert isinstance(fit, Fit)
-    left, top, wide, high = fit.crop_box(1280, 720)
-    assert (left, top) == ((1280 - wide) // 2, (720 - high) // 2)
-    assert (wide, high) == (640, 426)
-
-
-@pytest.mark.parametrize("allowed", [False, True])
-def test_a_cut_that_would_leave_too_few_pixels_is_not_made_unless_they_may_be_enlarged(allowed: bool) -> None:
-    stated = f"hfov_deg = 90.0\nallow_upscale = {str(allowed).lower()}"
-    run = prepare_stream(config(stated), traits(), info(width=WIDTH, height=HEIGHT))
-    assert run.ood == (() if allowed else ("hfov",))
-    assert run.intrinsics is not None
-    assert run.intrinsics.hfov_deg == pytest.approx(53.13 if allowed else 90.0, abs=1.0)
+    assert isinstance(run.fit, Fit)
+    assert run.fit.crop_box(1280, 720) == ((1280 - 640) // 2, (720 - 426) // 2, 640, 426)
+    for allowed in (False, True):
+        upscale = f"source.allow_upscale={str(allowed).lower()}"
+        run = prepared("source.hfov_deg=90.0", upscale, width=WIDTH, height=HEIGHT)
+        assert run.ood == (() if allowed else ("hfov",))
+        assert hfov_deg(run) == pytest.approx(53.13 if allowed else 90.0, abs=1.0)
 
 
 def test_a_calibration_for_another_shape_is_refused_at_the_start_and_left_out_in_mid_stream(tmp_path: Path) -> None:
-    stated = config(camera_file(tmp_path, fx=800.0))
+    stated, square = camera_file(tmp_path), {"width": 640, "height": 480}
     with pytest.raises(ConfigError):
-        prepare_stream(stated, traits(), info(width=640, height=480))
-    before = prepare_stream(stated, traits(), info())
-    run = prepare_stream(stated, traits(), info(width=640, height=480), before=before)
+        prepared(stated, **square)
+    before = prepared(stated)
+    run = prepared(stated, before=before, **square)
     assert (run.fit.resize, run.ood) == ("released", ("hfov",))
-    kept = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
+    kept = prepared(stated, width=640, height=360, before=before)
     assert (kept.fit.resize, kept.ood) == ("remap2x_area", ())
-    own = info(lens=BARREL, width=640, height=480)
-    assert prepare_stream(
-        config(), traits(), own, before=prepare_stream(config(), traits(), info(lens=BARREL))
-    ).ood == ("hfov",)
-
-
-def test_a_lens_too_narrow_for_the_model_is_flagged_and_refused_if_strict(tmp_path: Path) -> None:
-    stated = camera_file(tmp_path, fx=2400.0)
-    run = prepare_stream(config(stated), traits(), info())
-    assert run.intrinsics is not None
-    assert (run.ood, run.fit.resize) == (("hfov",), "remap2x_area")
-    assert run.intrinsics.hfov_deg < 30.0
-    with pytest.raises(ConfigError):
-        prepare_stream(config(stated, top="strict = true"), traits(), info())
-
-
-def test_a_calibration_and_a_field_of_view_contradict_each_other(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        prepare_stream(config(camera_file(tmp_path, 800.0) + "\nhfov_deg = 60.0"), traits(), info())
+    assert prepared(lens=BARREL, before=prepared(lens=BARREL), **square).ood == ("hfov",)
 
 
 def test_a_stated_rate_that_is_a_trained_one_but_for_rounding_is_not_flagged() -> None:
     for fps, flags in ((23.976, ()), (20.0, ("fps",))):
-        run = prepare_stream(config(top=f"window = {{fps = {fps}}}"), traits(), info())
+        run = prepared(f"window.fps={fps}")
         assert (run.fps, run.ood) == (fps, flags)
 
 
@@ -300,15 +258,6 @@ def test_depth_goes_where_its_picture_goes_and_nothing_between_is_made_up(lens: 
     clear = (image < 5) | (image > 250)
     assert clear.mean() > 0.2
     assert np.mean(depth[clear] == np.where(image[clear] > 128, 2.0, 7.0)) > 0.995
-
-
-def test_a_running_node_does_not_follow_a_calibration_file_that_is_edited(tmp_path: Path) -> None:
-    stated = config(camera_file(tmp_path, fx=800.0))
-    before = prepare_stream(stated, traits(), info())
-    camera_file(tmp_path, fx=2400.0)
-    after = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
-    assert after.lens == before.lens
-    assert after.intrinsics == before.intrinsics
 
 
 # Without a lens.

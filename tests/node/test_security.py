@@ -144,40 +144,23 @@ def test_a_refusal_that_cannot_be_told_holds_up_no_end(dies: bool, monkeypatch: 
     publisher.close()
 
 
-def test_keys_for_a_node_that_uses_none_are_refused_with_a_reason(node: FakeNode) -> None:
-    with node.serve(LOOPBACK) as server:
-        with pytest.raises(AuthError):
-            ask(server, keys(VIEWER), "hello")
-        assert node.codes == []
-
-
-# Where a node may be reached
-
-
-def test_an_ipc_endpoint_is_never_open_to_everybody(tmp_path: Path, node: FakeNode) -> None:
+def test_where_a_node_may_be_reached(tmp_path: Path, node: FakeNode) -> None:
     before = os.umask(0)
     try:
-        with node.serve(f"ipc://{tmp_path}/c"):
+        with node.serve(f"ipc://{tmp_path}/c"):  # never open to everybody
             assert stat.S_IMODE((tmp_path / "c").stat().st_mode) == 0o770
     finally:
         os.umask(before)
-
-
-def test_f19_with_keys_and_clients_a_wider_bind_is_allowed(node: FakeNode) -> None:
-    with node.serve("tcp://0.0.0.0:0", security=SECURITY) as server:
+    with node.serve("tcp://0.0.0.0:0", security=SECURITY) as server:  # F19: with keys and clients
         port = server.endpoint.rpartition(":")[2]
         with ControlClient(f"tcp://127.0.0.1:{port}", keys=keys(VIEWER), timeout_s=20.0) as client:
             assert client.request("hello").ok
+    with node.serve(LOOPBACK) as server, pytest.raises(AuthError):  # it uses no keys
+        ask(server, keys(VIEWER), "hello")
+    assert node.codes == []
 
 
 # Keys as files
-
-
-def test_keys_are_never_overwritten(tmp_path: Path) -> None:
-    write_key_pair(tmp_path, NODE)
-    with pytest.raises(OutputError):
-        write_key_pair(tmp_path, STRANGER)
-    assert read_key_pair(tmp_path) == NODE
 
 
 @pytest.mark.parametrize(
@@ -192,10 +175,13 @@ def test_keys_are_never_overwritten(tmp_path: Path) -> None:
     ],
     ids=range(6),  # keys are random
 )
-def test_a_damaged_key_or_a_secret_others_may_read_is_refused_and_never_shown(
+def test_a_key_is_never_overwritten_and_a_damaged_one_or_a_secret_others_may_read_refused_and_never_shown(
     tmp_path: Path, name: str, mode: int, text: str
 ) -> None:
     write_key_pair(tmp_path, NODE)
+    with pytest.raises(OutputError):
+        write_key_pair(tmp_path, STRANGER)
+    assert read_key_pair(tmp_path) == NODE
     (tmp_path / name).write_text(text)
     (tmp_path / name).chmod(mode)
     with pytest.raises(SetupError) as caught:
@@ -222,16 +208,14 @@ def listed(list_path: Path, node: FakeNode) -> AllowList:
     return AllowList(list_path, node.event)
 
 
-def test_the_list_names_clients_and_roles(tmp_path: Path, list_path: Path) -> None:
+def test_an_edited_list_counts_from_the_next_question_on(
+    listed: AllowList, list_path: Path, node: FakeNode, tmp_path: Path
+) -> None:
     write_key_pair(tmp_path / "keys", NODE)
     security = load_server_security(SecurityConfig(keys=str(tmp_path / "keys"), allow=str(list_path)))
     assert security is not None
     assert security.keys == NODE
-    assert {key: security.find_client(key) for key in CLIENTS} == CLIENTS
-    assert security.find_client(STRANGER.public) is None
-
-
-def test_an_edited_list_counts_from_the_next_question_on(listed: AllowList, list_path: Path, node: FakeNode) -> None:
+    assert {key: security.find_client(key) for key in (*CLIENTS, STRANGER.public)} == CLIENTS | {STRANGER.public: None}
     list_path.write_text(entry("hand", OPERATOR) + entry("late", STRANGER))
     assert listed.find(VIEWER.public) is None
     assert listed.find(STRANGER.public) == Client(name="late", role="viewer")

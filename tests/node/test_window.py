@@ -1,14 +1,19 @@
 """Frames become windows: the grid, its holes, restarts and the end of a stream."""
 
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
+from cameras import until
+from fakes import FakeSource, Steady
 from media import frames_at
 
+from gcd_node.errors import ReaderError
 from gcd_node.frame import Frame
 from gcd_node.stream_context import choose_fps
-from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder
+from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder, WindowSlot, read
 
 
 def run(
@@ -172,6 +177,14 @@ def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None
     assert [window.seqs for window in builder.flush()] == [(0, 1, 2, 3)]
     assert builder.flush() == []
 
+    class Hurried(FakeSource):
+        def frames(self) -> Iterator[Frame]:
+            yield from frames
+
+    slot = WindowSlot()
+    read(Hurried(4), WindowBuilder(frames=4, fps=10.0), slot)
+    assert slot.take() is not None  # the reader flushes
+
 
 @pytest.mark.parametrize(
     ("source_fps", "trained", "wanted"),
@@ -190,3 +203,101 @@ def test_the_highest_trained_rate_the_source_can_give_is_chosen(
     source_fps: float, trained: tuple[float, ...], wanted: tuple[float, bool]
 ) -> None:
     assert choose_fps(source_fps, trained) == wanted
+
+
+# The slot between reader and model thread, with real threads; numbers stand for windows where any will do.
+
+GUARD_S = 5.0
+
+
+def started(target: Callable[[], object]) -> threading.Thread:
+    thread = threading.Thread(target=target, daemon=True)
+    thread.start()
+    return thread
+
+
+def joined(thread: threading.Thread) -> None:
+    thread.join(GUARD_S)
+    assert not thread.is_alive(), "a thread hangs"
+
+
+def test_the_newest_item_wins_and_the_rest_is_counted_and_a_lossless_slot_hands_over_all_in_order() -> None:
+    slot = WindowSlot()
+    assert [slot.put(i) for i in range(5)] == [True] * 5
+    assert (slot.take(), slot.dropped) == (4, 4)
+    slot = WindowSlot(lossless=True)
+    giver = started(lambda: ([slot.put(i) for i in range(200)], slot.finish()))
+    assert list(iter(slot.take, None)) == list(range(200))
+    joined(giver)
+    assert slot.dropped == 0
+
+
+@pytest.mark.parametrize("ending", ["close", "finish"])
+def test_who_waits_to_take_or_to_give_is_let_go(ending: str) -> None:
+    empty, full = WindowSlot(), WindowSlot(lossless=True)
+    got: list[int | None] = []
+    answers: list[bool] = []
+    taker = started(lambda: got.append(empty.take()))
+    giver = started(lambda: answers.extend([full.put(1), full.put(2)]))
+    time.sleep(0.05)
+    getattr(empty, ending)()
+    full.close()
+    joined(taker)
+    joined(giver)
+    assert (got, answers) == ([None], [True, False])
+    assert full.closed
+    assert full.take() is None
+
+
+def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_more_is_shown() -> None:
+    slot, left, done, got = WindowSlot(), [2], [], []
+
+    def work() -> bool:
+        if not left[0]:
+            return False
+        left[0] -= 1
+        done.append(left[0])
+        return True
+
+    taker = started(lambda: got.append(slot.take(work)))
+    until(lambda: done == [1, 0])
+    left[0] = 1
+    slot.show(None)
+    until(lambda: done == [1, 0, 0])
+    slot.put(7)
+    joined(taker)
+    assert got == [7]
+
+
+def test_what_is_shown_while_there_is_work_under_way_is_not_lost() -> None:
+    slot, calls = WindowSlot(), []
+
+    def work() -> bool:
+        calls.append(len(calls))
+        if len(calls) == 1:
+            slot.show(None)  # from another thread, just now
+        else:
+            slot.put(7)
+        return False
+
+    assert slot.take(work) == 7
+    assert calls == [0, 1]
+
+
+def test_a_fault_in_the_source_is_not_swallowed() -> None:
+    slot = WindowSlot()
+    read(FakeSource(0, fails=ZeroDivisionError("bug")), WindowBuilder(frames=4, fps=10.0), slot)
+    with pytest.raises(ReaderError) as caught:
+        slot.take()
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
+    slot = WindowSlot()
+    source = Steady()
+    reader = started(lambda: read(source, WindowBuilder(frames=4, fps=10.0), slot))
+    time.sleep(0.05)
+    slot.close()
+    source.close()
+    joined(reader)
+    assert slot.take() is None
