@@ -1,28 +1,20 @@
 """Replays of a made-up source through a made-up model: quick, and different exactly where a test wants it."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from fakes import FakeSource, FakeSynthesizer, traits
+from fakes import FakeSource, FakeSynthesizer, fake_config, traits
 
 from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, Trajectory, View
-from gcd_node.config import NodeConfig, parse_config
 from gcd_node.lifecycle import Parts
 from gcd_node.replay.lockstep import replay
 from gcd_node.replay.run import RunFolder
 
-LAUNCH = """
-[source]
-kind = "synthetic"
-frames = 42
-[model]
-weights = "fake"
-steps = 1
-[view.main]
-"""
 WINDOWS, FRAMES = 3, 14
+SOURCE = 'kind = "synthetic"\nframes = 42'
 
 
 class LevelModel(FakeSynthesizer):
@@ -31,13 +23,12 @@ class LevelModel(FakeSynthesizer):
 
     def __init__(
         self,
-        made: Traits,
+        made: Traits | None = None,
         lower: Mapping[tuple[int, int], int] | None = None,
         classes: Mapping[int, int] | None = None,
-        act: Callable[[RenderOptions], None] | None = None,
-        holds: Sequence[str] = (),
+        **more: Any,
     ) -> None:
-        super().__init__(made, act, holds)
+        super().__init__(made or traits(), **more)
         self._lower, self._classes = lower or {}, classes or {}
 
     def render(
@@ -63,24 +54,18 @@ def nan_model(windows: set[int]) -> FakeSynthesizer:
         if next(calls) in windows:
             raise NonFiniteError("NaN in the latents")
 
-    return LevelModel(traits(), act=act)
-
-
-def launch(changes: Sequence[str] = ()) -> NodeConfig:
-    return parse_config(LAUNCH.encode(), "test", changes)
+    return LevelModel(act=act)
 
 
 def parts(model: FakeSynthesizer | None = None, source: FakeSource | None = None) -> Parts:
-    chosen = LevelModel(traits()) if model is None else model
-    return Parts(
-        open_source=lambda _: FakeSource(WINDOWS * FRAMES) if source is None else source, load_model=lambda _: chosen
-    )
+    chosen, played = model or LevelModel(), source or FakeSource(WINDOWS * FRAMES)
+    return Parts(open_source=lambda _: played, load_model=lambda _: chosen)
 
 
 def made_run(
     folder: Path, model: FakeSynthesizer | None = None, source: FakeSource | None = None, changes: Sequence[str] = ()
 ) -> RunFolder:
-    return replay(launch(changes), folder, parts=parts(model, source))
+    return replay(fake_config("model.steps=1", *changes, source=SOURCE), folder, parts=parts(model, source))
 
 
 def copied(run: RunFolder, folder: Path) -> Path:

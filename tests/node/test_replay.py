@@ -1,6 +1,7 @@
 """Replays: what a run holds, that it comes out the same again, and that half a run is never taken for one."""
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 import zmq
-from fakes import HEIGHT, WIDTH, FakeSource, fake_maps, painting_traits, traits
+from fakes import HEIGHT, WIDTH, FakeSource, fake_config, fake_maps, painting_traits, traits
 from media import ramp, write_video
-from runs import FRAMES, WINDOWS, LevelModel, copied, launch, made_run, nan_model, parts
+from runs import FRAMES, SOURCE, WINDOWS, LevelModel, copied, made_run, nan_model, parts
 
 from gcd_node.cli.main import run_app
-from gcd_node.config import NodeConfig, parse_config
+from gcd_node.config import NodeConfig
 from gcd_node.encoded_frames import window_seed
 from gcd_node.errors import (
     ConfigError,
@@ -28,6 +29,7 @@ from gcd_node.errors import (
 )
 from gcd_node.frame import Frame
 from gcd_node.inference import WindowReport
+from gcd_node.replay.compare import compare
 from gcd_node.replay.lockstep import digest_of, lockstep_config, replay
 from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, new_folder, open_run, pixel_digest
 from gcd_node.stream_context import config_digest
@@ -63,7 +65,7 @@ def test_what_is_on_disk_is_what_the_model_drew_to_the_bit(run: RunFolder, tmp_p
         assert pixel_digest(drawn) == window.views["main"]["win"] == window.input_sha256
         columns = (np.arange(FRAMES)[:, None] + np.arange(WIDTH)) % len(painting_traits().classes)
         assert np.array_equal(view["cls"], np.repeat(columns[:, None], HEIGHT, axis=1))
-    live = made_run(tmp_path / "run", LevelModel(traits(), holds=("visibility", "inverse_depth")))
+    live = made_run(tmp_path / "run", LevelModel(holds=("visibility", "inverse_depth")))
     maps, drawn_maps = live.read_view(live.manifest.windows[0], "main"), fake_maps()
     assert set(maps) == {"win", "vis", "depth"}
     assert np.array_equal(maps["vis"], drawn_maps["visibility"].numpy())
@@ -85,26 +87,23 @@ def test_a_manifest_tells_the_whole_story(run: RunFolder) -> None:
 
 
 def test_seeds_are_those_of_the_live_node_and_of_the_launch_file_in_the_manifest(run: RunFolder) -> None:
-    live = launch(["source.pace=realtime", "publish.encoding=jpeg", "life.idle_s=5", "control.endpoint=ipc"])
+    live = fake_config("model.steps=1", "source.pace=realtime", "publish.encoding=jpeg", source=SOURCE)
     assert config_digest(lockstep_config(live), traits()) == config_digest(live, traits())
     again = msgspec.convert(run.manifest.config, NodeConfig)
-    assert again == lockstep_config(launch())
+    assert again == lockstep_config(fake_config("model.steps=1", source=SOURCE))
     assert config_digest(again, painting_traits()) == run.manifest.cfg_digest
 
 
 def test_a_recording_is_named_by_the_digest_of_its_bytes_a_folder_by_names_and_contents(tmp_path: Path) -> None:
     video = write_video(tmp_path / "v.mkv", ramp(14, WIDTH, HEIGHT), 24.0)
-    settings = parse_config(f'[source]\npath = "{video}"\n[model]\nweights="fake"\n[view.main]'.encode(), "test")
-    made = replay(settings, tmp_path / "run", parts=parts(source=FakeSource(14)))
+    made = replay(fake_config(source=f'path = "{video}"'), tmp_path / "run", parts=parts(source=FakeSource(14)))
     assert made.manifest.made_from["source sha256"] == hashlib.sha256(video.read_bytes()).hexdigest()
     place, digests = tmp_path / "in", set[str]()
     place.mkdir()
-    (place / "b").write_bytes(b"2")
-    digests.add(digest_of(place))
-    (place / "b").write_bytes(b"3")
-    digests.add(digest_of(place))
-    (place / "b").rename(place / "c")
-    digests.add(digest_of(place))
+    for name, content in (("b", b"2"), ("b", b"3"), ("c", b"3")):
+        (place / "b").unlink(missing_ok=True)
+        (place / name).write_bytes(content)
+        digests.add(digest_of(place))
     assert len(digests) == 3
     with pytest.raises(SourceError):
         digest_of(tmp_path / "nowhere")
@@ -145,7 +144,8 @@ def test_a_replay_opens_no_socket_and_holds_a_gpu_to_repeatable_convolutions(
     monkeypatch.setattr(zmq.Context, "socket", refuse)
     monkeypatch.setattr(torch.backends.cudnn, "benchmark", True)
     seen: list[tuple[bool, bool]] = []
-    replay(launch(["control.endpoint=ipc", "publish.min_subscribers=3"]), tmp_path / "run", look, parts())
+    settings = fake_config("control.endpoint=ipc", "publish.min_subscribers=3", source=SOURCE)
+    replay(settings, tmp_path / "run", look, parts())
     assert seen == [(True, False)] * WINDOWS
     assert (torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark) == (False, True)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -159,9 +159,9 @@ def test_a_live_camera_is_refused_and_what_never_ends_is_played_once_or_refused(
     assert run_app(["replay", str(tmp_path / "l.toml"), "--out", str(tmp_path / "run")]) == 78
     assert "secret" not in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-    assert not lockstep_config(parse_config(f'[source]\npath = "x.mkv"\nloop = true{rest}', "test")).source.loop
+    assert not lockstep_config(fake_config(source='path = "x.mkv"\nloop = true')).source.loop
     with pytest.raises(ConfigError):
-        lockstep_config(parse_config(f'[source]\nkind = "synthetic"{rest}', "test"))
+        lockstep_config(fake_config())
 
 
 def test_a_folder_in_use_is_refused_before_anything_is_loaded_and_an_empty_one_taken(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_folder_in_use_is_refused_before_anything_is_loaded_and_an_empty_one_t
     opened: list[object] = []
     for out in (tmp_path, tmp_path / "file", tmp_path / "file" / "run"):
         with pytest.raises(OutputError):
-            replay(launch(), out, opened.append, parts())
+            replay(fake_config(source=SOURCE), out, opened.append, parts())
     assert opened == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "kept.txt"]
     (tmp_path / "run").mkdir()
@@ -250,3 +250,20 @@ def test_a_manifest_that_is_none_is_damage_and_says_where(
     (tmp_path / MANIFEST).write_bytes(text.replace(old, new, 1))
     with pytest.raises(DamagedRunError, match=reason):
         open_run(tmp_path)
+
+
+def test_what_a_strange_run_states_takes_neither_time_nor_memory(run: RunFolder, tmp_path: Path) -> None:
+    strange = copied(run, tmp_path / "run")
+    manifest = (strange / MANIFEST).read_text()
+    (strange / MANIFEST).write_text(manifest.replace('"config": {', '"config": {"model": ' + '{"a":' * 20_000, 1))
+    with pytest.raises(DamagedRunError):
+        open_run(strange)
+    with (strange / MANIFEST).open("r+b") as file:
+        file.truncate(2**30)  # a sparse file
+    with pytest.raises(DamagedRunError):
+        open_run(strange)
+    (strange / MANIFEST).write_text(manifest)
+    (strange / "main" / "000000.win.png").unlink()
+    os.mkfifo(strange / "main" / "000000.win.png")
+    with pytest.raises(DamagedRunError):
+        compare(run, open_run(strange))

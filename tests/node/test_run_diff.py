@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from fakes import FakeSource, painting_traits, traits
+from fakes import FakeSource, painting_traits
 from runs import FRAMES, LevelModel, copied, made_run, nan_model
 
 from gcd_model import View
@@ -29,7 +29,7 @@ def golden(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def lowered(folder: Path, lower: Mapping[tuple[int, int], int]) -> RunFolder:
-    return made_run(folder, LevelModel(traits(), lower))
+    return made_run(folder, LevelModel(lower=lower))
 
 
 def classed(folder: Path, columns: Mapping[int, int]) -> RunFolder:
@@ -64,6 +64,9 @@ def test_one_bad_frame_is_not_hidden_by_thirteen_good_ones(golden: RunFolder, tm
 
 
 def test_class_pixels_have_a_bound_of_their_own(tmp_path: Path) -> None:
+    for bounds in ({"min_psnr_db": 0.0}, {"min_psnr_db": math.nan}, {"max_class_share": 1.5}):
+        with pytest.raises(UsageError):
+            Tolerance(**bounds)
     (view,) = compare(classed(tmp_path / "a", {}), classed(tmp_path / "b", {1: 48})).differences
     share = 48 / 96 / FRAMES  # half of the columns, in one frame
     assert view.shares == {"class map": pytest.approx(share)}
@@ -77,7 +80,7 @@ class MovedMaps(LevelModel):
     """Its inverse depth is so many times the usual one, and `columns` of its visibility are painted instead."""
 
     def __init__(self, factor: float, columns: int) -> None:
-        super().__init__(traits(), holds=("visibility", "inverse_depth"))
+        super().__init__(holds=("visibility", "inverse_depth"))
         self._factor, self._columns = factor, columns
 
     def render(self, *asked: Any) -> list[View]:
@@ -115,38 +118,17 @@ def test_a_window_that_only_one_run_has_fails_and_shifts_none_of_the_others(gold
     assert set(holed.facts) == {"total windows", "total nan_windows", "trouble MODEL_NAN in window 1"}
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("stamps_ns", tuple(range(9, FRAMES + 9))),
-        ("seqs", tuple(range(1, FRAMES + 1))),
-        ("epoch", 4),
-        ("ood", ("fps",)),
-    ],
-)
-def test_other_moments_and_flags_fail_even_if_the_pixels_agree(
-    field: str, value: object, golden: RunFolder, tmp_path: Path
-) -> None:
+def test_other_moments_flags_and_sizes_fail_even_if_the_pixels_agree(golden: RunFolder, tmp_path: Path) -> None:
     first, *others = golden.manifest.windows
-    changed = msgspec.structs.replace(first, **{field: value})
-    (view,) = compare(golden, restated(golden, tmp_path / "run", windows=(changed, *others))).failures(LOOSE)
-    assert view.facts == (field,)
-
-
-def test_pictures_of_another_size_cannot_be_near(golden: RunFolder, tmp_path: Path) -> None:
     black = np.zeros((FRAMES, 16, 24, 3), np.uint8)
-    first, *others = golden.manifest.windows
-    changed = msgspec.structs.replace(first, views={"main": {"win": pixel_digest(black)}})
-    resized = restated(golden, tmp_path / "run", windows=(changed, *others))
-    keep_pixels(resized.path, "main", 0, "win", black)
-    (view,) = compare(golden, resized).failures(LOOSE)
-    assert view.facts == ("size",)
-
-
-@pytest.mark.parametrize("bounds", [{"min_psnr_db": 0.0}, {"min_psnr_db": math.nan}, {"max_class_share": 1.5}])
-def test_bounds_that_make_no_sense_are_refused(bounds: dict[str, float]) -> None:
-    with pytest.raises(UsageError):
-        Tolerance(**bounds)
+    changes = {"stamps_ns": tuple(range(9, FRAMES + 9)), "seqs": tuple(range(1, FRAMES + 1)), "epoch": 4}
+    for field, value in (changes | {"ood": ("fps",), "views": {"main": {"win": pixel_digest(black)}}}).items():
+        changed = msgspec.structs.replace(first, **{field: value})
+        other = restated(golden, tmp_path / field, windows=(changed, *others))
+        if field == "views":
+            keep_pixels(other.path, "main", 0, "win", black)
+        (view,) = compare(golden, other).failures(LOOSE)
+        assert view.facts == ("size" if field == "views" else field,)
 
 
 # What is said.
@@ -180,7 +162,7 @@ def test_the_first_divergence_says_whether_input_and_seed_were_the_same(golden: 
     assert same.startswith("first divergence: window 2, view main: ")
     assert same.endswith("the model was given the same pictures")
     assert "other pictures already" in told(made_run(tmp_path / "input", source=Brighter(42)))
-    seed = made_run(tmp_path / "seed", LevelModel(traits(), {(0, 0): 1}), changes=["model.cond_aug=0.01"])
+    seed = made_run(tmp_path / "seed", LevelModel(lower={(0, 0): 1}), changes=["model.cond_aug=0.01"])
     assert "same pictures and another seed" in told(seed)
 
 

@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from runs import LAUNCH, parts
+from runs import SOURCE, parts
 
 import gcd_node.testing  # noqa: F401  loaded before the inner sessions, which put sys.modules back
 from gcd_node.replay import compare, lockstep  # noqa: F401  the same
@@ -25,7 +25,8 @@ def project(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytes
     whole = lockstep.replay
     monkeypatch.setattr(lockstep, "replay", lambda config, out: whole(config, out, parts=parts()))
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # other plugins would be loaded anew in each session
-    pytester.makefile(".toml", launch=LAUNCH)
+    launch = f'[source]\n{SOURCE}\n[model]\nweights = "fake"\nsteps = 1\n[view.main]\n'
+    pytester.makefile(".toml", launch=launch)
     pytester.makeini("[pytest]\n")
     return pytester
 
