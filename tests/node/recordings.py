@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fakes import Box, FakeSource, FakeSynthesizer, made_node, traits
+from fakes import LOCKSTEP, Box, FakeSource, FakeSynthesizer, fake_config, made_node, run, traits
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_ros2.decoder import DecoderFactory
 from zstandard import ZstdError
 
 from gcd_model import Traits
-from gcd_node.config import NodeConfig, parse_config
+from gcd_node.config import NodeConfig
 from gcd_node.frame import Frame, FrameSource, LensModel
 from gcd_node.node import Node
 from gcd_node.sources import open_source
@@ -60,18 +60,10 @@ class Said:
         return json.loads(self.value.data)
 
 
-def recorder_config(
-    folder: Path,
-    *,
-    record: str = "",
-    source: str = 'kind = "synthetic"\npace = "lockstep"',
-    more: str = "",
-    keep_free_mb: float = 0.0,
-) -> NodeConfig:
-    """more: of [model]."""
-    where = f'folder = "{folder}"\nkeep_free_mb = {keep_free_mb}\nautostart = true\n'
-    text = f'[source]\n{source}\n[model]\nweights = "fake"\n{more}\n[view.main]\n[record]\n{where}{record}'
-    return parse_config(text.encode(), "test")
+def recorder_config(folder: Path, *changes: str, source: str = LOCKSTEP, keep_free_mb: float = 0.0) -> NodeConfig:
+    """changes: KEY=VALUE."""
+    where = (f"record.folder={folder}", f"record.keep_free_mb={keep_free_mb}", "record.autostart=true")
+    return fake_config(*where, *changes, source=source)
 
 
 def recorded(
@@ -84,15 +76,12 @@ def recorded(
     return node, box
 
 
-def replayed(path: Path, made: Traits | None = None, *, source: str = "") -> tuple[FrameSource, Box]:
-    """What a node makes of a recording. source: of [source]."""
-    text = (
-        f'[source]\nkind = "mcap"\npath = "{path}"\npace = "lockstep"\n{source}\n[model]\nweights = "fake"\n[view.main]'
-    )
-    config, box = parse_config(text.encode(), "test"), Box()
+def replayed(path: Path, made: Traits | None = None, topic: str = "") -> tuple[FrameSource, Box]:
+    """What a node makes of a recording."""
+    named = f'topic = "{topic}"' if topic else ""
+    config = fake_config(source=f'kind = "mcap"\npath = "{path}"\npace = "lockstep"\n{named}')
     opened = open_source(config.source)
-    made_node(config, FakeSynthesizer(made or traits()), opened, box).run()
-    return opened, box
+    return opened, run(config, FakeSynthesizer(made or traits()), opened)
 
 
 def files(folder: Path) -> list[Path]:
@@ -120,14 +109,12 @@ def summary(path: Path) -> Any:
         return make_reader(file).get_summary()
 
 
-def metadata(path: Path) -> dict[str, dict[str, str]]:
+def extras(path: Path) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
+    """Its metadata and attachments, by name."""
     with path.open("rb") as file:
-        return {each.name: each.metadata for each in make_reader(file).iter_metadata()}
-
-
-def attachments(path: Path) -> dict[str, bytes]:
-    with path.open("rb") as file:
-        return {each.name: each.data for each in make_reader(file).iter_attachments()}
+        reader = make_reader(file)
+        metadata = {each.name: each.metadata for each in reader.iter_metadata()}
+        return metadata, {each.name: each.data for each in reader.iter_attachments()}
 
 
 def salvaged(path: Path, topic: str) -> list[int]:

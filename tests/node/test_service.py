@@ -1,5 +1,6 @@
 """What the process tells its machine: systemd over a real notify socket, and log lines that break nothing."""
 
+import gc
 import io
 import itertools
 import json
@@ -12,10 +13,24 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
+import torch
+from fakes import write_tiny
 from rig import service_manager
 
+from gcd_model.errors import CheckpointError
+from gcd_model.weights.adapter import Adapter, base_digest
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import load_weights
+from gcd_model.weights.save import write_adapter
+from gcd_node.cli.main import run_app
+from gcd_node.cli.run import apply_scheduling
+from gcd_node.config import LifeConfig, ModelSection, NodeConfig, parse_config
+from gcd_node.errors import ConfigError
 from gcd_node.service import JsonLines, ServiceManager
+from gcd_node.session import load_model, model_threads
+from gcd_node.stream_context import config_digest
 
 
 @pytest.mark.parametrize("is_abstract", [False, True])
@@ -137,3 +152,123 @@ import os; os._exit(0)
     finally:
         stuck.kill()
         stuck.communicate()
+
+
+# How `gcd-node run` behaves beside others on its machine, and how the process ends.
+
+
+def test_a_network_takes_half_the_cores_or_so_many_threads_as_is_stated_and_opencv_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for cores, threads in ((1, 1), (2, 1), (8, 4)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+        assert model_threads(ModelSection(weights="fake")) == threads
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    wanted = max(before) + 1
+    try:
+        load_model(ModelSection(weights="random:driving", device="cpu", threads=wanted))
+        assert (torch.get_num_threads(), cv2.getNumThreads()) == (wanted, wanted)
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
+
+
+def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    nice: list[int] = []
+    monkeypatch.setattr(os, "nice", nice.append)
+    before = sys.getswitchinterval()
+    try:
+        apply_scheduling(LifeConfig(nice=7))
+        assert nice == [7]
+        assert sys.getswitchinterval() == pytest.approx(0.001)
+        assert gc.get_freeze_count() > 0
+    finally:
+        sys.setswitchinterval(before)
+        gc.unfreeze()
+
+
+def test_a_thread_that_hangs_changes_neither_the_exit_code_nor_what_was_said() -> None:
+    code = """
+import sys, threading, time
+from gcd_node.cli.main import main
+threading.Thread(target=time.sleep, args=(3600,), daemon=True).start()
+sys.argv = ["gcd-node", "ctl", "state", "--endpoint", "ipc:///nowhere/at/all", "--timeout", "0.1"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 69
+    assert done.stderr.startswith("error: ipc:///nowhere/at/all did not answer state")
+
+
+def test_f23_a_node_that_has_not_even_begun_ends_with_0() -> None:
+    code = """
+import sys, time
+from gcd_node.cli import main
+sys.argv = ["gcd-node", "-v", "run", "launch.toml"]
+main.run_app = lambda _: (print("importing torch", flush=True), [time.sleep(0.01) for _ in range(360_000)])
+main.main()
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as node:
+        assert node.stdout is not None
+        assert node.stdout.readline() == "importing torch\n"
+        node.terminate()
+        assert node.wait(60) == 0
+
+
+# Adapters beside their weights, exports and engines: what is taken, and what is refused before anything runs.
+
+
+LAUNCH = b"""
+[source]
+path = "drive.mp4"
+[model]
+weights = "random:driving"
+device = "cpu"
+[view.topdown]
+"""
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Weights, an adapter of them, and one of others."""
+    folder = tmp_path_factory.mktemp("adapters")
+    loaded = load_weights(write_tiny(folder))
+    state = loaded.networks.state_dict()
+    layer = next(
+        name for name in sorted(state) if name.endswith("query.weight") and state[name].ndim == 2
+    ).removesuffix(".weight")
+    width = state[f"{layer}.weight"].shape[0]
+    factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
+    assert loaded.family is not None
+    card = Card(name="adapted", config=loaded.networks.config, family=loaded.family.name, move_time=loaded.move_time)
+    for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
+        adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)
+        write_adapter(folder / f"{name}.safetensors", adapter, overwrite=False)
+    return {name: folder / f"{name}.safetensors" for name in ("tiny", "own", "other")}
+
+
+def launch(weights: object, *changes: str) -> NodeConfig:
+    return parse_config(LAUNCH, "launch.toml", [f"model.weights={weights}", *changes])
+
+
+def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(files: dict[str, Path]) -> None:
+    plain, adapted = launch(files["tiny"]), launch(files["tiny"], f"model.adapter={files['own']}")
+    before, traits = load_model(plain.model).traits, load_model(adapted.model).traits
+    assert traits.name == "adapted"
+    assert traits.sha256_12 != before.sha256_12
+    assert config_digest(plain, before) != config_digest(adapted, before)
+    with pytest.raises(CheckpointError):
+        load_model(launch(files["tiny"], f"model.adapter={files['other']}").model)
+
+
+def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
+    assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64
+    assert "exists; give another name, or allow an export to be overwritten" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("change", ["model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'])
+def test_onnxruntime_is_refused_for_what_is_no_export(change: str) -> None:
+    section = launch("random:driving", change).model
+    with pytest.raises(ConfigError, match="onnxruntime runs exports, and random:driving is none"):
+        load_model(section)
