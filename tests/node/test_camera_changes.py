@@ -71,9 +71,6 @@ def view_of(rig: Rig, camera: Even, epoch: int, size: tuple[int, int] | None = N
     return seen[0]
 
 
-# Another size.
-
-
 def test_a_calibration_of_another_shape_is_left_out_and_the_field_of_view_is_flagged_until_it_is_back(
     tmp_path: Path,
 ) -> None:
@@ -119,18 +116,13 @@ def test_pictures_the_model_cannot_be_given_are_refused_until_they_change_and_th
     assert rig.statuses()[-1]["drops"]["source"] >= 15
 
 
-# Another rate, and what is told meanwhile.
-
-
 def lose(rig: Rig, camera: Camera, count: int = 1) -> None:
     camera.feed(SourceLostError("unplugged"))
     rig.await_event("SRC_LOST", count)
 
 
 def test_a_camera_that_returns_at_another_rate_gets_windows_of_the_nearest_trained_rate(tmp_path: Path) -> None:
-    camera, bench = Even(), Bench()
-    bench.plug(camera)
-    with Rig(tmp_path, bench) as rig:
+    with Rig(tmp_path, bench := Bench(camera := Even())) as rig:
         rig.await_state("active")
         before = view_of(rig, camera, 0).header
         lose(rig, camera)
@@ -153,9 +145,7 @@ def test_a_camera_that_returns_at_another_rate_gets_windows_of_the_nearest_train
 def test_a_camera_that_returns_too_slow_for_the_stated_rate_is_refused_and_the_next_one_is_taken(
     tmp_path: Path,
 ) -> None:
-    camera, bench = Even(), Bench()
-    bench.plug(camera)
-    with Rig(tmp_path, bench, more="window = {fps = 24.0}") as rig:
+    with Rig(tmp_path, bench := Bench(camera := Even()), more="window = {fps = 24.0}") as rig:
         rig.await_state("active")
         view_of(rig, camera, 0)
         lose(rig, camera)
@@ -164,9 +154,7 @@ def test_a_camera_that_returns_too_slow_for_the_stated_rate_is_refused_and_the_n
             slow.step()
         assert "fps 24 is more than the 10 the source gives" in rig.await_event("SRC_REFUSED")["message"]
         lose(rig, slow, 2)
-        right = bench.plug(Even())
-        view_of(rig, right, 2)
-        assert rig.node.state.label == "active"
+        view_of(rig, bench.plug(Even()), 2)
     assert len({view.header.src.epoch for view in rig.of()}) == 2  # none of what was refused
 
 
@@ -192,9 +180,6 @@ def test_a_node_can_be_stopped_and_started_while_its_camera_takes_for_ever_to_op
         view_of(rig, late, 2)
         answer.set()
     assert not rig.node.left_behind
-
-
-# The same device.
 
 
 @pytest.mark.parametrize("stated", [None, "192.168.1.20"])
@@ -275,13 +260,9 @@ def taped(folder: Path) -> Generator[Tape]:
         thread.join(20)
 
 
-def heard_by_the_tape(rig: Rig) -> None:
-    until(lambda: rig.publisher.stats.subscribers >= 2)
-
-
 def test_a_topic_that_a_command_opens_and_closes_begins_and_ends_with_it(tmp_path: Path) -> None:
     with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP, views=TWO_VIEWS) as rig:
-        heard_by_the_tape(rig)
+        until(lambda: rig.publisher.stats.subscribers >= 2)  # the tape hears
         tape.await_more("view/top/win")
         assert rig.ask("set_param", samples=2).code is Code.OK
         tape.await_more("view/top/std")
@@ -302,7 +283,7 @@ def test_a_removed_view_ends_on_every_topic_it_ever_had(tmp_path: Path) -> None:
     model = FakeSynthesizer(painting_traits())
     views = "[view.top]\n[view.second]"
     with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=views) as rig:
-        heard_by_the_tape(rig)
+        until(lambda: rig.publisher.stats.subscribers >= 2)  # the tape hears
         rig.ask("set_param", samples=2)
         tape.await_more("view/second/std")
         tape.await_more("view/second/cls")
@@ -319,9 +300,7 @@ def test_a_removed_view_ends_on_every_topic_it_ever_had(tmp_path: Path) -> None:
 
 
 WILD: list[dict[str, object]] = [
-    {"azimuth_deg": 1e308},
-    {"radius": 1e308},
-    {"radius": -1e308},
+    *({"azimuth_deg": 1e308}, {"radius": 1e308}, {"radius": -1e308}),
     {"kind": "orbit", "rate_deg_s": 1e308, "amplitude_deg": 60.0},
     {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e308},
     {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e-308},
@@ -350,7 +329,7 @@ def test_a_view_removed_in_the_last_window_still_ends(tmp_path: Path) -> None:
 
     model = FakeSynthesizer(traits(), slow)
     with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=TWO_VIEWS) as rig:
-        heard_by_the_tape(rig)
+        until(lambda: rig.publisher.stats.subscribers >= 2)  # the tape hears
         assert begun.wait(30)
         assert rig.ask("remove_view", view="swing").code is Code.OK
         assert rig.ask("deactivate").code is Code.ACCEPTED

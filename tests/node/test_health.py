@@ -5,7 +5,6 @@ import json
 import socket
 import sys
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -180,15 +179,13 @@ def test_a_status_holds_every_key_of_the_protocol_that_is_known(health: Health, 
     header = OriginHeader(node_id="gcd", boot_id="0" * 32, t_publish_ns=1)
     received = decode(encode(StatusMessage(topic="status", header=header, fields=status)))
     assert isinstance(received, StatusMessage)
-    assert {key: received.fields[key] for key in status} == status
-    source = {"state": "streaming", "fps": 10.0, "last_frame_age_ms": 50.0, "reconnects": 0, "corrupt": 1, "dropped": 7}
-    model = {"state": "ready", "ms_p50": 250.0, "ms_p99": 250.0, "gpu_mem_mb": 812.2}
-    faults = {"WIN_GAP": 2, "CLOCK_STEP": 1}
-    overall = {"state": "active", "level": 1, "reasons": ["fps"], "ready": True, "not_ready": []}
-    assert status == overall | {
-        "source": source,
-        "window": {"built": 5, "rejected": 3, "reason_counts": faults, "skipped": 4},
-        "model": {**model, "oom_count": 1, "nan_windows": 1, "backoff_s": 0.0},
+    assert received.fields == status
+    timed = {"ms_p50": 250.0, "ms_p99": 250.0, "gpu_mem_mb": 812.2, "backoff_s": 0.0}
+    feed = {"state": "streaming", "fps": 10.0, "last_frame_age_ms": 50.0, "reconnects": 0, "corrupt": 1, "dropped": 7}
+    assert status == {"state": "active", "level": 1, "reasons": ["fps"], "ready": True, "not_ready": []} | {
+        "source": feed,
+        "window": {"built": 5, "rejected": 3, "reason_counts": {"WIN_GAP": 2, "CLOCK_STEP": 1}, "skipped": 4},
+        "model": {"state": "ready", "oom_count": 1, "nan_windows": 1, **timed},
         "publish": {"sent": 31, "subs": 2, "bytes": 4_130_000, "dropped": 9},
         "drops": {"source": 7, "window": 3, "slot": 4, "model": 3, "queue": 9},
         "views": {"topdown": {"last_ms": 50}},
@@ -237,13 +234,8 @@ from gcd_node.metrics import MetricsServer  # noqa: E402
 
 
 @pytest.fixture
-def shown_health() -> Health:
-    return Health()
-
-
-@pytest.fixture
-def server(shown_health: Health) -> Iterator[MetricsServer]:
-    with MetricsServer("127.0.0.1:0", shown_health) as opened:
+def server(health: Health) -> Iterator[MetricsServer]:
+    with MetricsServer("127.0.0.1:0", health) as opened:
         yield opened
 
 
@@ -270,48 +262,37 @@ def samples(server: MetricsServer) -> dict[str, float]:
     }
 
 
-def make_ready(shown_health: Health) -> None:
-    now_ns = time.monotonic_ns()
-    shown_health.state = "active"
-    shown_health.source("streaming")
-    shown_health.model = "busy"
-    shown_health.expect(("topdown",), window_s=3600.0)
-    for i in range(11):
-        shown_health.frame(now_ns + i * S // 10, now_ns)
-    shown_health.published("topdown", 0.25)
-
-
-def test_a_node_is_ready_only_once_views_come(server: MetricsServer, shown_health: Health) -> None:
+def test_a_node_is_ready_only_once_views_come(server: MetricsServer, health: Health, clock: Clock) -> None:
     def ready(*missing: str, level: int = 0, reasons: tuple[str, ...] = ()) -> tuple[int, Any]:
         fields = {"ready": not missing, "not_ready": list(missing), "level": level, "reasons": list(reasons)}
         return (503 if missing else 200), fields
 
     everything = ("NOT_ACTIVE", "SRC_NOT_STREAMING", "MODEL_NOT_READY", "VIEWS_NOT_FRESH")
     assert get(server, "/readyz") == ready(*everything)
-    make_ready(shown_health)
+    work(health, clock, window_s=3600.0)
     assert get(server, "/readyz") == ready()
-    shown_health.source("lost")
+    health.source("lost")
     assert get(server, "/readyz") == ready("SRC_NOT_STREAMING", level=2, reasons=("SRC_LOST",))
     assert get(server, "/healthz") == (200, {"live": True})
     assert get(server, "/")[0] == 404
 
 
 def test_metrics_hold_what_the_health_was_told_and_are_explained_in_the_docs(
-    server: MetricsServer, shown_health: Health, request: pytest.FixtureRequest
+    server: MetricsServer, health: Health, clock: Clock, request: pytest.FixtureRequest
 ) -> None:
-    make_ready(shown_health)
+    work(health, clock, window_s=3600.0)
     for seconds in (0.1, 0.2, 0.3):
-        shown_health.stage("render", seconds)
-    shown_health.counts["built"], shown_health.faults = 4, {"WIN_GAP": 2}
-    shown_health.counts.update(slot=5, sent=31, subs=2, bytes=4130)
-    shown_health.corrupt(1)
-    shown_health.gpu_mem_mb = 812.5
-    shown_health.raise_reason("fps", Level.WARN)
+        health.stage("render", seconds)
+    health.counts["built"], health.faults = 4, {"WIN_GAP": 2}
+    health.counts.update(slot=5, sent=31, subs=2, bytes=4130)
+    health.corrupt(1)
+    health.gpu_mem_mb = 812.5
+    health.raise_reason("fps", Level.WARN)
     found = samples(server)
     expected = {
         "gcd_level": 1, "gcd_ready": 1, "gcd_reason_level fps": 1, "gcd_node_state active": 1,
-        "gcd_node_state inactive": 0, "gcd_source_state streaming": 1, "gcd_model_state busy": 1,
-        "gcd_source_frames_total": 11, "gcd_source_corrupt_frames_total": 1, "gcd_source_fps": 10,
+        "gcd_node_state inactive": 0, "gcd_source_state streaming": 1, "gcd_model_state ready": 1,
+        "gcd_source_frames_total": 14, "gcd_source_corrupt_frames_total": 1, "gcd_source_fps": 10,
         "gcd_windows_built_total": 4, "gcd_window_faults_total WIN_GAP": 2, "gcd_dropped_total slot": 5,
         "gcd_dropped_total window": 2, "gcd_dropped_total queue": 0, "gcd_model_gpu_memory_bytes": 812.5e6,
         "gcd_messages_sent_total": 31, "gcd_bytes_sent_total": 4130, "gcd_subscriptions": 2,
@@ -346,20 +327,17 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
             caller.close()
 
 
-def test_without_the_extra_a_launch_file_that_asks_for_it_is_refused(
-    shown_health: Health, monkeypatch: pytest.MonkeyPatch
+def test_junk_is_refused_and_the_next_caller_served(
+    server: MetricsServer, health: Health, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    for sent in (b"\x00\xff" * 40, b"GET " + b"/" * 70_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n"):
+        with connected(server) as caller:
+            caller.sendall(sent)
+            caller.shutdown(socket.SHUT_WR)
+            with contextlib.suppress(ConnectionResetError):
+                assert b" 200 " not in caller.recv(100)
+        assert get(server, "/healthz")[0] == 200
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)  # without the extra
     monkeypatch.delitem(sys.modules, "gcd_node.metrics")
     with pytest.raises(ConfigError):
-        metrics_server("127.0.0.1:0", shown_health)
-
-
-@pytest.mark.parametrize("sent", [b"\x00\xff" * 40, b"GET " + b"/" * 70_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n"])
-def test_junk_is_refused_and_the_next_caller_served(server: MetricsServer, sent: bytes) -> None:
-    with connected(server) as caller:
-        caller.sendall(sent)
-        caller.shutdown(socket.SHUT_WR)
-        with contextlib.suppress(ConnectionResetError):
-            assert b" 200 " not in caller.recv(100)
-    assert get(server, "/healthz")[0] == 200
+        metrics_server("127.0.0.1:0", health)

@@ -110,7 +110,8 @@ def test_several_views_come_from_one_batch_and_change_alone(tmp_path: Path) -> N
 def test_a_view_is_set_by_angles_by_a_rigid_pose_or_as_an_orbit(tmp_path: Path) -> None:
     planned = traits().plan_view(SphericalDelta(azimuth_deg=25.0, elevation_deg=5.0, radius_m=1.0))
     pose = planned.source_from_target[-1].flatten().tolist()
-    with Rig(tmp_path, Bench(), more=WAITING) as rig:
+    with Rig(tmp_path, Bench(), more=WAITING, views="[view.main]\nazimuth_deg = 10.0\n[view.other]") as rig:
+        assert rig.ask("set_view", view="main", azimuth_deg=1.0).code is Code.NOT_READY
         rig.ask("configure")
         rig.await_state("inactive")
         told = rig.ask("set_view", view="main", T_src_dst=pose).result
@@ -125,19 +126,16 @@ def test_a_view_is_set_by_angles_by_a_rigid_pose_or_as_an_orbit(tmp_path: Path) 
         turned = [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]  # looks at the scene, rolled by 90 degrees
         assert rig.ask("set_view", view="main", T_src_dst=turned).code is Code.OUT_OF_RANGE
         assert rig.ask("set_view", view="main", T_src_dst=[2.0] * 16).code is Code.BAD_ARG
-        assert rig.ask("views").result == {"main": {**goal, "view_rev": 3}}
-
-
-def test_a_change_meant_for_another_revision_is_refused(tmp_path: Path) -> None:
-    with Rig(tmp_path, Bench(), views=TWO_VIEWS, more=WAITING) as rig:
-        assert rig.ask("set_view", view="main", azimuth_deg=1.0).code is Code.NOT_READY
-        rig.ask("configure")
-        rig.await_state("inactive")
-        assert rig.client.request("set_view", {"view": "main", "azimuth_deg": 1.0}, if_view_rev=1).code is Code.OK
-        refused = rig.client.request("set_view", {"view": "main", "azimuth_deg": 2.0}, if_view_rev=1)
-        assert (refused.code, refused.result) == (Code.WRONG_STATE, {"view_rev": 2})
-        assert rig.client.request("remove_view", {"view": "main"}, if_view_rev=1).code is Code.WRONG_STATE
-        assert rig.client.request("remove_view", {"view": "main"}, if_view_rev=2).code is Code.OK
+        views = rig.ask("views").result
+        assert views is not None
+        assert views["main"] == {**goal, "view_rev": 3}
+        # a change meant for another revision
+        angle = {"view": "main", "azimuth_deg": 1.0}
+        assert rig.client.request("set_view", angle, if_view_rev=3).code is Code.OK
+        refused = rig.client.request("set_view", angle, if_view_rev=3)
+        assert (refused.code, refused.result) == (Code.WRONG_STATE, {"view_rev": 4})
+        assert rig.client.request("remove_view", {"view": "main"}, if_view_rev=3).code is Code.WRONG_STATE
+        assert rig.client.request("remove_view", {"view": "main"}, if_view_rev=4).code is Code.OK
 
 
 def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
