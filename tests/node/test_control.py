@@ -70,9 +70,6 @@ def is_answered(stranger: Socket) -> bool:
     return bool(stranger.poll(100))
 
 
-# Asking and commanding
-
-
 def test_a_request_reaches_the_node_once_and_typed_and_is_answered(client: ControlClient, node: FakeNode) -> None:
     reply = client.request("hello", request_id="abc")
     assert (reply.id, reply.ok, reply.code, reply.state) == ("abc", True, "OK", "active")
@@ -102,9 +99,6 @@ def test_whatever_the_node_does_is_answered_and_shows_no_code(
     assert client.request("hello").ok
 
 
-# Repeats
-
-
 def test_the_same_id_is_one_request(client: ControlClient, node: FakeNode) -> None:
     first, again = (client.request("set_view", {"view": "top"}, request_id="same") for _ in range(2))
     other = client.request("set_view", {"view": "top", "azimuth_deg": 5.0}, request_id="same")
@@ -124,9 +118,6 @@ def test_replies_are_forgotten_in_time_and_kept_within_bounds() -> None:
     cache.keep("big", b"?" * 4000, b"x" * 4900, 62.0)
     assert [cache.find(i, b"?", 62.0) is None for i in (48, 49)] == [True, False]
     assert cache.find("big", b"?" * 4000, 63.0) == b"x" * 4900
-
-
-# Strangers
 
 
 @pytest.mark.parametrize("parts", [[b""], [b"{"], [b"\xff"], [b"[" * 30_000], [b"", wire("hello")]])
@@ -171,9 +162,6 @@ def test_f17_an_oversize_request_is_refused_and_reported_and_a_huge_one_drops_it
     assert node.view_rev == 1
 
 
-# Life
-
-
 def test_closing_lets_the_last_reply_out_and_leaves_nothing(tmp_path: Path, node: FakeNode) -> None:
     threads = threading.active_count()
     server = node.serve(f"ipc://{tmp_path}/c")
@@ -183,9 +171,6 @@ def test_closing_lets_the_last_reply_out_and_leaves_nothing(tmp_path: Path, node
         server.close()
     assert not (tmp_path / "c").exists()
     assert threading.active_count() == threads
-
-
-# Requests as bytes.
 
 
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
@@ -209,9 +194,6 @@ def test_every_verb_is_read_as_its_own_struct(verb: str) -> None:
     assert command.verb == verb
     assert type(command.args) is VERBS[verb].arguments
     assert parse_command(wire("remove_view", args={"view": "a"}, if_view_rev=2)).if_view_rev == 2
-
-
-# What is refused, and how it is said
 
 
 @pytest.mark.parametrize(
@@ -268,9 +250,6 @@ def test_f14_a_wrong_argument_is_bad_arg_and_named(args: object, says: str) -> N
 def test_f14_out_of_range_gives_the_allowed_interval(args: dict[str, object], arg: str, allowed: list[int]) -> None:
     error = refused(wire("set_param", args=args))
     assert (error.code, error.result) == ("OUT_OF_RANGE", {"allowed": {arg: allowed}})
-
-
-# As a user types them.
 
 
 @pytest.fixture

@@ -77,14 +77,18 @@ def test_a_replay_of_the_live_model_is_the_same_twice_with_all_its_maps(tmp_path
     assert [len(each.stamps_ns) for each in windows[0]] == [1] * 5  # a view of every frame
 
 
-def test_views_stand_at_their_goals_and_are_placed_from_the_mount() -> None:
-    placed = VirtualView("placed", config(), TRAITS, MOUNT).planned()
-    assert all(placed.at_goal)
-    vehicle_from_view = MOUNT.vehicle_from_camera @ placed.source_from_target[0]
-    assert vehicle_from_view[:3, 3].tolist() == pytest.approx([-4.0, 3.0, 3.0])
-    above = VirtualView("topdown", config(), TRAITS, MOUNT).planned()
-    assert all(above.at_goal)
-    assert (MOUNT.vehicle_from_camera @ above.source_from_target[0])[:3, 3].tolist() == pytest.approx([-8.0, 0.0, 8.0])
+def test_views_stand_at_their_goals_and_are_placed_from_the_mount_by_models_that_take_any_pose() -> None:
+    for name, wanted in (("placed", [-4.0, 3.0, 3.0]), ("topdown", [-8.0, 0.0, 8.0])):
+        planned = VirtualView(name, config(), TRAITS, MOUNT).planned()
+        assert all(planned.at_goal)
+        vehicle_from_view = MOUNT.vehicle_from_camera @ planned.source_from_target[0]
+        assert vehicle_from_view[:3, 3].tolist() == pytest.approx(wanted)
+    place = SetView(view="main", position_m=(0.0, 0.0, 2.0), look_at_m=(3.0, 0.0, 0.0))
+    assert place.to_config() == ViewConfig(position_m=(0.0, 0.0, 2.0), look_at_m=(3.0, 0.0, 0.0))
+    sphere = struct_replace(config(), source=struct_replace(config().source, pose=SourcePose(radius=3.0)))
+    for settings, made in ((sphere, TRAITS), (config(), traits())):
+        with pytest.raises(OptionError):
+            VirtualView("placed", settings, made)
 
 
 def test_a_view_takes_any_rigid_pose_as_it_is() -> None:
@@ -103,10 +107,8 @@ def test_a_view_takes_any_rigid_pose_as_it_is() -> None:
         'kind = "pose"',
         "pose = [0, 0, 1, 0, 0, 0, 1]",
         'kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 1]\nradius = 2.0',
-        'kind = "pose"\npose = [0, 0, 1]',
-        'kind = "pose"\npose = [0, 0, 1, 0, 0, 0, 0]',
-        'kind = "pose"\npose = [0, 0, nan, 0, 0, 0, 1]',
-        'kind = "pose"\npose = [0, 0, 2e4, 0, 0, 0, 1]',
+        *(f'kind = "pose"\npose = {pose}' for pose in ("[0, 0, 1]", "[0, 0, 1, 0, 0, 0, 0]")),
+        *(f'kind = "pose"\npose = [0, 0, {z}, 0, 0, 0, 1]' for z in ("nan", "2e4")),
         "position_m = [0, 0, 1]",
         "look_at_m = [0, 0, 1]",
         "position_m = [0, 1]\nlook_at_m = [0, 0, 1]",
@@ -117,19 +119,6 @@ def test_a_view_takes_any_rigid_pose_as_it_is() -> None:
 def test_what_is_no_pose_or_place_or_two_goals_is_refused(wrong: str) -> None:
     with pytest.raises(ConfigError):
         config(f"[view.wrong]\n{wrong}\n")
-
-
-def test_places_are_for_models_that_take_any_pose_and_cameras_on_vehicles() -> None:
-    sphere = struct_replace(config().source, pose=SourcePose(radius=3.0))
-    with pytest.raises(OptionError):
-        VirtualView("placed", struct_replace(config(), source=sphere), TRAITS)
-    with pytest.raises(OptionError):
-        VirtualView("placed", config(), load_synthesizer("random:kubric90", device="cpu").traits)
-
-
-def test_set_view_takes_a_place_too() -> None:
-    wanted = SetView(view="main", position_m=(0.0, 0.0, 2.0), look_at_m=(3.0, 0.0, 0.0))
-    assert wanted.to_config() == ViewConfig(position_m=(0.0, 0.0, 2.0), look_at_m=(3.0, 0.0, 0.0))
 
 
 def test_the_lens_is_the_stated_one_or_is_assumed_and_published() -> None:

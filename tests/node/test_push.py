@@ -68,7 +68,7 @@ def taken(source: LiveCamera) -> Frame:
     return frame
 
 
-def test_depth_and_odometry_come_with_their_picture(endpoint: str) -> None:
+def test_depth_and_odometry_come_with_their_picture(endpoint: str, caplog: pytest.LogCaptureFixture) -> None:
     depth, pose = np.full(SHAPE, 2.5), np.eye(4)
     depth[0] = [np.nan, np.inf, -1.0, 0.0] * (SHAPE[1] // 4)
     pose[:3, 3] = 1, 2, 3
@@ -80,15 +80,8 @@ def test_depth_and_odometry_come_with_their_picture(endpoint: str) -> None:
     assert not frame.depth[0].any()
     assert (frame.depth[1:] == 2.5).all()
     assert np.array_equal(frame.odometry, pose)
-
-
-def test_depth_of_another_shape_is_left_out_with_one_line(endpoint: str, caplog: pytest.LogCaptureFixture) -> None:
-    square = np.ones((SHAPE[0], SHAPE[0]), np.float32)
-    with (
-        caplog.at_level(logging.WARNING),
-        pushing(endpoint, lambda pusher, _: pusher.push(RED, time.time_ns(), square)),
-        opened(endpoint) as source,
-    ):
+    square = np.ones((SHAPE[0], SHAPE[0]), np.float32)  # which is left out, with one line
+    with pushing(endpoint, lambda pusher, _: pusher.push(RED, time.time_ns(), square)), opened(endpoint) as source:
         assert [taken(source).depth for _ in range(5)] == [None] * 5
     assert source.corrupt == 0
     assert [each.getMessage().partition(":")[0][-22:] for each in caplog.records] == ["goes without its depth"]

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +132,6 @@ def test_windows_that_were_rejected_are_counted_and_those_with_nan_named(tmp_pat
     assert str(window_seed(nan.cfg_digest, 1, 1)) in nan.troubles["MODEL_NAN in window 1"]
 
 
-# How a run comes to be.
-
-
 def test_a_replay_opens_no_socket_and_holds_a_gpu_to_repeatable_convolutions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -212,49 +209,31 @@ def test_a_full_disk_ends_a_replay_with_what_could_not_be_written(
     assert list(tmp_path.iterdir()) == []
 
 
-# Damaged runs.
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        lambda whole: whole[: len(whole) // 2],
-        lambda _: cv2.imencode(".png", np.full((FRAMES * HEIGHT, WIDTH, 3), 7, np.uint8))[1].tobytes(),
-        lambda _: cv2.imencode(".png", np.full((FRAMES * HEIGHT - 1, WIDTH), 7, np.uint8))[1].tobytes(),
-        lambda _: b"no picture",
-        lambda _: None,
-    ],
-)
-def test_pixels_that_do_not_fit_their_manifest_are_damage(
-    content: Callable[[bytes], bytes | None], run: RunFolder, tmp_path: Path
-) -> None:
+def test_pixels_that_do_not_fit_their_manifest_are_damage(run: RunFolder, tmp_path: Path) -> None:
+    flat = np.full((FRAMES * HEIGHT, WIDTH, 3), 7, np.uint8)
     picture = copied(run, tmp_path / "copy") / "main" / "000001.win.png"
-    new = content(picture.read_bytes())
-    picture.unlink() if new is None else picture.write_bytes(new)
-    damaged = open_run(tmp_path / "copy")
-    with pytest.raises(DamagedRunError):
-        damaged.read_view(damaged.manifest.windows[1], "main")
+    damaged, whole = open_run(tmp_path / "copy"), picture.read_bytes()
+    other = (cv2.imencode(".png", each)[1].tobytes() for each in (flat, flat[1:, :, 0]))
+    for content in (whole[: len(whole) // 2], *other, b"no picture", None):
+        picture.unlink() if content is None else picture.write_bytes(content)
+        with pytest.raises(DamagedRunError):
+            damaged.read_view(damaged.manifest.windows[1], "main")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "reason"),
-    [
+def test_a_manifest_that_is_none_is_damage_and_says_where(run: RunFolder, tmp_path: Path) -> None:
+    text = encode_manifest(run.manifest)
+    for old, new, reason in (
         (b"{", b"", "no manifest of a run"),
         (b'"gcd-run/3"', b'"gcd-run/1"', "gcd-run/1"),
         (b'"nan_windows": 0', b'"nan_windows": 0, "more": 1', "more"),
         (b'"window_id":1', b'"window_id":0', "higher"),
         (b'"main":{', b'"../main":{', "views"),
         (b'"win":', b'"vis":', "digest"),
-    ],
-)
-def test_a_manifest_that_is_none_is_damage_and_says_where(
-    old: bytes, new: bytes, reason: str, run: RunFolder, tmp_path: Path
-) -> None:
-    text = encode_manifest(run.manifest)
-    assert old in text
-    (tmp_path / MANIFEST).write_bytes(text.replace(old, new, 1))
-    with pytest.raises(DamagedRunError, match=reason):
-        open_run(tmp_path)
+    ):
+        assert old in text
+        (tmp_path / MANIFEST).write_bytes(text.replace(old, new, 1))
+        with pytest.raises(DamagedRunError, match=reason):
+            open_run(tmp_path)
 
 
 def test_what_a_strange_run_states_takes_neither_time_nor_memory(run: RunFolder, tmp_path: Path) -> None:
@@ -298,9 +277,6 @@ def restated(run: RunFolder, folder: Path, **changes: object) -> RunFolder:
     copied(run, folder)
     (folder / MANIFEST).write_bytes(encode_manifest(msgspec.structs.replace(run.manifest, **changes)))
     return open_run(folder)
-
-
-# How far apart.
 
 
 def test_a_run_is_identical_to_its_repetition(golden: RunFolder, tmp_path: Path) -> None:
@@ -362,9 +338,6 @@ def test_depth_and_visibility_count_like_class_pixels(tmp_path: Path) -> None:
     assert compare(usual, made_run(tmp_path / "plain")).differences[0].facts == ("visibility", "depth")
 
 
-# What always fails.
-
-
 def test_a_window_that_only_one_run_has_fails_and_shifts_none_of_the_others(golden: RunFolder, tmp_path: Path) -> None:
     longer = made_run(tmp_path / "longer", source=FakeSource(4 * FRAMES))
     for a, b, only in ((golden, longer, "only in B"), (longer, golden, "only in A")):
@@ -386,9 +359,6 @@ def test_other_moments_flags_and_sizes_fail_even_if_the_pixels_agree(golden: Run
             keep_pixels(other.path, "main", 0, "win", black)
         (view,) = compare(golden, other).failures(LOOSE)
         assert view.facts == ("size" if field == "views" else field,)
-
-
-# What is said.
 
 
 def test_what_the_runs_were_made_from_is_named_first(golden: RunFolder, tmp_path: Path) -> None:

@@ -63,9 +63,6 @@ def heard(reader: ViewSubscriber) -> ReceivedView | None:
         return None
 
 
-# Who may do what
-
-
 def test_f18_a_viewer_is_forbidden_to_command(server: ControlServer, node: FakeNode) -> None:
     assert ask(server, keys(VIEWER), "set_view") == "FORBIDDEN"
     assert ask(server, keys(VIEWER), "hello") == "OK"
@@ -160,9 +157,6 @@ def test_where_a_node_may_be_reached(tmp_path: Path, node: FakeNode) -> None:
     assert node.codes == []
 
 
-# Keys as files
-
-
 @pytest.mark.parametrize(
     ("name", "mode", "text"),
     [
@@ -187,9 +181,6 @@ def test_a_key_is_never_overwritten_and_a_damaged_one_or_a_secret_others_may_rea
     with pytest.raises(SetupError) as caught:
         read_key_pair(tmp_path)
     assert name == "public.key" or text not in str(caught.value)
-
-
-# The list of clients
 
 
 def entry(name: str, pair: KeyPair, role: str = "viewer") -> str:

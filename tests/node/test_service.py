@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import pytest
 import torch
-from fakes import write_tiny
+from fakes import fake_config, write_tiny
 from rig import service_manager
 
 from gcd_model.errors import CheckpointError
@@ -26,7 +26,7 @@ from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import write_adapter
 from gcd_node.cli.main import run_app
 from gcd_node.cli.run import apply_scheduling
-from gcd_node.config import LifeConfig, ModelSection, NodeConfig, parse_config
+from gcd_node.config import LifeConfig, ModelSection, NodeConfig
 from gcd_node.errors import ConfigError
 from gcd_node.service import JsonLines, ServiceManager
 from gcd_node.session import load_model, model_threads
@@ -64,9 +64,6 @@ def test_a_socket_that_cannot_be_reached_is_logged_once_and_the_node_goes_on(
     for tell in (service.ready, service.alive, service.alive, service.stopping):
         tell()
     assert len(caplog.records) == 1
-
-
-# Log lines
 
 
 def lines(text: str) -> list[dict[str, Any]]:
@@ -218,25 +215,14 @@ main.main()
 # Adapters beside their weights, exports and engines: what is taken, and what is refused before anything runs.
 
 
-LAUNCH = b"""
-[source]
-path = "drive.mp4"
-[model]
-weights = "random:driving"
-device = "cpu"
-[view.topdown]
-"""
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Weights, an adapter of them, and one of others."""
     folder = tmp_path_factory.mktemp("adapters")
     loaded = load_weights(write_tiny(folder))
     state = loaded.networks.state_dict()
-    layer = next(
-        name for name in sorted(state) if name.endswith("query.weight") and state[name].ndim == 2
-    ).removesuffix(".weight")
+    names = (name for name in sorted(state) if name.endswith("query.weight") and state[name].ndim == 2)
+    layer = next(names).removesuffix(".weight")
     width = state[f"{layer}.weight"].shape[0]
     factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
     assert loaded.family is not None
@@ -248,7 +234,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def launch(weights: object, *changes: str) -> NodeConfig:
-    return parse_config(LAUNCH, "launch.toml", [f"model.weights={weights}", *changes])
+    return fake_config(f"model.weights={weights}", "model.device=cpu", *changes)
 
 
 def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(files: dict[str, Path]) -> None:
@@ -261,14 +247,9 @@ def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(
         load_model(launch(files["tiny"], f"model.adapter={files['other']}").model)
 
 
-def test_an_export_over_a_folder_of_mine_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_onnxruntime_is_refused_for_what_is_no_export_and_an_export_over_a_folder_of_mine(tmp_path: Path) -> None:
+    for change in ("model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'):
+        with pytest.raises(ConfigError, match="onnxruntime runs exports, and random:driving is none"):
+            load_model(launch("random:driving", change).model)
     pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
     assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64
-    assert "exists; give another name, or allow an export to be overwritten" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("change", ["model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'])
-def test_onnxruntime_is_refused_for_what_is_no_export(change: str) -> None:
-    section = launch("random:driving", change).model
-    with pytest.raises(ConfigError, match="onnxruntime runs exports, and random:driving is none"):
-        load_model(section)

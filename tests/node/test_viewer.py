@@ -70,9 +70,6 @@ def viewer(tmp_path: Path) -> Iterator[ViewerServer]:
         yield opened
 
 
-# What is sent.
-
-
 @settings(deadline=None, max_examples=50)
 @given(st.text(max_size=80) | st.binary(max_size=80))
 def test_what_is_no_request_of_the_page_is_refused(text: str | bytes) -> None:
@@ -152,9 +149,6 @@ def test_maps_are_sent_without_loss_and_depth_as_grey_levels() -> None:
         assert [each["name"] for each in classes] == [each.name for each in message.header.classes or ()]
 
 
-# The page over HTTP.
-
-
 def test_every_file_is_served_with_headers_that_let_nothing_else_in_and_none_holds_the_token(
     viewer: ViewerServer,
 ) -> None:
@@ -190,9 +184,6 @@ def test_others_than_free_ports_of_this_machine_are_refused(viewer: ViewerServer
     for address in ("0.0.0.0:8470", "[::]:8470", "robot:8470", "", "127.0.0.1:", "127.0.0.1:70000", host_of(viewer)):
         with pytest.raises(EndpointError if address == host_of(viewer) else ConfigError):
             ViewerServer(address, endpoints_in(tmp_path))
-
-
-# The feed.
 
 
 def test_who_comes_is_a_viewer_until_the_token_is_shown_which_is_in_no_log_and_asks_for_what_a_page_may(
@@ -290,9 +281,6 @@ def test_the_end_waits_for_nobody(tmp_path: Path) -> None:
 LOOPBACK = "tcp://127.0.0.1:0"
 
 
-# Beside a node.
-
-
 def test_pictures_come_only_while_somebody_looks_and_an_operator_steers_the_node(tmp_path: Path) -> None:
     camera = Camera()
     with Rig(tmp_path, Bench(camera), watched=False) as rig, viewer_of(tmp_path) as viewer:
@@ -377,9 +365,6 @@ def test_a_node_that_asks_for_keys_asks_its_own_page_too(
             assert role(feed, token=found[2]) == ("operator", False)
             assert answer(feed, "views")["result"]["main"]["view_rev"] == 1
             assert answer(feed, "set_param", steps=3)["code"] == ("OK" if page_role == "operator" else "FORBIDDEN")
-
-
-# As a process of its own.
 
 
 def printed_page(process: "subprocess.Popen[str]") -> str:
