@@ -276,9 +276,6 @@ def same(one: SourceFeatures, other: SourceFeatures) -> bool:
     return all((a is None and b is None) or (a is not None and b is not None and torch.equal(a, b)) for a, b in tensors)
 
 
-# Laws.
-
-
 def test_windows_that_overlap_agree_to_the_last_bit_on_the_frames_they_share() -> None:
     model, encoded = load_synthesizer("random:driving", device="cpu"), kept()
     picture = np.random.default_rng(0).integers(0, 256, (128, 192, 3), np.uint8)
@@ -325,9 +322,6 @@ def test_it_makes_no_difference_in_what_order_frames_are_encoded(seed: int) -> N
     assert sorted(set(model.encoded)) == sorted(model.encoded)  # each once
 
 
-# When frames are encoded.
-
-
 def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> None:
     class Waiting(FakeSource):
         """Gives its last frame when all those before it are encoded."""
@@ -342,9 +336,6 @@ def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> No
     model = Encoder()
     assert run(config(), model, Waiting(T)).ids() == [0]
     assert model.encoded == list(range(T))
-
-
-# What is forgotten.
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,6 @@ def context():
         made.destroy(linger=0)
 
 
-# A second process
-
-
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
 def test_a_second_process_receives_every_window_bit_for_bit(tmp_path, transport) -> None:
     data = f"ipc://{tmp_path}/data" if transport == "ipc" else "tcp://127.0.0.1:0"
@@ -105,9 +102,6 @@ def test_a_conflated_slow_reader_gets_the_newest_window_and_then_the_end(tmp_pat
     assert len(seen) < 30
 
 
-# Sockets as the protocol has them
-
-
 def test_a_new_subscriber_is_welcomed_with_zeros(tmp_path, context) -> None:
     with opened(tmp_path) as publisher:
         reader = plain_reader(context, publisher.endpoint, bytes(32))
@@ -150,9 +144,6 @@ def until_level(notes: StatusSubscriber, level: int) -> StatusMessage:
         if note.fields["level"] == level:
             return note
     raise AssertionError(f"no note of level {level} came")
-
-
-# Hand-over
 
 
 def test_lockstep_that_no_reader_takes_is_an_error_at_the_end(tmp_path) -> None:
@@ -221,9 +212,6 @@ def test_what_stops_the_thread_reaches_the_caller(tmp_path, monkeypatch) -> None
     for call in (publisher.check, lambda: publisher.send(window()), publisher.close):
         with pytest.raises(NodeError):
             call()
-
-
-# Endpoints
 
 
 def test_a_live_ipc_endpoint_is_refused_and_stays_alive_and_the_file_of_a_dead_process_is_replaced(tmp_path) -> None:
