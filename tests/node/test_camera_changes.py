@@ -71,9 +71,7 @@ def view_of(rig: Rig, camera: Even, epoch: int, size: tuple[int, int] | None = N
     return seen[0]
 
 
-def test_a_calibration_of_another_shape_is_left_out_and_the_field_of_view_is_flagged_until_it_is_back(
-    tmp_path: Path,
-) -> None:
+def test_a_calibration_of_another_shape_is_left_out_and_flagged_until_it_fits_again(tmp_path: Path) -> None:
     camera = Even(size=WHOLE)
     with Rig(tmp_path, Bench(camera), config=calibrated(tmp_path)) as rig:
         rig.await_state("active")
@@ -95,7 +93,7 @@ def test_a_calibration_of_another_shape_is_left_out_and_the_field_of_view_is_fla
     [("", TINY, "allow_upscale"), ("strict = true", SQUARE, "strict: field of view")],
     ids=["too small", "strict"],
 )
-def test_pictures_the_model_cannot_be_given_are_refused_until_they_change_and_the_node_lives_on(
+def test_pictures_the_model_cannot_take_are_refused(
     more: str, size: tuple[int, int], words: str, tmp_path: Path
 ) -> None:
     camera = Even(size=WHOLE)
@@ -128,7 +126,7 @@ def test_a_camera_that_returns_at_another_rate_gets_windows_of_the_nearest_train
         lose(rig, camera)
         slower = bench.plug(Even(fps=12.5))
         after = view_of(rig, slower, 1).header
-        until(lambda: rig.metas()[-1]["fps"] == 12.0)
+        until(lambda: rig.told("meta")[-1]["fps"] == 12.0)
         lose(rig, slower, 2)
         slowest = bench.plug(Even(fps=4.0))
         flagged = view_of(rig, slowest, 2).header
@@ -142,9 +140,7 @@ def test_a_camera_that_returns_at_another_rate_gets_windows_of_the_nearest_train
     assert set(states[states.index("active") :]) == {"active"}
 
 
-def test_a_camera_that_returns_too_slow_for_the_stated_rate_is_refused_and_the_next_one_is_taken(
-    tmp_path: Path,
-) -> None:
+def test_a_camera_that_returns_too_slow_is_refused_and_the_next_one_taken(tmp_path: Path) -> None:
     with Rig(tmp_path, bench := Bench(camera := Even()), more="window = {fps = 24.0}") as rig:
         rig.await_state("active")
         view_of(rig, camera, 0)

@@ -66,9 +66,7 @@ def last_error(capsys: Capture) -> str:
 # One clip.
 
 
-def test_synthesize_writes_frames_video_strip_and_arrays_and_says_what_nobody_stated(
-    clip: Path, tmp_path: Path, capsys: Capture
-) -> None:
+def test_synthesize_writes_all_it_drew_and_says_what_nobody_stated(clip: Path, tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "out"
     options = ["--azimuth-deg", "20", "--elevation-deg", "-5", "--radius", "1"]
     assert synthesize(clip, KUBRIC, out, *options) == 0
@@ -93,9 +91,7 @@ def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path, capsys: Cap
     assert np.abs(angles - poses).max() < 1e-4
 
 
-def test_synthesize_writes_the_class_map_with_its_meaning_and_where_samples_differ(
-    small_clip: Path, tiny: Path, tmp_path: Path
-) -> None:
+def test_synthesize_writes_class_maps_and_where_samples_differ(small_clip: Path, tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert synthesize(small_clip, tiny, out, "--samples", "2") == 0
     assert len(list((out / "frames_s1").glob("*.png"))) == 14
@@ -200,9 +196,7 @@ def test_usage_errors_are_exit_64(capsys: Capture) -> None:
     assert "no-such-command" in capsys.readouterr().err
 
 
-def test_every_command_has_the_help_that_the_list_says_and_the_list_needs_no_torch(
-    capsys: Capture,
-) -> None:
+def test_every_command_has_the_help_of_the_list_which_needs_no_torch(capsys: Capture) -> None:
     whole = get_command(new_app(COMMANDS)).commands  # type: ignore[attr-defined]
     for name, (_, summary) in COMMANDS.items():
         assert " ".join(str(whole[name].help).split("\n\n")[0].split()) == summary, name
@@ -311,9 +305,7 @@ def levels(clip: Clip) -> list[int]:
     return [round((float(frame[0, 0, 0]) + 1) * 127.5) for frame in clip.video]
 
 
-def test_a_video_goes_to_the_trained_size_or_another_and_the_range_of_the_model(
-    video: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_video_goes_to_the_size_and_the_range_of_the_model(video: Path, caplog: pytest.LogCaptureFixture) -> None:
     clip = read(video)
     assert clip.video.shape == (14, 3, HEIGHT, WIDTH)
     assert levels(clip) == [10 * i for i in range(14)]

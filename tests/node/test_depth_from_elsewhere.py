@@ -77,7 +77,7 @@ def test_depth_takes_the_way_of_its_pictures_from_a_file_as_from_a_folder(video:
         (np.ones((13, HEIGHT, 2 * WIDTH), np.float32), TooShortError),
     ],
 )
-def test_depth_that_does_not_belong_to_the_pictures_is_refused(
+def test_depth_of_other_pictures_is_refused(
     video: Path, tmp_path: Path, depth: np.ndarray, error: type[Exception]
 ) -> None:
     np.save(tmp_path / "d.npy", depth)
@@ -106,9 +106,7 @@ def test_a_live_view_is_written_with_all_it_tells(still_clip: Path, tmp_path: Pa
     assert (tmp_path / "seen.mp4").stat().st_size > 0
 
 
-def test_with_depth_a_published_model_tells_what_was_seen_in_the_units_of_its_radius(
-    still_clip: Path, tmp_path: Path
-) -> None:
+def test_with_depth_a_published_model_tells_what_was_seen_in_its_units(still_clip: Path, tmp_path: Path) -> None:
     orbit = ("--azimuth-deg", 5, "--steps", 1, "--height", HEIGHT, "--width", WIDTH)
     np.save(tmp_path / "small.npy", np.load(tmp_path / "depth.npy") / 10)
     for name, (file, unit_m) in {"a": ("depth.npy", 1), "b": ("small.npy", 0.1), "c": ("small.npy", 1)}.items():
@@ -301,9 +299,7 @@ def test_every_window_of_a_view_that_holds_them_comes_with_its_own() -> None:
     ]
 
 
-def test_depth_loses_less_than_a_thousandth_from_0_3_to_200_m_and_what_is_none_stays_none(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_depth_loses_less_than_a_thousandth_and_what_is_none_stays_none(monkeypatch: pytest.MonkeyPatch) -> None:
     sent, wanted = inverse_depth(published(*HELD, frames=14).of("depth")[0]), fake_maps()["inverse_depth"].numpy()
     known = wanted > 0
     assert (wanted[known].min() < 1 / 199, wanted[known].max() > 1 / 0.31) == (True, True)

@@ -111,9 +111,7 @@ def test_f5_a_file_that_ends_is_exit_0_and_one_that_is_too_short_65(run: Outcome
         (cv2.imencode(".avif", np.zeros((48, 64, 3), np.uint8))[1].tobytes(), "codec AV01"),
     ],
 )
-def test_f6_a_file_that_cannot_be_decoded_is_exit_66(
-    run: Outcome, content: bytes | None, words: str, tmp_path: Path
-) -> None:
+def test_f6_an_undecodable_file_is_exit_66(run: Outcome, content: bytes | None, words: str, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "clip.mp4").write_bytes(content)
     code, told = run(f'path = "{tmp_path}/clip.mp4"')
@@ -141,9 +139,7 @@ def test_f20_an_endpoint_in_use_is_exit_73_and_named(run: Outcome, tmp_path: Pat
 
 
 @pytest.mark.parametrize("damage", ["missing", "misshapen"])
-def test_f25_weights_that_do_not_fit_are_exit_65_and_the_first_five_are_named(
-    run: Outcome, damage: str, tmp_path: Path
-) -> None:
+def test_f25_weights_that_do_not_fit_are_exit_65_and_five_are_named(run: Outcome, damage: str, tmp_path: Path) -> None:
     with safe_open(write_tiny(tmp_path), "pt") as whole:
         weights = {name: whole.get_tensor(name) for name in whole.keys()}  # noqa: SIM118  it is no dict
         card = whole.metadata()

@@ -46,13 +46,9 @@ from gcd_node.frame import load_lens
 from gcd_node.sources.files import read_picture
 from gcd_node.verbs import VERBS, RequestError, parse_command
 
-SETTINGS = settings(
-    max_examples=max(30, ROUNDS // 16),
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
-)
+UNHEALTHY = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large]
+MANY = {"max_examples": max(30, ROUNDS // 16), "deadline": None}
+SETTINGS = settings(derandomize=True, database=None, suppress_health_check=UNHEALTHY, **MANY)
 pytestmark = pytest.mark.timeout(max(120, ROUNDS // 10))
 
 JSON = st.recursive(
@@ -60,9 +56,6 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=10), inner, max_size=4),
     max_leaves=20,
 )
-
-
-# Messages.
 
 
 def use(message: Message) -> str:
@@ -94,9 +87,7 @@ WINDOW_HEADER = header_of(encode(window()))
     payload=st.binary(max_size=200),
     flags=st.integers(0, 15),
 )
-def test_any_header_ends_as_a_message_or_a_message_error(
-    topic: bytes, changes: dict[str, Any], payload: bytes, flags: int
-) -> None:
+def test_any_header_is_a_message_or_an_error(topic: bytes, changes: dict[str, Any], payload: bytes, flags: int) -> None:
     header = json.dumps({**WINDOW_HEADER, **changes}).encode()[: 60 * 1024]
     header = header.ljust(-(-len(header) // 16) * 16)
     prefix = PREFIX.pack(topic, MAGIC, len(header) // 16, flags, len(payload), 0, 0, 0)
@@ -116,9 +107,6 @@ def read_message(part: bytes, _: Path) -> str:
 def read_message_without_checksum(part: bytes, _: Path) -> str:
     """So that the checks behind the checksum are reached."""
     return use(decode(part if len(part) < PREFIX.size else part[:56] + bytes(4) + part[60:]))
-
-
-# Requests.
 
 
 def request(verb: str, args: object, **more: object) -> bytes:
@@ -144,9 +132,8 @@ def test_any_json_ends_as_a_command_or_a_request_error(verb: str, args: object, 
     try:
         assert parse_command(part).verb in VERBS
     except RequestError as error:
-        told = Reply(
-            id=error.request_id, ok=False, code=error.reason, message=str(error), state="", result=error.result
-        )
+        refusal = {"id": error.request_id, "code": error.reason, "message": str(error), "result": error.result}
+        told = Reply(ok=False, state="", **refusal)
         assert decode_reply(msgspec.json.encode(told)) == told  # and the refusal can be sent
 
 
@@ -155,13 +142,9 @@ def test_any_json_ends_as_a_command_or_a_request_error(verb: str, args: object, 
 CONFIG = b"""
 node_id = "front"
 strict = true
-[source]
-kind = "rtsp"
-url = "rtsp://user:secret@camera/1"
-pose = {elevation_deg = 5.0, radius = 15.0}
-[model]
-weights = "package:live-small"
-guidance = [1.0, 1.5]
+source = {kind = "rtsp", url = "rtsp://user:secret@camera/1", pose = {elevation_deg = 5.0, radius = 15.0}}
+model = {weights = "package:live-small", guidance = [1.0, 1.5]}
+life = {idle_s = 2.5}
 [view.top]
 kind = "orbit"
 rate_deg_s = 5.0
@@ -170,8 +153,6 @@ amplitude_deg = 30
 azimuth_deg = -1e1
 [publish]
 jpeg_quality = 75
-[life]
-idle_s = 2.5
 """
 LAUNCH = [path.read_bytes() for path in sorted((Path(__file__).parents[2] / "launch").glob("*.toml"))]
 CHANGES = [b"model.steps=4\nview.top.azimuth_deg=-3.5\nnode_id=side", b'source.url="rtsp://x"\nlife.nice = 3']
@@ -266,20 +247,12 @@ def stamped(message: ViewMessage | EndMessage) -> Message:
     return replace(message, header=replace(message.header, t_publish_ns=STAMP_NS), sequence=7)
 
 
-def jpeg() -> ViewMessage:
-    payload = bytes(range(100))
-    header = replace(view_header(), encoding="jpeg", offsets=(0, 40, 100))
-    return ViewMessage(topic="view/top/win", header=header, payload=payload)
-
-
-def spread() -> ViewMessage:
-    header = replace(view_header(shape=(2, 4, 6, 1)), scale=0.25)
-    return ViewMessage(topic="view/top/std", header=header, payload=bytes(48))
-
-
-def preview() -> ViewMessage:
-    header = view_header(view_id="src", shape=(1, 4, 6, 3))
-    return ViewMessage(topic="src/frm", header=header, payload=bytes(72))
+def view(topic: str, size: int, **changes: object) -> Message:
+    """changes: of the header."""
+    name = topic.split("/")
+    header = view_header(view_id="src" if name[0] == "src" else "top", shape=changes.pop("shape", (2, 4, 6, 3)))
+    payload = bytes(range(size)) or bytes(int(np.prod(header.shape)))
+    return stamped(ViewMessage(topic=topic, header=replace(header, **changes), payload=payload))
 
 
 def note(topic: StatusTopic) -> StatusMessage:
@@ -290,12 +263,12 @@ def note(topic: StatusTopic) -> StatusMessage:
 GOLDEN: dict[str, tuple[Message, str]] = {
     "win": (stamped(window()), "6f9c25e8e887e5dd"),
     "frm": (stamped(window(kind="frm", images=np.zeros((1, 4, 6, 3), np.uint8))), "a2d48a39d5e10f7d"),
-    "jpeg": (stamped(jpeg()), "3dfe1948ac65e671"),
-    "std": (stamped(spread()), "c3b614c9d4032aa6"),
+    "jpeg": (view("view/top/win", 100, encoding="jpeg", offsets=(0, 40, 100)), "3dfe1948ac65e671"),
+    "std": (view("view/top/std", 0, shape=(2, 4, 6, 1), scale=0.25), "c3b614c9d4032aa6"),
     "cls": (stamped(class_map()), "20282abcca4d372a"),
     "vis": (stamped(visibility()), "0bf890c50f60cad5"),
     "depth": (stamped(depth()), "03e65644266df55a"),
-    "src": (stamped(preview()), "c1f9e5a5e28ef029"),
+    "src": (view("src/frm", 0, shape=(1, 4, 6, 3)), "c1f9e5a5e28ef029"),
     "end": (stamped(end()), "8ab29cecdf73e2a2"),
     "status": (note("status"), "78b8489d084c92e7"),
     "event": (note("event"), "8de3aded17024dc4"),

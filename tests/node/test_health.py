@@ -81,9 +81,7 @@ def test_a_stage_counts_everything_and_ranks_the_last_minute(clock: Clock) -> No
 
 
 @pytest.mark.parametrize(("seam_s", "gaps"), [(0, 19), (60, 18)], ids=["even", "looped"])
-def test_the_rate_is_measured_by_stamps_and_not_by_arrivals(
-    health: Health, clock: Clock, seam_s: int, gaps: int
-) -> None:
+def test_the_rate_is_that_of_stamps_not_of_arrivals(health: Health, clock: Clock, seam_s: int, gaps: int) -> None:
     for i in range(20):
         clock.sleep(0.02 if i % 2 else 0.18)
         health.frame(i * 100 * MS + (seam_s * S if i > 16 else 0), clock.now_ns)
@@ -109,9 +107,7 @@ def test_a_stalled_source_warns_and_a_lost_one_is_an_error_until_it_streams(heal
 
 
 @pytest.mark.parametrize(("corrupt", "expected"), [(2, []), (3, ["SRC_CORRUPT"])])
-def test_over_a_fifth_of_damaged_frames_warns_and_passes(
-    health: Health, clock: Clock, corrupt: int, expected: list[str]
-) -> None:
+def test_a_fifth_of_damaged_frames_warns(health: Health, clock: Clock, corrupt: int, expected: list[str]) -> None:
     work(health, clock, window_s=None)
     clock.sleep(6)
     stream(health, clock, frames=8)
@@ -209,9 +205,7 @@ def test_a_change_is_noticed_once_and_rendering_is_none(health: Health, clock: C
     assert not health.changed()
 
 
-def test_a_code_that_comes_all_the_time_is_published_each_time_and_logged_now_and_then(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_code_that_comes_all_the_time_is_logged_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
     outbox, now_s = Box(), 100.0
     announcer = Announcer("gcd", "0" * 32, outbox, Health(), lambda: now_s)
     for count in range(25):
@@ -309,9 +303,7 @@ def test_metrics_hold_what_the_health_was_told_and_are_explained_in_the_docs(
     assert [name for name in sorted(ours) if f"`{name}" not in text] == []
 
 
-def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_good(
-    server: MetricsServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_callers_lock_nobody_out_for_good(server: MetricsServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gcd_node.metrics._Handler.timeout", 0.5)
     before = threading.active_count()
     silent = [connected(server) for _ in range(30)]
@@ -327,7 +319,7 @@ def test_callers_that_say_nothing_neither_grow_the_node_nor_lock_probes_out_for_
             caller.close()
 
 
-def test_junk_is_refused_and_the_next_caller_served(
+def test_junk_is_refused_and_the_next_one_served(
     server: MetricsServer, health: Health, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for sent in (b"\x00\xff" * 40, b"GET " + b"/" * 70_000, b"GET /metrics HTTP/9.9\r\n\r\n", b"\r\n"):

@@ -26,6 +26,7 @@ from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
 from gcd_node.publisher import Publisher
 from gcd_node.sources import RecordedSource, SyntheticSource
 
+Capture = pytest.CaptureFixture[str]
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "launch"
 TOMLS = sorted(LAUNCH.glob("*.toml"))
@@ -218,9 +219,7 @@ def test_a_good_launch_file_is_looked_at_from_end_to_end(launch: Path) -> None:
         ("publish.data=tcp://0.0.0.0:5580", "endpoints", 78),
     ],
 )
-def test_what_would_fail_is_named_and_is_the_exit_code(
-    change: str, topic: str, code: int, launch: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_fails_is_the_exit_code(change: str, topic: str, code: int, launch: Path, capsys: Capture) -> None:
     assert found(launch, change)[topic][0] == "failed"
     assert run_app(["check", str(launch), "--set", change]) == code
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
@@ -256,7 +255,7 @@ def test_where_recordings_would_go_is_looked_at(launch: Path, tmp_path: Path) ->
 # The configuration as text.
 
 
-def test_what_is_printed_is_the_same_launch_file_again(launch: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_printed_is_the_same_launch_file_again(launch: Path, capsys: Capture) -> None:
     assert run_app(["run", str(launch), "--set", "model.steps=7", "--print-config"]) == 0
     again = parse_config(capsys.readouterr().out.encode(), "printed")
     assert again == load_config(launch, ["model.steps=7"])

@@ -106,9 +106,7 @@ def test_realtime_drops_windows_and_never_frames() -> None:
 
 @pytest.mark.parametrize(("family", "error"), [("kubric90", ViewRangeError), ("driving", ViewFixedError)])
 @pytest.mark.parametrize("view", ["azimuth_deg = 91.0", 'kind = "orbit", rate_deg_s = 9.0, amplitude_deg = 120.0'])
-def test_a_view_the_checkpoint_cannot_give_is_refused_before_the_first_frame(
-    family: str, view: str, error: type[Exception]
-) -> None:
+def test_a_view_the_model_cannot_give_is_refused_at_the_start(family: str, view: str, error: type[Exception]) -> None:
     model = FakeSynthesizer(traits(family))
     with pytest.raises(error):
         run(fake_config(f"view.main={{{view}}}"), model, FakeSource(14, fps=10.0))
@@ -157,7 +155,7 @@ def test_nobody_claims_to_know_where_an_unsteered_camera_stands_and_the_driving_
         (None, ShapeError("no such picture"), "SRC_FAILED", "closed", "ready"),
     ],
 )
-def test_the_last_status_says_how_it_ended(
+def test_the_last_status_is_the_end(
     act: Exception | None, fails: Exception | None, code: str, source: str, model: str
 ) -> None:
     def do(_: RenderOptions) -> None:

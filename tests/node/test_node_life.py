@@ -104,7 +104,7 @@ def test_several_views_come_from_one_batch_and_change_alone(tmp_path: Path) -> N
     assert swings == pytest.approx([0.0, 14.0, 28.0])  # a change of its neighbour does not make it begin again
     assert {len(paths) for paths, _ in model.asked} == {2}
     assert len({view.header.cfg_digest for view in rig.of()[:3]}) == 2
-    assert [meta["view_revs"]["main"] for meta in rig.metas()] == [1, 2]
+    assert [meta["view_revs"]["main"] for meta in rig.told("meta")] == [1, 2]
 
 
 def test_a_view_is_set_by_angles_by_a_rigid_pose_or_as_an_orbit(tmp_path: Path) -> None:
@@ -242,9 +242,7 @@ class SlowSynthesizer(FakeSynthesizer):
 
 
 @pytest.mark.parametrize("part", ["encoder", "step", "decoder"])
-def test_f23_whatever_part_of_the_model_is_at_work_it_is_abandoned(
-    tmp_path: Path, part: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_f23_any_part_of_the_model_is_abandoned(tmp_path: Path, part: str, caplog: pytest.LogCaptureFixture) -> None:
     model = SlowSynthesizer(part)
     with Rig(tmp_path, lambda _: FakeSource(10_000), model, config=LOCKSTEP) as rig:
         assert model.begun.wait(30)

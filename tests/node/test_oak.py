@@ -85,9 +85,7 @@ def test_damaged_and_foreign_messages_are_counted_and_not_yielded() -> None:
 
 
 @pytest.mark.parametrize("state", ["DISCONNECTED", "FAILED", None])
-def test_a_device_that_goes_away_is_a_loss_that_names_its_state(
-    state: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_that_goes_is_a_loss_and_its_state_named(state: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = MagicMock()
     broken.get.side_effect = broken.tryGetAll.side_effect = RuntimeError("X_LINK_ERROR")
     factory = pipelines.Scripted(pipelines.steady())
@@ -154,9 +152,7 @@ def device(serial: str, name: str = "1.2") -> dai.DeviceInfo:
 ONE, TWO = device("18443010A1B2C3D4E5", "1.2"), device("19443010AABBCCDDEE", "192.168.1.20")
 
 
-def test_without_a_name_there_must_be_one_device_and_one_that_is_named_must_be_there(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_a_name_there_must_be_one_device_and_a_named_one_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
     with pytest.raises(SourceAbsentError) as caught:
         _ = open_oak(OakSource(device="127.0.0.1", open_timeout_s=PATIENT_S)).info

@@ -191,9 +191,7 @@ def server(recording: Path) -> Iterator[RtspServer]:
         yield running
 
 
-def test_after_a_short_silence_what_piled_up_is_not_taken_for_new_and_after_a_long_one_it_is_lost(
-    server: RtspServer,
-) -> None:
+def test_what_piled_up_in_a_silence_is_not_new_and_after_a_long_one_it_is_lost(server: RtspServer) -> None:
     source = open_stream(RtspSource(url=server.url, open_timeout_s=GUARD_S), read_timeout_s=4.0)
     frames = source.frames()
     before = next(frames)
@@ -210,7 +208,7 @@ def test_after_a_short_silence_what_piled_up_is_not_taken_for_new_and_after_a_lo
     assert 2.0 < time.monotonic() - begin < GUARD_S
 
 
-def test_a_password_opens_the_stream_and_no_password_is_ever_repeated(
+def test_a_password_opens_a_stream_and_is_never_repeated(
     recording: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
@@ -317,9 +315,7 @@ def watching(
 
 
 @pytest.mark.parametrize("ending", [SourceLostError("USB said goodbye"), SourceError("torn"), None])
-def test_a_silent_camera_stalls_and_goes_on_and_one_that_says_it_is_gone_is_believed_at_once(
-    ending: Exception | None,
-) -> None:
+def test_a_silent_camera_stalls_and_one_that_says_it_is_gone_is_believed(ending: Exception | None) -> None:
     camera, second = Camera(), Camera()
     with watching(camera, Bench(second), stall_ms=100.0) as reader:
         camera.shoot()
@@ -421,9 +417,7 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
     until(late.closed.is_set)  # nobody wants it any more
 
 
-def test_patience_follows_the_rate_and_two_seconds_and_waiting_doubles_up_to_its_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_patience_follows_the_rate_and_waiting_doubles_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert patience_s(V4l2Source(), FPS) == (0.2, 1.8)
     assert patience_s(V4l2Source(), 5.0) == pytest.approx((0.6, 1.8))
     assert patience_s(V4l2Source(), 1.0) == pytest.approx((3.0, 6.0))

@@ -194,9 +194,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(place)], check=True)
 
 
-def test_f22_a_full_disk_ends_the_recording_with_a_readable_file_and_the_stream_goes_on(
-    tmp_path: Path, small_disk: Path
-) -> None:
+def test_f22_a_full_disk_ends_the_recording_readably_and_not_the_stream(tmp_path: Path, small_disk: Path) -> None:
     more = section(small_disk / "here", ', autostart = true, input_encoding = "raw"')
     with Rig(tmp_path, lambda _: Calibrated(10_000_000), config=LOCKSTEP, more=more) as rig:
         stopped = rig.await_event("REC_STOPPED")

@@ -39,6 +39,7 @@ from gcd_node.replay.lockstep import digest_of, lockstep_config, replay
 from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, keep_pixels, new_folder, open_run, pixel_digest
 from gcd_node.stream_context import config_digest
 
+Capture = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.timeout(60)
 
 
@@ -132,9 +133,7 @@ def test_windows_that_were_rejected_are_counted_and_those_with_nan_named(tmp_pat
     assert str(window_seed(nan.cfg_digest, 1, 1)) in nan.troubles["MODEL_NAN in window 1"]
 
 
-def test_a_replay_opens_no_socket_and_holds_a_gpu_to_repeatable_convolutions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_replay_opens_no_socket_and_is_repeatable_on_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("a replay opened a socket")
 
@@ -153,9 +152,7 @@ def test_a_replay_opens_no_socket_and_holds_a_gpu_to_repeatable_convolutions(
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_live_camera_is_refused_and_what_never_ends_is_played_once_or_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_replayed_is_refused_and_a_loop_played_once(tmp_path: Path, capsys: Capture) -> None:
     rest = '\n[model]\nweights = "fake"\n[view.main]'
     (tmp_path / "l.toml").write_text(f'[source]\nkind = "rtsp"\nurl = "rtsp://u:secret@camera/1"{rest}')
     assert run_app(["replay", str(tmp_path / "l.toml"), "--out", str(tmp_path / "run")]) == 78
@@ -195,9 +192,7 @@ def test_a_replay_that_fails_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_ends_a_replay_with_what_could_not_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_a_replay_with_what_was_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, _: Path) -> None:
         raise OSError(28, "No space left on device", path)
 
@@ -393,9 +388,7 @@ def test_the_first_divergence_says_whether_input_and_seed_were_the_same(golden: 
     assert "same pictures and another seed" in told(seed)
 
 
-def test_exit_codes_verdict_and_json_tell_same_near_different_damaged_and_missing(
-    golden: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_diff_tells_same_near_and_different(golden: RunFolder, tmp_path: Path, capsys: Capture) -> None:
     other = lowered(tmp_path / "run", {(1, 4): 5})
     damaged = copied(golden, tmp_path / "damaged")
     (damaged / MANIFEST).write_text("{")

@@ -310,9 +310,7 @@ BIG = 60 * 2**20  # a chunk may hold as much
 
 
 @pytest.mark.parametrize("is_cut", [True, False], ids=["cut", "damaged"])
-def test_a_log_plays_to_where_it_was_cut_or_is_damaged_and_says_so(
-    is_cut: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_log_plays_to_where_it_is_damaged(is_cut: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     images = list(np.random.default_rng(0).integers(0, 255, (60, HEIGHT, WIDTH, 3), np.uint8))
     path = write_log(tmp_path / "log.mcap", images, compression=CompressionType.NONE, chunk_size=1 << 13)
     assert len(list(LogSource(path).frames())) == 60
@@ -347,7 +345,7 @@ def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_damaged_pictures_are_counted_and_a_calibration_that_lacks_what_its_name_promises_left_out(
+def test_damaged_pictures_are_counted_and_an_odd_calibration_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     bad = [b"", b"\xff\xd8\xff nothing", coded(flat(1, 2, 3))[:200], b"GIF89a" + bytes(99)]
@@ -477,9 +475,7 @@ def endless(path: Path) -> Path:
     return path
 
 
-def test_a_log_whose_pictures_never_come_again_plays_and_then_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_whose_pictures_never_come_again_fails_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logs, "_SEARCH_S", 0.5)
     log = LogSource(endless(tmp_path / "log.mcap"))  # what is known of them is enough to open it
     frames = log.frames()

@@ -208,9 +208,7 @@ def test_what_is_old_or_on_its_way_is_never_published(bench: Bench) -> None:
     bench.until(lambda: bench.out("~/top/image/compressed") and bench.diagnostic(1).level == 0, jpeg_window())
 
 
-def test_what_goes_wrong_with_one_kind_shows_and_leaves_the_others_alone(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_goes_wrong_with_one_kind_leaves_the_others_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def refusing(data: str, view: str, kind: str, **options: Any) -> ViewSubscriber:
         if kind == "cls" and refused:
             raise AuthError("no key")
@@ -226,9 +224,7 @@ def test_what_goes_wrong_with_one_kind_shows_and_leaves_the_others_alone(
     bench.until(lambda: bench.out("~/top/classes"), class_map(drawn=numbers(1)))
 
 
-def test_a_dead_node_shows_and_one_that_is_started_again_is_read_again(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dead_node_shows_and_its_next_life_is_read(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.node.tick()
     assert (bench.diagnostic(0).level, bench.diagnostic(0).message) == (3, "no node")
     bench.until(lambda: bench.diagnostic(0).level == 0 and bench.out("~/top/depth"), depth())
@@ -287,9 +283,7 @@ def test_the_package_is_complete_and_imports_what_it_declares(monkeypatch: pytes
     assert {"gcd-client", "numpy"} <= set(setup["install_requires"])
 
 
-def test_the_launch_file_starts_the_package_with_parameters_it_knows(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_launch_file_has_parameters_the_package_knows(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     ros = MagicMock()
     ros.LaunchConfiguration = lambda name: (name,)
     for name in ("", ".actions", ".substitutions", "_ros.actions", "_ros.parameter_descriptions"):

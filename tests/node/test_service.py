@@ -57,9 +57,7 @@ def test_the_watchdog_is_fed_four_times_a_period_however_often_it_is_called(tmp_
 
 
 @pytest.mark.parametrize("address", ["/nonexistent/notify", "vsock:2:1234", "@" + "x" * 200])
-def test_a_socket_that_cannot_be_reached_is_logged_once_and_the_node_goes_on(
-    address: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_socket_that_is_not_there_is_logged_once_and_no_more(address: str, caplog: pytest.LogCaptureFixture) -> None:
     service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "30000000"})
     for tell in (service.ready, service.alive, service.alive, service.stopping):
         tell()
@@ -154,7 +152,7 @@ import os; os._exit(0)
 # How `gcd-node run` behaves beside others on its machine, and how the process ends.
 
 
-def test_a_network_takes_half_the_cores_or_so_many_threads_as_is_stated_and_opencv_no_more(
+def test_a_network_takes_half_the_cores_or_the_stated_threads_and_opencv_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for cores, threads in ((1, 1), (2, 1), (8, 4)):

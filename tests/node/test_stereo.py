@@ -144,7 +144,7 @@ def pair() -> tuple[Image, Image]:
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
-def test_an_unrectified_pair_gives_its_depth_through_its_calibration(
+def test_an_unrectified_pair_gives_depth_by_its_calibration(
     tmp_path: Path, pair: tuple[Image, Image], shrink: int
 ) -> None:
     path = written(tmp_path / "calib.json", board())
@@ -161,9 +161,7 @@ def test_an_unrectified_pair_gives_its_depth_through_its_calibration(
 
 
 @pytest.mark.parametrize("axis", [0, 2], ids=["tilted", "rolled"])
-def test_the_calibration_of_another_device_is_noticed_in_the_pictures(
-    tmp_path: Path, pair: tuple[Image, Image], axis: int
-) -> None:
+def test_the_calibration_of_another_device_is_noticed(tmp_path: Path, pair: tuple[Image, Image], axis: int) -> None:
     off = moved(turn=[2.0 * (axis == each) for each in range(3)])
     content = board()
     step = off @ np.linalg.inv(WORLD_FROM_RIGHT) @ WORLD_FROM_LEFT

@@ -72,9 +72,7 @@ def test_settings_are_what_they_are_in_python(project: pytest.Pytester) -> None:
     run_test(project, settings={"model.stepps": 4}).stdout.fnmatch_lines(["*ConfigError: *`steps`*"])
 
 
-def test_an_update_makes_a_run_anew_byte_for_byte_or_in_place_of_a_damaged_one_and_removes_nothing_else(
-    project: pytest.Pytester,
-) -> None:
+def test_an_update_makes_a_run_anew_byte_for_byte_and_removes_nothing_else(project: pytest.Pytester) -> None:
     mine = project.path / "golden" / "drive" / "mine.txt"
     mine.parent.mkdir(parents=True)
     mine.touch()

@@ -149,9 +149,7 @@ def test_maps_are_sent_without_loss_and_depth_as_grey_levels() -> None:
         assert [each["name"] for each in classes] == [each.name for each in message.header.classes or ()]
 
 
-def test_every_file_is_served_with_headers_that_let_nothing_else_in_and_none_holds_the_token(
-    viewer: ViewerServer,
-) -> None:
+def test_every_file_is_served_with_headers_that_let_nothing_in_and_no_token(viewer: ViewerServer) -> None:
     assert viewer.operator_url == f"{viewer.url}#token={TOKEN}"
     for path, (content, kind) in load_page().items():
         status, headers, body = get(viewer, path)
@@ -162,9 +160,7 @@ def test_every_file_is_served_with_headers_that_let_nothing_else_in_and_none_hol
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
 
 
-def test_a_foreign_name_made_to_point_here_gets_nothing_and_there_are_no_other_files_and_methods(
-    viewer: ViewerServer,
-) -> None:
+def test_a_foreign_name_made_to_point_here_gets_nothing(viewer: ViewerServer) -> None:
     for hosts in (["evil.example"], ["127.0.0.1.evil.example:80"], [""], [], ["127.0.0.1", "evil"], ["0.0.0.0"]):
         status, _, body = get(viewer, "/", hosts=hosts)
         assert (status in (400, 403), b"<html" in body) == (True, False), hosts
@@ -310,9 +306,7 @@ def test_pictures_come_only_while_somebody_looks_and_an_operator_steers_the_node
             assert answer(late, "describe")["result"]["limits"]["azimuth_deg"] == [-90.0, 90.0]
 
 
-def test_a_page_that_never_reads_slows_neither_node_nor_others_and_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_that_never_reads_slows_nobody_and_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_module, "_PING_S", 0.5)
     monkeypatch.setattr(feed_module, "_STUCK_S", 1.0)
     noise = np.random.default_rng(0).integers(0, 256, (14, 256, 384, 3), np.uint8)
@@ -336,9 +330,7 @@ def test_a_page_that_never_reads_slows_neither_node_nor_others_and_is_given_up(
 
 
 @pytest.mark.parametrize("page_role", ["viewer", "operator"])
-def test_a_node_that_asks_for_keys_asks_its_own_page_too(
-    page_role: Role, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_node_with_keys_asks_its_page_too(page_role: Role, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     node_keys, page_keys = new_key_pair(), new_key_pair()
     write_key_pair(tmp_path / "node", node_keys)
     write_key_pair(tmp_path / "page", page_keys)

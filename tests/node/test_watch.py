@@ -30,6 +30,7 @@ from gcd_node.image_io import ViewSaver, to_u8, write_arrays, write_png
 from gcd_node.publisher import Publisher
 from gcd_node.sources.files import read_picture
 
+Capture = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.timeout(60)
 SEEN = np.random.default_rng(0).integers(0, 3, (2, 16, 16), np.uint8)
 WALL_NS = 1_800_000_000_000_000_000
@@ -83,9 +84,7 @@ def test_a_table_has_the_figures_of_each_topic() -> None:
     assert max(map(len, text_of(table.render("", ended=False), 80).splitlines())) <= 80
 
 
-def test_saved_pictures_and_video_are_the_published_pixels_hatched_beside_them_where_their_own_visibility_came(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_saved_are_the_published_pixels_and_hatched_ones(tmp_path: Path, capsys: Capture) -> None:
     shown = [pixels(i, height=16, width=16) for i in range(3)]
     seen = [visibility(0, seen=SEEN), visibility(5, seen=SEEN)]  # the second is of another window
     first, second, third = (window(i, images=images) for i, images in enumerate(shown))
@@ -228,9 +227,7 @@ def test_whatever_a_node_says_is_drawn_without_harm(fields: dict[str, Any]) -> N
     assert json.loads(json.dumps(board.record(10.0)))["node_id"] == "robot_7"
 
 
-def test_status_prints_a_table_or_one_line_of_json_or_every_note_on_its_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_status_prints_a_table_or_notes_as_json(tmp_path: Path, capsys: Capture) -> None:
     endpoint = f"ipc://{tmp_path}/status"
     assert run_app(["status", endpoint, "--once", "--timeout", "0.2"]) == 69
     assert capsys.readouterr().err.startswith(f"error: no status from {endpoint} within 0.2 s: is the node running")

@@ -192,7 +192,7 @@ def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None
         (17.0, (), (17.0, False)),
     ],
 )
-def test_the_highest_trained_rate_the_source_can_give_is_chosen(
+def test_the_highest_rate_it_can_give_is_chosen(
     source_fps: float, trained: tuple[float, ...], wanted: tuple[float, bool]
 ) -> None:
     assert choose_fps(source_fps, trained) == wanted
