@@ -165,13 +165,6 @@ class ViewSaver:
         """Finish the videos; until then they may lack their end."""
         for video in self._videos.values():
             video.close()
-        self._videos.clear()
-
-    def __enter__(self) -> "ViewSaver":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _write(self, view: ReceivedView, frames: Image, folder: Path) -> None:
         header, kind = view.header, kind_of(view.message.topic)

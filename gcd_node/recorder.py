@@ -72,10 +72,9 @@ def check_room(config: RecordConfig, root: Path) -> float:
 
 def _taken_bytes(root: Path) -> int:
     total = 0
-    for folder, _, names in os.walk(root):
-        for path in (os.path.join(folder, name) for name in names if name.endswith(".mcap")):
-            with suppress(FileNotFoundError):  # somebody moved it away meanwhile
-                total += os.stat(path).st_size
+    for path in (Path(folder, name) for folder, _, names in os.walk(root) for name in names):
+        with suppress(FileNotFoundError):  # somebody moved it away meanwhile
+            total += path.stat().st_size if path.suffix == ".mcap" else 0
     return total
 
 

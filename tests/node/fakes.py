@@ -4,6 +4,7 @@ import functools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -261,8 +262,10 @@ class FakeNode:
         self.result: Any = None
         self.events: list[tuple[str, dict[str, object]]] = []
 
-    def serve(self, endpoint: str, **options: Any) -> ControlServer:
-        return ControlServer(endpoint, self.handle, lambda: "active", self.event, **options)
+    @contextmanager
+    def serve(self, endpoint: str, **options: Any) -> Iterator[ControlServer]:
+        with closing(ControlServer(endpoint, self.handle, lambda: "active", self.event, **options)) as server:
+            yield server
 
     def handle(self, command: Command, role: Role) -> Outcome:
         self.heard.append(command)

@@ -164,8 +164,7 @@ def test_f17_oversize_is_refused_and_a_huge_one_drops_its_sender(
 
 def test_closing_lets_the_last_reply_out_and_leaves_nothing(tmp_path: Path, node: FakeNode) -> None:
     threads = threading.active_count()
-    server = node.serve(f"ipc://{tmp_path}/c")
-    with ControlClient(server.endpoint, timeout_s=20.0) as client:
+    with node.serve(f"ipc://{tmp_path}/c") as server, ControlClient(server.endpoint, timeout_s=20.0) as client:
         assert client.request("shutdown").ok
         server.close()
         server.close()

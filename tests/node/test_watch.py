@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def test_what_is_saved_are_the_published_pixels_and_hatched_ones(tmp_path: Path,
 
 def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Path) -> None:
     drawn = [numbers(i, height=16, width=16) for i in range(2)]
-    with ViewSaver(tmp_path) as saver:
+    with closing(ViewSaver(tmp_path)) as saver:
         for i in range(2):
             saver.add(received(window(i, images=pixels(i, height=16, width=16))))
             saver.add(received(class_map(i, drawn=drawn[i])))
@@ -125,11 +126,11 @@ def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Pa
 def test_a_view_that_changes_its_size_and_what_cannot_be_written_are_errors(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     small, large = (received(window(images=pixels(height=16, width=width))) for width in (16, 32))
-    with ViewSaver(tmp_path) as saver:
+    with closing(ViewSaver(tmp_path)) as saver:
         saver.add(small)
         with pytest.raises(OutputError):
             saver.add(large)
-    with ViewSaver(tmp_path / "file") as saver, pytest.raises(OutputError):
+    with closing(ViewSaver(tmp_path / "file")) as saver, pytest.raises(OutputError):
         saver.add(small)
 
 
