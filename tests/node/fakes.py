@@ -41,7 +41,7 @@ from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import MessageSink, PublisherStats
 from gcd_node.node import Node
-from gcd_node.verbs import Command, Outcome, RequestError, SetView
+from gcd_node.verbs import Command, Outcome, RequestError
 
 HEIGHT, WIDTH = 64, 96
 
@@ -271,7 +271,6 @@ class FakeNode:
         self.heard.append(command)
         match command.verb:
             case "set_view":
-                assert isinstance(command.args, SetView)
                 if abs(command.args.azimuth_deg or 0.0) > 90:
                     allowed: dict[str, object] = {"allowed": {"azimuth_deg": [-90, 90]}}
                     raise RequestError("azimuth_deg is beyond what was trained", Code.OUT_OF_RANGE, "", allowed)

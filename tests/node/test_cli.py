@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from cameras import environment, noise
 from fakes import HEIGHT, WIDTH, FakeSynthesizer, live_traits, traits, write_tiny
-from media import environment, noise
 from typer.main import get_command
 
 from gcd_model import ASSUMED_SOURCE, CameraMount, Clip, OptionError, SphericalDelta
@@ -138,7 +138,6 @@ def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, fake: 
     write_video(tmp_path / "wide.mkv", [np.zeros((2 * WIDTH, 4 * WIDTH, 3), np.uint8)] * 14, 10.0)
     assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / "out", "--hfov-deg", "90", "--mount-height", "2") == 0
     mount = fake.clips[0].mount
-    assert mount is not None
     assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # 2:1 became 3:2
 
 
@@ -244,15 +243,10 @@ def named(views: dict[str, list[Arrival]], *names: str) -> list[float]:
     return [figures[name] for name in names]
 
 
-def test_windows_answer_their_frames_and_a_lost_one_misses_as_many() -> None:
+def test_a_frame_is_answered_once_every_view_has_it_and_a_lost_window_misses_as_many() -> None:
     windows = arrivals((1000, 500, range(14)), (2400, 700, range(14, 28)), (5200, 600, range(42, 56)))
-    names = ("NUM_FRAMES_SENT", "NUM_MISSED_FRAMES", "MEAN_FRAME_RATE", "MEAN_PLAYBACK_FRAME_RATE")
-    assert named({"top": windows}, *names) == pytest.approx([56, 14, 28 / 4.2, 42 / 4.2])
-    ages = named({"top": windows}, "MEAN_LATENCY", "P50_LATENCY", "P95_LATENCY", "MAX_LATENCY", "MAX_JITTER")
-    assert ages == [600, 600, 700, 700, 1400]
-
-
-def test_a_frame_is_answered_once_every_view_has_it() -> None:
+    names = ("NUM_FRAMES_SENT", "NUM_MISSED_FRAMES", "MEAN_FRAME_RATE", "P95_LATENCY", "MAX_JITTER")
+    assert named({"top": windows}, *names) == pytest.approx([56, 14, 28 / 4.2, 700, 1400])
     top = arrivals(*((100 * seq, 80, range(seq, seq + 1)) for seq in range(10)))
     side = arrivals(*((100 * seq + 50, 120, range(seq, seq + 1)) for seq in range(1, 10) if seq != 5))
     counted = named({"top": top, "side": side}, "NUM_FRAMES_SENT", "NUM_MISSED_FRAMES", "NUM_VIEWS", "MAX_LATENCY")

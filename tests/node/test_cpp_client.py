@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from cameras import until
+from cameras import until, write_video
 from fakes import HEIGHT, WIDTH, FakeSynthesizer, traits
-from media import write_video
 from msgspec.structs import replace
 from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator
 from numpy.typing import NDArray

@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from cameras import Bench
+from cameras import Bench, environment
 from fakes import LOCKSTEP, FakeSource, FakeSynthesizer, Steady, traits, write_tiny
-from media import environment
 from recordings import files, of, said, summary
 from rig import Rig
 from safetensors import safe_open
@@ -161,7 +160,6 @@ def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
     with Rig(tmp_path, lambda _: Steady(), model, config=REALTIME) as rig:
         reader = start_reader(f"ipc://{tmp_path}/data", "main")
         try:
-            assert reader.stdout is not None
             assert reader.stdout.readline()
             reader.send_signal(signal.SIGSTOP)
             begun, before_kb = len(rig.of()), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -222,7 +220,6 @@ def test_f23_a_model_that_hears_nothing_does_not_hold_up_the_end_and_a_second_si
     hung: dict[str, "subprocess.Popen[str]"], phase: str
 ) -> None:
     node = hung[phase]
-    assert node.stdout is not None
     assert node.stdout.readline() == "hangs\n"
     node.send_signal(signal.SIGTERM)
     if phase == "render":

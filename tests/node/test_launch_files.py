@@ -14,8 +14,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from cameras import write_video
 from fakes import write_tiny
-from media import write_video
 from msgspec.structs import replace
 from typer.main import get_command
 

@@ -67,14 +67,16 @@ def config(more: str = "") -> NodeConfig:
 
 
 @pytest.mark.timeout(300)
-def test_a_replay_of_the_live_model_is_the_same_twice_with_all_its_maps(tmp_path: Path) -> None:
-    (tmp_path / "launch.toml").write_text(LAUNCH)
-    for name in ("a", "b"):
-        assert run_app(["replay", str(tmp_path / "launch.toml"), "--out", str(tmp_path / name)]) == 0
-    windows = [open_run(tmp_path / name).manifest.windows for name in ("a", "b")]
-    assert windows[0] == windows[1]
-    assert set(windows[0][0].views["placed"]) == {"win", "cls", "vis", "depth"}
-    assert [len(each.stamps_ns) for each in windows[0]] == [1] * 5  # a view of every frame
+def test_a_replay_of_the_live_model_is_the_same_twice_with_all_its_maps_whatever_the_pace(tmp_path: Path) -> None:
+    (tmp_path / "launch.toml").write_text(LAUNCH + '[publish]\nencoding = "jpeg"\n')
+    for name, pace in (("a", "realtime"), ("b", "lockstep")):
+        where = ["--out", str(tmp_path / name), "--set", f"source.pace={pace}"]
+        assert run_app(["replay", str(tmp_path / "launch.toml"), *where]) == 0
+    assert run_app(["diff", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    first, second = (open_run(tmp_path / name).manifest for name in ("a", "b"))
+    assert first == second
+    assert set(first.windows[0].views["placed"]) == {"win", "cls", "vis", "depth"}
+    assert [len(each.stamps_ns) for each in first.windows] == [1] * 5  # a view of every frame
 
 
 def test_views_stand_at_their_goals_and_are_placed_from_the_mount_by_models_that_take_any_pose() -> None:
@@ -130,7 +132,6 @@ def test_the_lens_is_the_stated_one_or_is_assumed_and_published() -> None:
         source = struct_replace(config().source, hfov_deg=hfov_deg, pose=pose)
         views = {"main": ViewConfig()}
         run = prepare_stream(struct_replace(config(), source=source, view=views), TRAITS, INFO)
-        assert run.intrinsics is not None
         assert run.intrinsics.hfov_deg == pytest.approx(wanted)
         assert run.ood == ()
     wide = prepare_stream(
@@ -160,7 +161,6 @@ def played(made: Traits, pose: str = "", fps: float = 10.0) -> tuple[FakeSynthes
 
 def matrices(box: Box) -> np.ndarray:
     found = box.of("win")[0].header.source_from_view
-    assert found is not None
     return np.array(found).reshape(-1, 4, 4)
 
 
@@ -169,7 +169,6 @@ def test_the_view_stays_where_it_is_on_the_vehicle_however_the_camera_is_mounted
     _, usual = played(live_traits())
     model, box = played(live_traits(), pose)
     mount = model.clips[0].mount
-    assert mount is not None
     moved = mount.vehicle_from_camera.numpy() @ matrices(box)
     assert moved == pytest.approx(CameraMount().vehicle_from_camera.numpy() @ matrices(usual), abs=1e-9)
     told = box.told("meta")[0]["mount"]
@@ -201,7 +200,6 @@ def test_a_pose_that_cannot_be_or_in_words_the_model_does_not_know_is_refused(ma
 def test_an_orbit_is_planned_from_where_the_camera_is_said_to_stand() -> None:
     model, box = played(traits(), "elevation_deg = 25.0, radius = 13.0", fps=12.0)
     source, meta = model.asked[0][0][0].source, box.told("meta")[0]
-    assert source is not None
     assert (source.elevation_deg, source.radius_m) == (25.0, 13.0)
     assert model.clips[0].mount is None
     assert (meta["mount"], meta["src_pose"]) == (None, {"el_deg": 25.0, "r": 13.0, "assumed": False})

@@ -15,9 +15,8 @@ from unittest.mock import MagicMock, create_autospec
 
 import numpy as np
 import pytest
-from cameras import until
+from cameras import HEIGHT, WIDTH, environment, flat, until
 from fakes import fake_config
-from media import HEIGHT, WIDTH, environment, flat
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, LensModel
@@ -258,7 +257,6 @@ def test_the_lens_of_the_picture_itself_comes_before_the_memory() -> None:
     stored = LensModel(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
     with closing(opened(pipelines.Handed(first), lambda *_: stored)) as camera:
         lens = camera.info.lens
-    assert lens is not None
     assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.coefficients) == (80.0, 81.0, 32.0, 24.0, tuple(RATIONAL))
 
 
@@ -307,7 +305,6 @@ def test_hardware_gives_the_size_and_rate_it_was_asked_for_fresh_and_with_its_le
     assert float(np.median(ages_ms)) < 200
     assert (frames[0].size, oak.corrupt, oak.info.stamp_uncertainty_us) == ((1280, 720), 0, 500)
     lens = oak.info.lens
-    assert lens is not None
     assert 40 < 2 * math.degrees(math.atan(lens.width / 2 / lens.fx)) < 150
     assert (lens.cx, lens.cy) == pytest.approx((lens.width / 2, lens.height / 2), rel=0.1)
     begin = time.monotonic()

@@ -16,8 +16,7 @@ from unittest.mock import create_autospec
 import cv2
 import msgspec
 import pytest
-from cameras import FPS, Bench, Camera, FakeVideoCapture, until
-from media import HEIGHT, WIDTH, environment, flat
+from cameras import FPS, HEIGHT, WIDTH, Bench, Camera, FakeVideoCapture, environment, flat, until
 from rtsp_server import RtspServer, serving, write_transport_stream
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
@@ -236,7 +235,6 @@ def test_a_process_ends_although_a_read_never_returns(server: RtspServer) -> Non
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "open\n"
         server.stall()
         time.sleep(0.3)

@@ -52,18 +52,6 @@ def context():
 
 
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
-def test_a_second_process_receives_every_window_bit_for_bit(tmp_path, transport) -> None:
-    data = f"ipc://{tmp_path}/data" if transport == "ipc" else "tcp://127.0.0.1:0"
-    with opened(tmp_path, data=data, readers=1, lockstep=True) as publisher:
-        reader = start_reader(publisher.endpoint, "top", "--all")
-        for i in range(5):
-            assert publisher.send(window(i))
-        publisher.end(end(window_id=4), delay_ms=0)
-    expected = [f"{i} {i} 0 False {zlib.crc32(pixels(i))}" for i in range(5)]
-    assert lines_of(reader) == [*expected, "end"]
-
-
-@pytest.mark.parametrize("transport", ["ipc", "tcp"])
 def test_only_what_leaves_the_machine_s_memory_carries_a_checksum(tmp_path, context, transport) -> None:
     data = f"ipc://{tmp_path}/data" if transport == "ipc" else "tcp://127.0.0.1:0"
     with opened(tmp_path, data=data) as publisher:
@@ -77,15 +65,16 @@ def test_only_what_leaves_the_machine_s_memory_carries_a_checksum(tmp_path, cont
     assert found == [0 if transport == "ipc" else zlib.crc32(parts[0][64:]), zlib.crc32(parts[1][64:])]
 
 
-def test_lockstep_never_skips_for_a_slow_reader(tmp_path) -> None:
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+def test_lockstep_never_skips_for_a_slow_process(tmp_path, transport) -> None:
+    data = "" if transport == "ipc" else "tcp://127.0.0.1:0"
     big = pixels(1, frames=14, height=128, width=192)  # 1 MB: more than the kernel's buffers hold
-    with opened(tmp_path, lockstep=True, readers=1) as publisher:
+    with opened(tmp_path, data=data, lockstep=True, readers=1) as publisher:
         reader = start_reader(publisher.endpoint, "top", "--all", "--slow", "0.05")
         for i in range(30):
             publisher.send(window(i, images=big))
         publisher.end(end(window_id=29))
-    rows = [line.split()[:3] for line in lines_of(reader)]
-    assert rows == [[str(i), str(i), "0"] for i in range(30)] + [["end"]]
+    assert lines_of(reader) == [*(f"{i} {i} 0 False {zlib.crc32(big)}" for i in range(30)), "end"]  # bit for bit
 
 
 def test_a_conflated_slow_reader_gets_the_newest_window_and_then_the_end(tmp_path) -> None:
@@ -321,9 +310,7 @@ def test_a_preview_says_that_it_is_no_generated_view_and_what_frame_it_is() -> N
     assert header.t_capture_ns == (5_000_000_000,)  # of a recording, its own clock
     assert (header.src.seq, header.src.epoch, header.model.name) == ((7,), 3, "none")
     assert 0 <= header.age_ms < 30_000
-    assert header.pose is not None
     assert header.pose[0].az_deg == 0.0
-    assert header.intrinsics is not None
     assert header.intrinsics[0] == pytest.approx(320.0)  # half of 640 over tan 45 degrees
     assert (header.intrinsics[2], header.intrinsics[5]) == (319.5, 179.5)
     assert preview(1280, 720).header.intrinsics is None
@@ -360,7 +347,6 @@ def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> N
             until(lambda: rig.publisher.stats.previews == 1)
             camera.run(30)
             first = views.receive(60_000)
-            assert first is not None
             assert (first.images.shape, first.header.synthetic) == ((1, 64, 96, 3), False)
             assert first.header.intrinsics is not None
             assert np.abs(first.images.astype(int) - 20 - first.header.src.seq[0]).max() <= 3

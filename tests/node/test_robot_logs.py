@@ -18,6 +18,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from cameras import HEIGHT, WIDTH, flat, ramp
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
@@ -25,7 +26,6 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.writer import CompressionType
-from media import HEIGHT, WIDTH, flat, ramp
 from mutations import BYTE_PIECES, ROUNDS, Mutator, outcomes
 from robot_logs import (
     TOPIC,
@@ -168,7 +168,6 @@ def test_foxglove_pictures_are_read_with_their_stamps_and_calibration(tmp_path: 
     frames, lens = list(source.frames()), source.info.lens
     assert stamps(frames) == [at(i) for i in range(4)]
     assert all(near(frame.image) for frame in frames)
-    assert lens is not None
     assert (lens.fx, lens.fy, lens.cx, lens.coefficients) == (60.0, 61.0, 32.0, tuple(d))
 
 
@@ -216,7 +215,6 @@ def test_frames_carry_the_depth_that_was_stamped_nearest_to_them_in_metres(tmp_p
     frames = companions(tmp_path / "log.mcap", more)
     assert stamps(frames) == [at(i) for i in range(4)]
     for frame, metres in zip(frames, (1.0, 1.2, 2.0), strict=False):
-        assert frame.depth is not None
         assert (frame.depth.dtype, frame.depth.shape) == (np.float32, (HEIGHT, WIDTH))
         np.testing.assert_allclose(frame.depth, metres)
     assert frames[3].depth is None
@@ -233,7 +231,6 @@ def test_compressed_depth_is_read_and_holes_stay_holes(tmp_path: Path) -> None:
     ):
         sent = compressed(BLACK, at(1), format_, head + coded(levels, ".png"))
         found = companions(tmp_path / "log.mcap", [("/depth", sent, 1.0)])[1].depth
-        assert found is not None
         np.testing.assert_allclose(found[1:], metres, rtol=1e-6)
         assert not found[0].any()
 
@@ -246,7 +243,6 @@ def test_frames_carry_the_camera_s_pose_by_odometry_and_static_transforms(tmp_pa
     more += [("/odom", odometry(9.0, at(i + 0.4)), i + 0.4) for i in range(3)]  # farther from the picture
     poses = [frame.odometry for frame in companions(tmp_path / "log.mcap", more)]
     for i, world_from_camera in enumerate(poses[:3]):
-        assert world_from_camera is not None
         np.testing.assert_allclose(world_from_camera[:3, 3], (i, 2.5, 0), atol=1e-9)  # 2.5 m ahead, turned to the left
         np.testing.assert_allclose(world_from_camera[:3, 2], (0, 1, 0), atol=1e-9)  # and looking there
         np.testing.assert_allclose(world_from_camera[:3, 1], (0, 0, -1), atol=1e-9)

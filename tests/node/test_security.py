@@ -93,7 +93,6 @@ def test_f18_strangers_get_no_views_and_others_do(publisher: Publisher, node: Fa
         assert node.await_event("AUTH_DENIED")["domain"] == "gcd.data"
         publisher.send(window(3))
         received = reader.receive(20_000)
-        assert received is not None
         assert received.header.window_id == 3
         assert heard(stranger) is None
         assert publisher.stats.subscribers == 1
@@ -198,7 +197,6 @@ def listed(list_path: Path, node: FakeNode) -> AllowList:
 def test_an_edited_list_counts_at_once(listed: AllowList, list_path: Path, node: FakeNode, tmp_path: Path) -> None:
     write_key_pair(tmp_path / "keys", NODE)
     security = load_server_security(SecurityConfig(keys=str(tmp_path / "keys"), allow=str(list_path)))
-    assert security is not None
     assert security.keys == NODE
     assert {key: security.find_client(key) for key in (*CLIENTS, STRANGER.public)} == CLIENTS | {STRANGER.public: None}
     list_path.write_text(entry("hand", OPERATOR) + entry("late", STRANGER))

@@ -140,7 +140,6 @@ with background_logging(as_json=False):
 import os; os._exit(0)
 """
     stuck = in_a_process(code, stdout=subprocess.PIPE)
-    assert stuck.stdout is not None
     try:
         assert stuck.wait(timeout=30) == 0  # nobody read its 5 MB
         assert float(stuck.stdout.readline()) < 10.0
@@ -204,7 +203,6 @@ main.run_app = lambda _: (print("importing torch", flush=True), [time.sleep(0.01
 main.main()
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as node:
-        assert node.stdout is not None
         assert node.stdout.readline() == "importing torch\n"
         node.terminate()
         assert node.wait(60) == 0
@@ -223,7 +221,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     layer = next(names).removesuffix(".weight")
     width = state[f"{layer}.weight"].shape[0]
     factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
-    assert loaded.family is not None
     card = Card(name="adapted", config=loaded.networks.config, family=loaded.family.name, move_time=loaded.move_time)
     for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
         adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)

@@ -21,8 +21,18 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from cameras import FakeVideoCapture, pushing, until
-from media import HEIGHT, WIDTH, environment, flat, ramp, write_pictures, write_video
+from cameras import (
+    HEIGHT,
+    WIDTH,
+    FakeVideoCapture,
+    environment,
+    flat,
+    pushing,
+    ramp,
+    until,
+    write_pictures,
+    write_video,
+)
 from rtsp_server import serving, write_transport_stream
 
 from gcd_client import FramePusher

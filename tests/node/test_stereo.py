@@ -240,8 +240,6 @@ def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(film
     request = ClipRequest(depth=films / "right.mkv", calibration=films / "calib.json", rectified=rectified)
     clip = read_clip(films / "left.mkv", request, live_traits())
     depth, lens = clip.depth, clip.lens
-    assert depth is not None
-    assert lens is not None
     assert (lens.width, lens.height) == (WIDTH, HEIGHT)
     known = depth[depth > 0]
     assert len(known) > 0.6 * depth.numel()

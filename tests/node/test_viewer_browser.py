@@ -121,13 +121,11 @@ def page(browser: Page) -> Page:
 @pytest.fixture(scope="module")
 def operator_url(node: "subprocess.Popen[str]") -> Iterator[str]:
     """Of the node's page, which is served by another process."""
-    assert node.stdout is not None
     assert node.stdout.readline() == "there\n", "the node did not start"
     folder = str(node.args[-2])  # type: ignore[index]
     endpoints = [f"--{name}=ipc://{folder}/{name}" for name in ("data", "status", "control")]
     command = [sys.executable, "-m", "gcd_node", "viewer", "--http", "127.0.0.1:0", *endpoints]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as viewer:
-        assert viewer.stderr is not None
         yield viewer.stderr.readline().removeprefix("page ").strip()
         viewer.terminate()
 

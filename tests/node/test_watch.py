@@ -244,7 +244,6 @@ def test_status_prints_a_table_or_notes_as_json(tmp_path: Path, capsys: Capture)
         assert line["source"]["fps"] == 10.0
         command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
-            assert reader.stdout is not None
             told = [json.loads(reader.stdout.readline()) for _ in range(3)]
             reader.terminate()
     lines = {line["topic"]: line for line in told}

@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
-from cameras import until
+from cameras import frames_at, until
 from fakes import FakeSource, Steady
-from media import frames_at
 
 from gcd_node.errors import ReaderError
 from gcd_node.frame import Frame
@@ -116,7 +115,7 @@ def test_what_a_window_holds_so_far_is_how_the_whole_one_will_begin(stride: int)
         seen.append(builder.filling)
 
 
-def test_a_window_carries_pictures_stamps_and_arrival() -> None:
+def test_a_window_carries_pictures_stamps_and_arrival_and_only_its_frames_are_fitted() -> None:
     frames = even(8, 10.0, first_ms=50.0)
     window = run(WindowBuilder(frames=4, fps=10.0), frames)[1]
     assert window.images.shape == (4, 2, 4, 3)
@@ -124,9 +123,6 @@ def test_a_window_carries_pictures_stamps_and_arrival() -> None:
     assert not window.frames[0].image.flags.writeable
     assert window.stamps_ns == tuple(frame.stamp_ns for frame in frames[4:])
     assert (window.arrival_ns, window.fps, window.epoch, window.dropped) == (frames[7].stamp_ns + 5, 10.0, 0, 0)
-
-
-def test_only_frames_of_a_window_are_fitted_and_each_once() -> None:
     fitted: list[int] = []
 
     def fit(image: np.ndarray) -> np.ndarray:
