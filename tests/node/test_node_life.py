@@ -30,6 +30,14 @@ from gcd_node.config import ModelSection
 from gcd_node.lifecycle import PATHS, Lifecycle, State, Verb
 from gcd_node.model import interruptible
 
+WILD: list[dict[str, object]] = [
+    *({"azimuth_deg": 1e308}, {"radius": 1e308}, {"radius": -1e308}),
+    {"kind": "orbit", "rate_deg_s": 1e308, "amplitude_deg": 60.0},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e308},
+    {"kind": "orbit", "rate_deg_s": 1.0, "amplitude_deg": 1e-308},
+    {"T_src_dst": [1e308] * 16},
+    {"T_src_dst": [1, 0, 0, 1e308, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]},
+]
 WAITING = "life = {autostart = false}"
 TWO_VIEWS = '[view.main]\nazimuth_deg = 10.0\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 30.0'
 
@@ -135,29 +143,11 @@ def test_a_view_is_set_by_angles_by_a_rigid_pose_or_as_an_orbit(tmp_path: Path) 
         assert rig.client.request("remove_view", {"view": "main"}, if_view_rev=4).code is Code.OK
 
 
-def test_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
-        rig.await_views(1)
-        reply = rig.ask("set_param", steps=3, guidance=[1.0, 2.0], publish="jpeg", jpeg_quality=60)
-        assert reply.code is Code.OK
-        until(lambda: rig.of()[-1].header.encoding == "jpeg")
-        header = rig.of()[-1].header
-        assert header.quality.steps == 3
-        assert rig.of()[-1].images.shape == (14, 64, 96, 3)
-        model = rig.model
-        assert model.asked[-1][1].guidance == (1.0, 2.0)
-        config = asked(rig, "get_config")["config"]
-        assert (config["model"]["steps"], config["publish"]["encoding"]) == (3, "jpeg")
-        assert rig.ask("set_param", samples=2).code is Code.OK
-        until(lambda: model.asked[-1][1].samples == 2)
-
-
-def test_a_node_tells_who_it_is_and_what_it_can(tmp_path: Path) -> None:
+def test_a_node_tells_who_it_is_and_parameters_change_from_the_next_window_on(tmp_path: Path) -> None:
     with Rig(tmp_path, lambda _: Steady(), config=LOCKSTEP) as rig:
         rig.await_views(1)
         hello, described = asked(rig, "hello"), asked(rig, "describe")
-        assert hello["boot_id"] == rig.views[0].header.boot_id
-        assert (hello["node_id"], hello["role"]) == ("gcd", "operator")
+        assert (hello["boot_id"], hello["node_id"], hello["role"]) == (rig.views[0].header.boot_id, "gcd", "operator")
         limits = {"azimuth_deg": [-90.0, 90.0], "elevation_deg": [-30.0, 30.0], "radius": [-3.0, 3.0]}
         assert (described["limits"], described["fps"]) == (limits, [6.0, 8.0, 12.0, 24.0])
         assert asked(rig, "get_calib")["K"] == pytest.approx(list(rig.views[0].header.intrinsics or ()))
@@ -165,6 +155,21 @@ def test_a_node_tells_who_it_is_and_what_it_can(tmp_path: Path) -> None:
         assert (state["state"], state["source"]) == ("active", "streaming")
         assert "heartbeat_seq" not in asked(rig, "stats")
         assert rig.ask("record_start").code is Code.NOT_READY
+        reply = rig.ask("set_param", steps=3, guidance=[1.0, 2.0], publish="jpeg", jpeg_quality=60)
+        assert reply.code is Code.OK
+        until(lambda: rig.of()[-1].header.encoding == "jpeg")
+        assert rig.of()[-1].header.quality.steps == 3
+        assert rig.of()[-1].images.shape == (14, 64, 96, 3)
+        assert rig.model.asked[-1][1].guidance == (1.0, 2.0)
+        config = asked(rig, "get_config")["config"]
+        assert (config["model"]["steps"], config["publish"]["encoding"]) == (3, "jpeg")
+        assert rig.ask("set_param", samples=2).code is Code.OK
+        until(lambda: rig.model.asked[-1][1].samples == 2)
+        for wanted in WILD:  # no number in a view can end the stream
+            reply = rig.ask("set_view", wanted, view="main")
+            assert reply.code in (Code.OK, Code.OUT_OF_RANGE, Code.BAD_ARG)
+            rig.await_views(len(rig.of()) + 3)
+        assert rig.events("MODEL_FAILED") == []
 
 
 def test_an_operator_who_deactivates_keeps_a_node_that_would_end_with_its_source(tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ def test_the_lens_in_memory_is_scaled_and_cut_to_the_picture_and_has_our_names(
     assert (lens.distortion, lens.coefficients) == wanted
 
 
-def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
+def test_a_lens_that_makes_no_sense_is_no_lens_and_that_of_the_picture_itself_comes_before_the_memory() -> None:
     for stored in (
         dai.CalibrationHandler(dai.EepromData()),
         memory(RATIONAL, width=1000),
@@ -248,14 +248,10 @@ def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
     ):
         with closing(opened(pipelines.steady(), partial(lens_in_memory, stored, SOCKET))) as camera:
             assert camera.info.lens is None
-
-
-def test_the_lens_of_the_picture_itself_comes_before_the_memory() -> None:
     first = pipelines.picture(0)
     matrix = [[80.0, 0.0, 32.0], [0.0, 81.0, 24.0], [0.0, 0.0, 1.0]]
     first.transformation = dai.ImgTransformation(WIDTH, HEIGHT, matrix, dai.CameraModel.Perspective, RATIONAL)
-    stored = LensModel(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
-    with closing(opened(pipelines.Handed(first), lambda *_: stored)) as camera:
+    with closing(opened(pipelines.Handed(first), partial(lens_in_memory, memory(RATIONAL), SOCKET))) as camera:
         lens = camera.info.lens
     assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.coefficients) == (80.0, 81.0, 32.0, 24.0, tuple(RATIONAL))
 

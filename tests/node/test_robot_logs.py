@@ -249,7 +249,7 @@ def test_frames_carry_the_camera_s_pose_by_odometry_and_static_transforms(tmp_pa
     assert poses[3] is None
 
 
-def test_of_several_topics_one_must_be_named(tmp_path: Path) -> None:
+def test_of_several_topics_one_must_be_named_and_late_pictures_are_found_but_one_is_too_few(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with ros_log(path) as say:
         for i in range(4):
@@ -260,17 +260,14 @@ def test_of_several_topics_one_must_be_named(tmp_path: Path) -> None:
         with pytest.raises(SourceError, match="/rear/image"):  # which it has
             LogSource(path, topic=topic, depth_topic=depth_topic)
     assert near(next(LogSource(path, topic="/rear/image").frames()).image, (0, 0, 200))
-
-
-def test_pictures_that_begin_late_are_found_and_one_is_too_few(tmp_path: Path) -> None:
     for count, error in ((0, SourceError), (1, TooShortError), (3, None)):
-        with ros_log(tmp_path / "log.mcap") as say:
+        with ros_log(path) as say:
             for _ in range(100):
                 say("/words", *WORDS)
             for i in range(count):
                 say(TOPIC, *compressed(BLACK, at(i)))
         with nullcontext() if error is None else pytest.raises(error):
-            assert LogSource(tmp_path / "log.mcap").topic == TOPIC
+            assert LogSource(path).topic == TOPIC
 
 
 INFO_HERE = camera_info(WIDTH, HEIGHT)

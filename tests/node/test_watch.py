@@ -134,13 +134,10 @@ def test_a_view_that_changes_its_size_and_what_cannot_be_written_are_errors(tmp_
         saver.add(small)
 
 
-def test_to_u8_rounds_to_the_nearest_level_and_keeps_the_order_of_axes() -> None:
+def test_the_demo_shows_what_arrived_whole_in_order_and_hatches_the_unseen(tmp_path: Path) -> None:
     video = np.zeros((2, 3, 4, 5), np.float32)
     video[1, 0, 2, 3], video[1, 1, 2, 3] = 100.6 / 255, 1.1
     assert to_u8(video)[1, 2, 3].tolist() == [101, 255, 0]
-
-
-def test_the_demo_shows_what_arrived_whole_in_order_and_hatches_the_unseen(tmp_path: Path) -> None:
     pictures = {number: [np.full((16, 16, 3), 10 * number + i, np.uint8) for i in range(2)] for number in (5, 2, 7)}
     for number, frames in pictures.items():
         write_arrays(tmp_path / "vis" / f"{number:06d}.npy", np.stack([2 + 0 * SEEN[0], 0 * SEEN[0]]))
