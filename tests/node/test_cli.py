@@ -173,26 +173,17 @@ def test_bad_options_are_one_line_with_cause_and_remedy(
     chosen = tiny if weights == TINY else tmp_path / weights if weights in contents else weights
     assert synthesize(clip, chosen, tmp_path / "out", *options) == code
     assert reason in last_error(capsys)
+    (tmp_path / "junk.mp4").write_bytes(b"this is no picture" * 100)
+    (tmp_path / "empty_folder").mkdir()
+    for name in ("missing.mp4", "junk.mp4", "empty_folder") if code == 66 else ():
+        assert synthesize(tmp_path / name, DRIVING, tmp_path / "out") == 66
+        assert name in last_error(capsys)
     assert not (tmp_path / "out").exists()
     if code == 65:
         assert run_app(["weights", "inspect", str(chosen)]) == 65
 
 
-def test_an_input_that_cannot_be_decoded_is_exit_66(tmp_path: Path, capsys: Capture) -> None:
-    (tmp_path / "empty_folder").mkdir()
-    (tmp_path / "junk.mp4").write_bytes(b"this is no picture" * 100)
-    for name in ("missing.mp4", "junk.mp4", "empty_folder"):
-        assert synthesize(tmp_path / name, DRIVING, tmp_path / "out") == 66
-        assert name in last_error(capsys)
-
-
 # The program.
-
-
-def test_usage_errors_are_exit_64(capsys: Capture) -> None:
-    for arguments in (["synthesize"], ["view", "ipc", "--kind", "cls", "--hatch"], ["no-such-command"]):
-        assert run_app(arguments) == 64
-    assert "no-such-command" in capsys.readouterr().err
 
 
 def test_every_command_has_the_help_of_the_list_which_needs_no_torch(capsys: Capture) -> None:
@@ -200,7 +191,9 @@ def test_every_command_has_the_help_of_the_list_which_needs_no_torch(capsys: Cap
     for name, (_, summary) in COMMANDS.items():
         assert " ".join(str(whole[name].help).split("\n\n")[0].split()) == summary, name
         assert run_app([name, "--help"]) == 0
-    capsys.readouterr()
+    for arguments in (["synthesize"], ["view", "ipc", "--kind", "cls", "--hatch"], ["no-such-command"]):
+        assert run_app(arguments) == 64
+    assert "no-such-command" in capsys.readouterr().err
     assert run_app(["export", "--help"]) == 0
     assert "[model] weights" in " ".join(capsys.readouterr().out.split())
     assert run_app(["--version"]) == 0
@@ -321,12 +314,9 @@ def test_start_and_stride_count_frames_of_the_input_and_too_few_is_an_error_with
     write_video(video, numbered(41), 24.0)
     clip = read(video, start=1, stride=3)
     assert (levels(clip), clip.fps) == ([10 * i % 250 for i in range(1, 41, 3)], 8.0)
-
-
-def test_a_still_is_repeated_and_a_folder_read_in_order(tmp_path: Path) -> None:
-    write_png(tmp_path / "s.png", numbered(5)[4])
-    still = read(tmp_path / "s.png")
+    write_png(video.parent / "s.png", numbered(5)[4])  # a still is repeated, a folder read in order
+    still = read(video.parent / "s.png")
     assert (levels(still), still.fps) == ([40] * 14, 12.0)
     for index, picture in enumerate(numbered(15)):
-        write_png(tmp_path / "folder" / f"{index}.png", picture)
-    assert levels(read(tmp_path / "folder", start=1)) == [10 * i for i in range(1, 15)]
+        write_png(video.parent / "folder" / f"{index}.png", picture)
+    assert levels(read(video.parent / "folder", start=1)) == [10 * i for i in range(1, 15)]

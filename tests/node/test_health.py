@@ -71,11 +71,11 @@ def told(health: Health) -> tuple[int, list[str], list[str]]:
 
 def test_a_stage_counts_everything_and_ranks_the_last_minute(clock: Clock) -> None:
     times = StageTimes()
-    for _ in range(30):
-        times.add(clock.now_ns, 9.0)
-    clock.sleep(61)
-    for milliseconds in range(1, 101):
-        times.add(clock.now_ns, milliseconds / 1000)
+    for milliseconds in (*[9000] * 30, None, *range(1, 101)):
+        if milliseconds is None:
+            clock.sleep(61)
+        else:
+            times.add(clock.now_ns, milliseconds / 1000)
     assert times.summary(clock.now_ns) == {"p50_ms": 50.0, "p99_ms": 99.0, "count": 130}
     assert times.total_s == pytest.approx(30 * 9 + 5.05)
 
@@ -107,17 +107,18 @@ def test_a_stalled_source_warns_and_a_lost_one_is_an_error_until_it_streams(heal
     assert health.status()["source"]["reconnects"] == 1
 
 
-@pytest.mark.parametrize(("corrupt", "expected"), [(2, []), (3, ["SRC_CORRUPT"])])
-def test_a_fifth_of_damaged_frames_warns(health: Health, clock: Clock, corrupt: int, expected: list[str]) -> None:
-    work(health, clock, window_s=None)
-    clock.sleep(6)
-    stream(health, clock, frames=8)
-    for total in (corrupt - 1, corrupt, corrupt):
-        health.corrupt(total)
-    assert told(health)[:2] == (len(expected), expected)
-    clock.sleep(6)
-    assert told(health)[0] == Level.OK
-    assert health.status()["source"]["corrupt"] == corrupt
+def test_a_fifth_of_damaged_frames_warns_and_passes(clock: Clock) -> None:
+    for corrupt, expected in ((2, []), (3, ["SRC_CORRUPT"])):
+        health = Health(clock)
+        work(health, clock, window_s=None)
+        clock.sleep(6)
+        stream(health, clock, frames=8)
+        for total in (corrupt - 1, corrupt, corrupt):
+            health.corrupt(total)
+        assert told(health)[:2] == (len(expected), expected)
+        clock.sleep(6)
+        assert told(health)[0] == Level.OK
+        assert health.status()["source"]["corrupt"] == corrupt
 
 
 def test_reasons_are_listed_worst_first_and_the_worst_is_the_level(health: Health, clock: Clock) -> None:

@@ -57,6 +57,11 @@ def test_only_what_leaves_the_machine_s_memory_carries_a_checksum(tmp_path, cont
     with opened(tmp_path, data=data) as publisher:
         views = plain_reader(context, publisher.endpoint, topic_key("view/top/win"))
         notes = plain_reader(context, publisher.status_endpoint, topic_key("status"))
+        welcomed = plain_reader(context, publisher.endpoint, bytes(32))
+        assert (welcomed.poll(5000), welcomed.recv()) == (
+            zmq.POLLIN,
+            bytes(64),
+        )  # who wants no views
         until(lambda: publisher.stats.subscribers == 1)
         publisher.send(window())
         publisher.note("status", origin(), {"state": "active"})
@@ -89,14 +94,6 @@ def test_a_conflated_slow_reader_gets_the_newest_window_and_then_the_end(tmp_pat
     assert seen[-1] == 39
     assert seen == sorted(set(seen))
     assert len(seen) < 30
-
-
-def test_a_new_subscriber_is_welcomed_with_zeros(tmp_path, context) -> None:
-    with opened(tmp_path) as publisher:
-        reader = plain_reader(context, publisher.endpoint, bytes(32))
-        assert reader.poll(5000)
-        assert reader.recv() == bytes(64)
-        assert publisher.stats.subscribers == 0  # who waits for the welcome alone wants no views
 
 
 def test_sequences_count_each_topic_on_its_own_and_the_end_follows_by_its_delay(tmp_path, context) -> None:
@@ -133,14 +130,6 @@ def until_level(notes: StatusSubscriber, level: int) -> StatusMessage:
         if note.fields["level"] == level:
             return note
     raise AssertionError(f"no note of level {level} came")
-
-
-def test_lockstep_that_no_reader_takes_is_an_error_at_the_end(tmp_path) -> None:
-    publisher = opened(tmp_path, readers=1, lockstep=True, drain_ms=100)
-    publisher.send(window())
-    publisher.send(window())
-    with pytest.raises(EndpointError):
-        publisher.close()
 
 
 def test_a_slow_reader_cannot_stretch_the_end_of_a_node_that_was_told_to_stop(tmp_path, monkeypatch) -> None:
@@ -234,6 +223,11 @@ def test_the_runtime_folder_is_private_and_shared_by_both_sides(tmp_path, monkey
 
 
 def test_a_close_that_waits_for_readers_can_be_cut_short(tmp_path) -> None:
+    publisher = opened(tmp_path, readers=1, lockstep=True, drain_ms=100)
+    publisher.send(window())
+    publisher.send(window())
+    with pytest.raises(EndpointError):  # no reader takes them
+        publisher.close()
     publisher = opened(tmp_path, lockstep=True, readers=1)
     publisher.send(window())
     closing = threading.Thread(target=publisher.close, daemon=True)

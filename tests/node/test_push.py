@@ -110,6 +110,10 @@ def test_a_second_pusher_is_refused_until_the_first_has_gone(endpoint: str) -> N
                 until(lambda: taken(source).seq < 0)
     with pushing(endpoint, red), opened(endpoint) as source:  # as the node opens it again
         taken(source)
+        with pytest.raises(EndpointError), opened(endpoint):  # bound as every other endpoint
+            pass
+    with pytest.raises(ConfigError), opened("tcp://0.0.0.0:0"):
+        pass
 
 
 def test_nobody_waits_for_a_node_that_is_not_there(endpoint: str) -> None:
@@ -121,13 +125,6 @@ def test_nobody_waits_for_a_node_that_is_not_there(endpoint: str) -> None:
         with opened(endpoint) as source:
             assert taken(source).seq >= 20
         waiting.join(GUARD_S)
-
-
-def test_an_endpoint_is_bound_as_every_other_one(endpoint: str) -> None:
-    with pytest.raises(ConfigError), opened("tcp://0.0.0.0:0"):
-        pass
-    with pushing(endpoint, red), opened(endpoint), pytest.raises(EndpointError), opened(endpoint):
-        pass
 
 
 def test_over_tcp_an_operator_s_key_pushes_and_a_viewer_s_does_not() -> None:

@@ -199,13 +199,6 @@ def test_who_comes_is_a_viewer_until_the_token_is_shown_which_is_in_no_log_and_a
     assert not [line for line in told if TOKEN in line]
 
 
-def test_a_node_without_a_control_socket_takes_no_commands(tmp_path: Path) -> None:
-    with viewer_of(tmp_path, control=False) as viewer, open_feed(viewer.url) as feed:
-        assert hear(feed, "welcome")["commands"] is False
-        role(feed, token=TOKEN)
-        assert "[control]" in answer(feed, "describe")["message"]
-
-
 def test_a_ninth_page_is_asked_to_wait(viewer: ViewerServer) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(MOST_BROWSERS):
@@ -256,6 +249,10 @@ def test_a_page_that_takes_seconds_for_a_message_may_say_as_much_as_any_other() 
 
 
 def test_the_end_waits_for_nobody(tmp_path: Path) -> None:
+    with viewer_of(tmp_path, control=False) as viewer, open_feed(viewer.url) as feed:  # a node without a control socket
+        assert hear(feed, "welcome")["commands"] is False
+        role(feed, token=TOKEN)
+        assert "[control]" in answer(feed, "describe")["message"]
     with contextlib.ExitStack() as stack:
         with viewer_of(tmp_path) as viewer:
             host, port = host_of(viewer).split(":")

@@ -42,14 +42,10 @@ def test_every_frame_is_a_window_of_one_at_once(spread: float) -> None:
     for frame in jittered(60, 10.0, spread):
         (window,) = builder.push(frame, frame.stamp_ns + 5)
         assert window.stamps_ns == (frame.stamp_ns,)
-
-
-@pytest.mark.parametrize("source_fps", [24.0, 30.0, 60.0])
-def test_windows_of_one_frame_keep_a_lower_rate(source_fps: float) -> None:
-    windows = run(WindowBuilder(frames=1, fps=10.0, source_fps=source_fps), even(int(10 * source_fps), source_fps))
-    assert len(windows) == pytest.approx(100, abs=1)
-    steps_ms = np.diff([window.stamps_ns[0] for window in windows]) / 1e6
-    assert steps_ms.max() <= 100 + 1000 / source_fps
+    for source_fps in (24.0, 30.0, 60.0):  # they keep a lower rate
+        windows = run(WindowBuilder(frames=1, fps=10.0, source_fps=source_fps), even(int(10 * source_fps), source_fps))
+        assert len(windows) == pytest.approx(100, abs=1)
+        assert np.diff([window.stamps_ns[0] for window in windows]).max() / 1e6 <= 100 + 1000 / source_fps
 
 
 def test_a_camera_that_was_silent_is_no_clock_that_was_set() -> None:
@@ -273,20 +269,16 @@ def test_what_is_shown_while_there_is_work_under_way_is_not_lost() -> None:
     assert calls == [0, 1]
 
 
-def test_a_fault_in_the_source_is_not_swallowed() -> None:
-    slot = WindowSlot()
-    read(FakeSource(0, fails=ZeroDivisionError("bug")), WindowBuilder(frames=4, fps=10.0), slot)
-    with pytest.raises(ReaderError) as caught:
-        slot.take()
-    assert isinstance(caught.value.__cause__, ZeroDivisionError)
-
-
-def test_closing_slot_and_source_stops_the_reader_without_an_error() -> None:
-    slot = WindowSlot()
-    source = Steady()
-    reader = started(lambda: read(source, WindowBuilder(frames=4, fps=10.0), slot))
+def test_a_fault_in_the_source_is_not_swallowed_and_closing_is_none() -> None:
+    slot, source = WindowSlot(), Steady()
+    reader = started(lambda: read(source, WindowBuilder(frames=4, fps=10.0, source_fps=10.0), slot))
     time.sleep(0.05)
     slot.close()
     source.close()
     joined(reader)
     assert slot.take() is None
+    slot = WindowSlot()
+    read(FakeSource(0, fails=ZeroDivisionError("bug")), WindowBuilder(frames=4, fps=10.0), slot)
+    with pytest.raises(ReaderError) as caught:
+        slot.take()
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
