@@ -253,3 +253,14 @@ def frames_at(stamps_ms: Iterable[float], width: int = 4, height: int = 2) -> li
         Frame(image=np.full((height, width, 3), seq % 256, np.uint8), stamp_ns=round(ms * 1e6), seq=seq)
         for seq, ms in enumerate(stamps_ms)
     ]
+
+
+def calibration(folder: Path, size: tuple[int, int], focal: float, d: Sequence[float] = (-0.1, 0.01, 0, 0, 0)) -> Path:
+    """A file as ROS writes it."""
+    path, (width, height) = folder / "camera.yaml", size
+    matrix = [focal, 0, width / 2 - 0.5, 0, focal, height / 2 - 0.5, 0, 0, 1]
+    path.write_text(
+        f"image_width: {width}\nimage_height: {height}\ncamera_matrix: {{rows: 3, cols: 3, data: {matrix}}}\n"
+        f"distortion_model: plumb_bob\ndistortion_coefficients: {{rows: 1, cols: 5, data: {list(d)}}}\n"
+    )
+    return path

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from cameras import FPS, Bench, Camera, until
+from cameras import FPS, Bench, Camera, calibration, until
 from fakes import HEIGHT, LOCKSTEP, WIDTH, FakeSynthesizer, Steady, painting_traits, traits
 from rig import Rig
 
@@ -22,13 +22,6 @@ from gcd_node.errors import SourceLostError
 from gcd_node.sources import OakSource, SourceConfig
 from gcd_node.sources.live import LiveCamera
 
-CALIBRATION = """
-image_width: 384
-image_height: 256
-camera_matrix: {rows: 3, cols: 3, data: [200.0, 0, 191.5, 0, 200.0, 127.5, 0, 0, 1]}
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0, 0, 0]}
-"""
 GUARD_S = 30.0
 WHOLE, HALF, SQUARE, TINY = (384, 256), (192, 128), (256, 256), (48, 32)
 
@@ -50,9 +43,7 @@ class Even(Camera):
 
 
 def calibrated(folder: Path) -> str:
-    path = folder / "camera.yaml"
-    path.write_text(CALIBRATION)
-    return f'kind = "v4l2"\ncalibration = "{path}"'
+    return f'kind = "v4l2"\ncalibration = "{calibration(folder, WHOLE, 200.0)}"'
 
 
 def reasons(rig: Rig) -> list[str]:

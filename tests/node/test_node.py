@@ -154,17 +154,14 @@ def test_the_last_status_is_the_end(
     assert last["level"] == (0 if code == "SRC_ENDED" else 2)
 
 
-@pytest.mark.parametrize(
-    ("failure", "code"),
-    [
+def test_a_failure_keeps_its_own_code() -> None:
+    for failure, code in (
         (PublisherError("died"), "PUBLISH_FAILED"),
         (EndpointError("not taken"), "NOT_DELIVERED"),
         (KeyError("ours"), "INTERNAL"),
         (CheckpointError("halved"), "MODEL_FAILED"),
-    ],
-)
-def test_a_failure_keeps_its_own_code(failure: Exception, code: str) -> None:
-    assert ending(failure, stopped=False) == ending(failure, stopped=True) == (code, "closed")
+    ):
+        assert ending(failure, stopped=False) == ending(failure, stopped=True) == (code, "closed")
 
 
 def test_an_outbox_that_fails_ends_the_run_and_every_thread() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from cameras import calibration
 from fakes import HEIGHT, WIDTH, fake_config, traits
 from numpy.typing import NDArray
 
@@ -172,19 +173,8 @@ def test_pictures_of_another_size_of_the_same_shape_are_taken() -> None:
     assert psnr(small, large) > 30.0
 
 
-CALIBRATION = """
-image_width: 1280
-image_height: 720
-camera_name: front
-camera_matrix: {{rows: 3, cols: 3, data: [{fx}, 0, 640.0, 0, {fx}, 360.0, 0, 0, 1]}}
-distortion_model: plumb_bob
-distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.01, 1e-05, 0, 0]}}
-"""
-
-
 def camera_file(folder: Path, fx: float = 800.0) -> str:
-    (folder / "front.yaml").write_text(CALIBRATION.format(fx=fx))
-    return f"source.calibration={folder}/front.yaml"
+    return f"source.calibration={calibration(folder, (1280, 720), fx)}"
 
 
 def prepared(

@@ -144,16 +144,9 @@ def test_a_recording_that_rotated_is_read_part_by_part_and_plays_as_the_source_g
         assert len(hashes(again, kind)) == 3
     captured = [[message.header.t_capture_ns for message in each.of("win")] for each in (again, box)]
     assert captured[0] == captured[1]
-    assert (source.info.id, source.info.lens) == (found[0].parent.name, LENS)
-
-
-def test_the_input_is_played_though_there_are_views_and_a_view_where_it_is_named(tmp_path: Path) -> None:
-    recorded(recorder_config(tmp_path / "a"), Calibrated(14))
-    assert replayed(files(tmp_path)[0])[0].info.width == 192
-    view, _ = replayed(files(tmp_path)[0], topic="/view/main/image")
+    assert (source.info.id, source.info.lens, source.info.width) == (found[0].parent.name, LENS, 192)  # the input
+    view, _ = replayed(found[0], painting_traits(), topic="/view/main/image")
     assert (view.info.width, view.info.lens is None) == (96, False)  # through its own camera
-    recorded(recorder_config(tmp_path / "b", 'record.what=["views"]'), FakeSource(14))
-    assert replayed(files(tmp_path / "b")[0])[0].info.width == 96  # the only pictures there are
 
 
 def record_for_ever(folder: Path) -> None:
@@ -402,20 +395,18 @@ def test_only_what_is_wanted_is_recorded_jpeg_as_it_is_and_no_transforms_without
         assert of(heard, wanted)
         assert not of(heard, unwanted) + of(heard, "/tf")
         assert of(heard, "/gcd/event")
+        assert replayed(files(tmp_path / what)[0])[0].info.width == 96  # the only pictures there are
     (message,) = box.of("win")
     assert b"".join(each.value.data for each in of(heard, "/view/main/image")) == message.payload  # not coded again
 
 
-def test_frames_of_a_view_follow_each_other_as_they_were_taken_and_end_before_the_next_window() -> None:
+def test_frames_of_a_view_follow_each_other_as_they_were_taken_and_a_status_is_a_diagnosis_of_every_part() -> None:
     message = window()
     live, lockstep = fake_config("view.top={}", source='kind = "v4l2"'), fake_config("view.top={}")
     at_ns, frames = message.header.t_publish_ns, message.header.shape[0]
     for config, step_ns in ((live, SECOND_NS // 10), (lockstep, 0)):
         made = [each for each in view_messages(message, config) if each.topic.endswith("/image")]
         assert [each.log_ns for each in made] == [at_ns + i * step_ns for i in range(frames)]
-
-
-def test_a_status_is_a_diagnosis_of_every_part() -> None:
     parts = {"source": {"state": "lost", "fps": 0.0}, "model": {"state": "degraded"}}
     fields = {"state": "active", "level": 2, "reasons": ["SRC_LOST"], **parts, "stages": {"age": {"p50_ms": 7.5}}}
     _, array = note_messages("status", origin(), fields, 1)

@@ -42,7 +42,15 @@ with pytest.MonkeyPatch.context() as patch:
     from gcd_views import bridge, messages
 
 
-def test_pictures_and_maps_pass_as_they_are_stamped_when_their_frame_was_captured() -> None:
+def test_pictures_maps_and_cameras_pass_as_they_are_stamped_when_their_frame_was_captured() -> None:
+    header = window().header
+    info = messages.to_camera_info(header, 1, "gcd/top_optical")
+    assert (info.height, info.width, info.header.frame_id) == (4, 6, "gcd/top_optical")
+    assert tuple(info.k) == header.intrinsics
+    assert np.array_equal(info.p.reshape(3, 4)[:, :3], info.k.reshape(3, 3))  # no distortion
+    assert np.array_equal(info.r.reshape(3, 3), np.eye(3))
+    unknown = messages.to_camera_info(replace(header, intrinsics=None), 1, "")
+    assert not np.concatenate([unknown.k, unknown.r, unknown.p]).any()
     message = jpeg_window()
     picture, decoded = (
         make(message, 1, "gcd/top_optical") for make in (messages.to_compressed_image, messages.to_image)
@@ -58,17 +66,6 @@ def test_pictures_and_maps_pass_as_they_are_stamped_when_their_frame_was_capture
         made = messages.to_image(message, 1, "gcd/top_optical")
         assert (made.encoding, made.height, made.width, made.step) == (encoding, 4, 6, len(payload) // 8)
         assert made.data.tobytes() == bytes(payload[len(payload) // 2 :])
-
-
-def test_a_camera_has_no_distortion_and_zeros_where_it_is_unknown() -> None:
-    header = window().header
-    info = messages.to_camera_info(header, 1, "gcd/top_optical")
-    assert (info.height, info.width, info.header.frame_id) == (4, 6, "gcd/top_optical")
-    assert tuple(info.k) == header.intrinsics
-    assert np.array_equal(info.p.reshape(3, 4)[:, :3], info.k.reshape(3, 3))
-    assert np.array_equal(info.r.reshape(3, 3), np.eye(3))
-    unknown = messages.to_camera_info(replace(header, intrinsics=None), 1, "")
-    assert not np.concatenate([unknown.k, unknown.r, unknown.p]).any()
 
 
 def test_a_transform_takes_points_of_the_view_to_the_source_camera() -> None:

@@ -291,15 +291,13 @@ def grey(values: NDArray[np.float64]) -> Image:
     return np.repeat(np.rint(values * 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
-@pytest.mark.parametrize(
-    ("gives", "sides"), [((1, "high", "wide"), ("high", "wide")), ((1, 1, "high", "wide"), (70, 98))]
-)
-def test_a_metric_network_is_taken_at_its_word(tmp_path: Path, gives: Any, sides: Any) -> None:
-    path = network(tmp_path / "net.onnx", (1, 3, *sides), (*gives[:-2], *sides))
-    depth = OnnxDepth(path, kind="metric")(np.full((160, 240, 3), 255, np.uint8))
+def test_a_metric_network_is_taken_at_its_word(tmp_path: Path) -> None:
     white = np.mean((1 - np.array([0.485, 0.456, 0.406])) / [0.229, 0.224, 0.225])
-    assert depth.shape == (160, 240)
-    assert depth == pytest.approx(float(white), rel=1e-5)
+    for gives, sides in (((1,), ("high", "wide")), ((1, 1), (70, 98))):
+        path = network(tmp_path / "net.onnx", (1, 3, *sides), (*gives, *sides))
+        depth = OnnxDepth(path, kind="metric")(np.full((160, 240, 3), 255, np.uint8))
+        assert depth.shape == (160, 240)
+        assert depth == pytest.approx(float(white), rel=1e-5)
 
 
 @pytest.mark.parametrize(("a", "b"), [(1.6, -0.1), (0.9, 0.0)])
