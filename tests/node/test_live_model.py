@@ -36,7 +36,7 @@ from gcd_node.node import Node
 from gcd_node.preprocess import assumed_hfov_deg, stated_mount
 from gcd_node.replay.run import open_run
 from gcd_node.sources import SourcePose
-from gcd_node.stream_context import config_digest, prepare_stream
+from gcd_node.stream_context import prepare_stream
 from gcd_node.verbs import SetView
 from gcd_node.views import VirtualView
 
@@ -138,16 +138,6 @@ def test_the_lens_is_the_stated_one_or_is_assumed_and_published() -> None:
         struct_replace(config(), source=struct_replace(config().source, hfov_deg=140.0)), TRAITS, INFO
     )
     assert wide.ood == ("hfov",)
-
-
-def test_where_views_and_cameras_stand_is_part_of_the_configurations_name() -> None:
-    digests = {
-        config_digest(struct_replace(config(), source=struct_replace(config().source, pose=pose)), TRAITS)
-        for pose in (None, SourcePose(height_m=1.0), SourcePose(height_m=2.0), SourcePose(radius=2.0))
-    }
-    moved = ViewConfig(position_m=(-4.0, 3.0, 3.5), look_at_m=(12.0, 0.0, 0.5))
-    digests |= {config_digest(each, TRAITS) for each in (config(), struct_replace(config(), view={"placed": moved}))}
-    assert len(digests) == 6
 
 
 # Where the source camera stands: on a sphere or on its vehicle, and which model takes which.

@@ -373,18 +373,6 @@ def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
     assert watch.skipped + len(seqs) == fake.grabbed + 1 - seqs[0]  # nobody misses those before the first
 
 
-@pytest.mark.parametrize("lost", [False, True])
-def test_closing_ends_a_silent_watch_and_one_that_looks_for_its_camera(lost: bool) -> None:
-    camera = Camera()
-    with watching(camera) as reader:
-        if lost:
-            camera.feed(None)
-            until(lambda: "lost" in reader.told)
-        started_s = time.monotonic()
-    assert time.monotonic() - started_s < 10
-    assert camera.closed.is_set()
-
-
 def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
     camera, late = Camera(), Camera()
     answer, asked_for = threading.Event(), list[SourceInfo]()

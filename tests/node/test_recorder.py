@@ -145,7 +145,7 @@ def test_a_recording_that_rotated_is_read_part_by_part_and_plays_as_the_source_g
     captured = [[message.header.t_capture_ns for message in each.of("win")] for each in (again, box)]
     assert captured[0] == captured[1]
     assert (source.info.id, source.info.lens, source.info.width) == (found[0].parent.name, LENS, 192)  # the input
-    view, _ = replayed(found[0], painting_traits(), topic="/view/main/image")
+    view, _ = replayed(found[0].parent, painting_traits(), topic="/view/main/image")
     assert (view.info.width, view.info.lens is None) == (96, False)  # through its own camera
 
 

@@ -167,13 +167,11 @@ def test_a_network_takes_half_the_cores_or_the_stated_threads_and_opencv_no_more
 
 
 def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    nice: list[int] = []
+    nice, before = list[int](), sys.getswitchinterval()
     monkeypatch.setattr(os, "nice", nice.append)
-    before = sys.getswitchinterval()
     try:
         apply_scheduling(LifeConfig(nice=7))
-        assert nice == [7]
-        assert sys.getswitchinterval() == pytest.approx(0.001)
+        assert (nice, sys.getswitchinterval()) == ([7], pytest.approx(0.001))
         assert gc.get_freeze_count() > 0
     finally:
         sys.setswitchinterval(before)

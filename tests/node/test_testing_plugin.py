@@ -110,10 +110,7 @@ def test_the_plugin_brings_no_model_into_a_session_that_replays_nothing(pytester
     )
     command = [sys.executable, "-m", "pytest", "-q", "-p", "gcd_node.testing", "-p", "no:cacheprovider"]
     alone = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]  # which brings the plugin by itself
+    assert project["entry-points"]["pytest11"] == {"gcd_node.testing": "gcd_node.testing"}
     done = subprocess.run(command, cwd=pytester.path, env=alone, capture_output=True, text=True, timeout=50)
     assert done.returncode == 0, done.stdout + done.stderr
-
-
-def test_an_installed_package_brings_the_plugin_by_itself() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["entry-points"]["pytest11"] == {"gcd_node.testing": "gcd_node.testing"}
