@@ -1,4 +1,4 @@
-"""How recordings begin, end, rotate and play again; what they survive, and what they never touch: the stream."""
+"""Recordings: made by a node over fakes, read back by the reference libraries."""
 
 import errno
 import hashlib
@@ -9,8 +9,8 @@ import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,38 +19,143 @@ import cv2
 import numpy as np
 import pytest
 from cameras import FPS, Bench, Camera, until
-from fakes import LOCKSTEP, Box, FakeSource, fake_config, painting_traits
-from recordings import (
-    LENS,
-    SECOND_NS,
-    Calibrated,
-    Said,
-    extras,
-    files,
-    of,
-    recorded,
-    recorder_config,
-    replayed,
-    said,
-    salvaged,
-    summary,
-)
+from fakes import LOCKSTEP, Box, FakeSource, FakeSynthesizer, fake_config, made_node, painting_traits, run, traits
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rig import Rig
 from rosbags.highlevel import AnyReader
 from wire_messages import origin, window
+from zstandard import ZstdError
 
 from gcd_client.control import Code
 from gcd_client.images import depth_m, images
 from gcd_client.protocol import to_json
+from gcd_model import Traits
 from gcd_node import ros_messages
-from gcd_node.config import parse_config
-from gcd_node.frame import Frame, SourceInfo
+from gcd_node.config import NodeConfig, parse_config
+from gcd_node.frame import Frame, FrameSource, LensModel, SourceInfo
 from gcd_node.health import Level
+from gcd_node.node import Node
 from gcd_node.recorder import Recorder
 from gcd_node.ros_messages import McapFile, note_messages, view_messages
+from gcd_node.sources import open_source
 from gcd_node.sources.logs import LogSource, pose_of
 
 pytestmark = pytest.mark.timeout(180)
+SECOND_NS = 10**9
+LENS = LensModel(
+    width=192, height=128, fx=200.0, fy=201.0, cx=95.5, cy=63.5, distortion="plumb_bob",
+    coefficients=(-0.1, 0.02, 0.0, 0.0, 0.0),
+)  # fmt: skip
+
+
+class Calibrated(FakeSource):
+    """A source that knows its lens, with noise that no coder keeps whole."""
+
+    def __init__(self, count: int = 30, fps: float = 24.0) -> None:
+        super().__init__(count, fps=fps, size=(192, 128))
+        self.info = replace(self.info, lens=LENS)
+
+    def frames(self) -> Iterator[Frame]:
+        draw = np.random.default_rng(0)
+        for frame in super().frames():
+            yield replace(frame, image=draw.integers(0, 256, frame.image.shape, np.uint8))
+
+
+@dataclass(frozen=True)
+class Said:
+    """One message of a recording; value: decoded by the reference library for ROS 2."""
+
+    topic: str
+    log_ns: int
+    publish_ns: int
+    sequence: int
+    value: Any
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of its header."""
+        return self.value.header.stamp.sec * SECOND_NS + self.value.header.stamp.nanosec
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The JSON in it."""
+        return json.loads(self.value.data)
+
+
+def recorder_config(folder: Path, *changes: str, source: str = LOCKSTEP, keep_free_mb: float = 0.0) -> NodeConfig:
+    """changes: KEY=VALUE."""
+    where = (f"record.folder={folder}", f"record.keep_free_mb={keep_free_mb}", "record.autostart=true")
+    return fake_config(*where, *changes, source=source)
+
+
+def recorded(
+    config: NodeConfig, source: FrameSource | None = None, made: Traits | None = None, holds: Sequence[str] = ()
+) -> tuple[Node, Box]:
+    """A node that recorded a whole run. holds: see FakeSynthesizer."""
+    box = Box()
+    node = made_node(config, FakeSynthesizer(made or traits(), holds=holds), source or FakeSource(30), box)
+    node.run()
+    return node, box
+
+
+def replayed(path: Path, made: Traits | None = None, topic: str = "") -> tuple[FrameSource, Box]:
+    """What a node makes of a recording."""
+    named = f'topic = "{topic}"' if topic else ""
+    config = fake_config(source=f'kind = "mcap"\npath = "{path}"\npace = "lockstep"\n{named}')
+    opened = open_source(config.source)
+    return opened, run(config, FakeSynthesizer(made or traits()), opened)
+
+
+def files(folder: Path) -> list[Path]:
+    """Every file of every recording, in the order of their names."""
+    return sorted(folder.rglob("*.mcap"))
+
+
+def said(path: Path) -> list[Said]:
+    """Every message of a finished file."""
+    with path.open("rb") as file:
+        return [
+            Said(channel.topic, message.log_time, message.publish_time, message.sequence, decoded)
+            for _, channel, message, decoded in make_reader(
+                file, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
+        ]
+
+
+def of(messages: Sequence[Said], topic: str) -> list[Said]:
+    return [each for each in messages if each.topic == topic]
+
+
+def summary(path: Path) -> Any:
+    with path.open("rb") as file:
+        return make_reader(file).get_summary()
+
+
+def extras(path: Path) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
+    """Its metadata and attachments, by name."""
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        metadata = {each.name: each.metadata for each in reader.iter_metadata()}
+        return metadata, {each.name: each.data for each in reader.iter_attachments()}
+
+
+def salvaged(path: Path, topic: str) -> list[int]:
+    """Sequence numbers on a topic, as far as the reference reader gets front to back in a file without an end."""
+    found: list[int] = []
+    with path.open("rb") as file:
+        try:
+            for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+                if channel.topic == topic:
+                    found.append(message.sequence)
+        except (McapError, EOFError, ValueError, ZstdError):
+            pass  # where it was cut
+    return found
+
+
+# How recordings begin, end, rotate and play again; what they survive, and what they never touch: the stream.
+
 
 RAW = "record.input_encoding=raw"
 LIVE = SourceInfo(kind="v4l2", id="t", width=100, height=100, fps_nominal=10.0, clock="realtime")
@@ -286,7 +391,7 @@ Run: TypeAlias = tuple[list[Said], Box, Path]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Two windows of a model that draws class maps, visibility and depth, on two samples, and all recorded of them."""
     folder = tmp_path_factory.mktemp("run")
     config = recorder_config(folder, "model.samples=2")
@@ -296,8 +401,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return said(path), box, path
 
 
-def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(run: Run) -> None:
-    heard, _, path = run
+def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(whole: Run) -> None:
+    heard, _, path = whole
     counts, found = Counter(each.topic for each in heard), summary(path)
     assert {each.topic: found.statistics.channel_message_counts[key] for key, each in found.channels.items()} == counts
     pictures = ("image", "camera_info", "classes", "std", "visibility", "depth")
@@ -314,8 +419,8 @@ def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(run: Run) ->
     assert len(values) == len(heard)
 
 
-def test_stamps_are_those_of_the_capture_and_numbers_those_of_the_source(run: Run) -> None:
-    heard, box, _ = run
+def test_stamps_are_those_of_the_capture_and_numbers_those_of_the_source(whole: Run) -> None:
+    heard, box, _ = whole
     inputs, views = of(heard, "/src/image"), of(heard, "/view/main/image")
     assert [each.stamp_ns for each in inputs] == [round(i * 1e8) for i in range(30)]
     assert [each.sequence for each in inputs] == list(range(30))
@@ -329,8 +434,8 @@ def test_stamps_are_those_of_the_capture_and_numbers_those_of_the_source(run: Ru
     assert all(abs(each.log_ns - time.time_ns()) < 600 * SECOND_NS for each in heard)
 
 
-def test_pictures_are_what_was_seen_and_published(run: Run) -> None:
-    heard, box, _ = run
+def test_pictures_are_what_was_seen_and_published(whole: Run) -> None:
+    heard, box, _ = whole
     for topic, wanted, most in (
         ("/src/image", [np.full((64, 96, 3), 20 + number) for number in range(30)], 2),
         ("/view/main/image", np.concatenate([images(message) for message in box.of("win")]), 3),
@@ -341,8 +446,8 @@ def test_pictures_are_what_was_seen_and_published(run: Run) -> None:
             assert np.abs(picture[..., ::-1].astype(int) - pixels).max() <= most
 
 
-def test_maps_come_back_as_they_were_published(run: Run) -> None:
-    heard, box, _ = run
+def test_maps_come_back_as_they_were_published(whole: Run) -> None:
+    heard, box, _ = whole
     for topic, kind in (("classes", "cls"), ("std", "std"), ("visibility", "vis"), ("depth", "depth")):
         encoding, pixels_of = ("32FC1", depth_m) if kind == "depth" else ("mono8", images)
         wanted = np.concatenate([pixels_of(message) for message in box.of(kind)]).reshape(-1, 64, 96)
@@ -352,8 +457,8 @@ def test_maps_come_back_as_they_were_published(run: Run) -> None:
         np.testing.assert_array_equal(pixels, wanted)
 
 
-def test_headers_and_poses_are_the_wire_s_own(run: Run) -> None:
-    heard, box, _ = run
+def test_headers_and_poses_are_the_wire_s_own(whole: Run) -> None:
+    heard, box, _ = whole
     for topic, kind in (("header", "win"), ("std_header", "std")):
         assert [each.told for each in of(heard, f"/view/main/{topic}")] == [
             json.loads(json.dumps(to_json(message.header))) for message in box.of(kind)
@@ -437,7 +542,7 @@ def test_camera_info_says_what_is_known_of_the_camera_and_a_replay_knows_as_much
     assert (info.lens, info.hfov_deg, info.stamp_uncertainty_us) == (lens, hfov_deg, 500)
 
 
-def test_the_layout_that_ships_shows_topics_that_are_recorded(run: Run) -> None:
+def test_the_layout_that_ships_shows_topics_that_are_recorded(whole: Run) -> None:
     layout = json.loads((Path(__file__).parents[2] / "launch" / "foxglove-layout.json").read_text())
     panels = layout["configById"]
 
@@ -451,8 +556,8 @@ def test_the_layout_that_ships_shows_topics_that_are_recorded(run: Run) -> None:
     named |= {path.split(".")[0] for path in paths}
     named |= {panel[key] for panel in panels.values() for key in ("topicToRender", "topicPath") if key in panel}
     assert len(named) >= 8
-    assert {name.replace("/topdown/", "/main/") for name in named} <= {each.topic for each in run[0]}
-    parts = {status.name for each in of(run[0], "/diagnostics") for status in each.value.status}
+    assert {name.replace("/topdown/", "/main/") for name in named} <= {each.topic for each in whole[0]}
+    parts = {status.name for each in of(whole[0], "/diagnostics") for status in each.value.status}
     drawn = {path.split('"')[1] for path in paths if "name==" in path}
     assert drawn == {"gcd: node", "gcd: source", "gcd: model", "gcd: rec"}
     assert drawn <= parts

@@ -1,10 +1,15 @@
-"""Replays: what a run holds, that it comes out the same again, and that half a run is never taken for one."""
+"""Replays of a made-up source through a made-up model, compared, and as the pytest plugin makes them."""
 
 import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +20,10 @@ import pytest
 import torch
 import zmq
 from cameras import ramp, write_video
-from fakes import HEIGHT, WIDTH, FakeSource, fake_config, fake_maps, painting_traits
-from runs import FRAMES, SOURCE, WINDOWS, LevelModel, copied, made_run, nan_model, parts
+from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, fake_config, fake_maps, painting_traits, traits
 
-from gcd_model import View
+import gcd_node.testing  # noqa: F401  loaded before the inner sessions, which put sys.modules back
+from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, Trajectory, View
 from gcd_node.cli.main import run_app
 from gcd_node.config import NodeConfig
 from gcd_node.encoded_frames import window_seed
@@ -33,24 +38,88 @@ from gcd_node.errors import (
 )
 from gcd_node.frame import Frame
 from gcd_node.inference import WindowReport
+from gcd_node.lifecycle import Parts
+from gcd_node.replay import lockstep
 from gcd_node.replay.compare import Tolerance, compare, report_text
 from gcd_node.replay.lockstep import digest_of, lockstep_config, replay
 from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, keep_pixels, new_folder, open_run, pixel_digest
 from gcd_node.stream_context import config_digest
 
-Capture = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.timeout(60)
+WINDOWS, FRAMES = 3, 14
+SOURCE = 'kind = "synthetic"\nframes = 42'
+
+
+class LevelModel(FakeSynthesizer):
+    """Gives the source back, each level a whole number lower: by one for each step beyond the first, and by `lower`
+    at (window, frame). `classes` moves the class numbers of a window's frame 0 in so many columns."""
+
+    def __init__(
+        self,
+        made: Traits | None = None,
+        lower: Mapping[tuple[int, int], int] | None = None,
+        classes: Mapping[int, int] | None = None,
+        **more: Any,
+    ) -> None:
+        super().__init__(made or traits(), **more)
+        self._lower, self._classes = lower or {}, classes or {}
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        window, steps = len(self.asked), 1 if options is None else options.steps or 1
+        video = ((features.latents + 1) / 2 * 255).round() - (steps - 1)
+        for (at, frame), levels in self._lower.items():
+            video[frame] -= levels if at == window else 0
+        views = super().render(features, trajectories, options)
+        for view in views:
+            if view.classes is not None:
+                first = view.classes[:, 0, :, : self._classes.get(window, 0)]
+                first.add_(1).remainder_(len(self.traits.classes))
+        return [replace(view, samples=(video / 255)[None]) for view in views]
+
+
+def nan_model(windows: set[int]) -> FakeSynthesizer:
+    """NaN in these windows, in both attempts."""
+    calls = iter(window for window in range(99) for _ in range(2 if window in windows else 1))
+
+    def act(_: RenderOptions) -> None:
+        if next(calls) in windows:
+            raise NonFiniteError("NaN in the latents")
+
+    return LevelModel(act=act)
+
+
+def parts(model: FakeSynthesizer | None = None, source: FakeSource | None = None) -> Parts:
+    chosen, played = model or LevelModel(), source or FakeSource(WINDOWS * FRAMES)
+    return Parts(open_source=lambda _: played, load_model=lambda _: chosen)
+
+
+def made_run(
+    folder: Path, model: FakeSynthesizer | None = None, source: FakeSource | None = None, changes: Sequence[str] = ()
+) -> RunFolder:
+    return replay(fake_config("model.steps=1", *changes, source=SOURCE), folder, parts=parts(model, source))
+
+
+def copied(run: RunFolder, folder: Path) -> Path:
+    return Path(shutil.copytree(run.path, folder))
+
+
+# Replays: what a run holds, that it comes out the same again, and that half a run is never taken for one.
+
+
+Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """With class maps. Tests that damage it damage a copy."""
     return made_run(tmp_path_factory.mktemp("run") / "run", LevelModel(painting_traits()), FakeSource(42, fps=10.0))
 
 
-def test_what_is_on_disk_is_what_the_model_drew_to_the_bit(run: RunFolder, tmp_path: Path) -> None:
-    for index, window in enumerate(run.manifest.windows):
-        view = run.read_view(window, "main")
+def test_what_is_on_disk_is_what_the_model_drew_to_the_bit(whole: RunFolder, tmp_path: Path) -> None:
+    for index, window in enumerate(whole.manifest.windows):
+        view = whole.read_view(window, "main")
         levels = np.arange(20 + FRAMES * index, 20 + FRAMES * (index + 1), dtype=np.uint8)
         drawn = np.broadcast_to(levels[:, None, None, None], (FRAMES, HEIGHT, WIDTH, 3))
         assert np.array_equal(view["win"], drawn)
@@ -64,8 +133,8 @@ def test_what_is_on_disk_is_what_the_model_drew_to_the_bit(run: RunFolder, tmp_p
     assert np.array_equal(maps["depth"].view("<f2"), drawn_maps["inverse_depth"].numpy().astype("<f2"))
 
 
-def test_a_manifest_tells_the_whole_story(run: RunFolder) -> None:
-    manifest = run.manifest
+def test_a_manifest_tells_the_whole_story(whole: RunFolder) -> None:
+    manifest = whole.manifest
     assert {f"version {name}" for name in ("gcd-node", "python", "torch", "opencv")} <= set(manifest.made_from)
     assert (manifest.made_from["weights name"], manifest.made_from["machine device"]) == ("fake", "cpu")
     assert (manifest.frames, manifest.rejected, manifest.nan_windows) == (42, {}, 0)
@@ -122,7 +191,7 @@ def test_a_replay_opens_no_socket_and_is_repeatable_on_a_gpu(tmp_path: Path, mon
     def look(_: WindowReport) -> None:
         seen.append((torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark))
         (folder,) = tmp_path.iterdir()
-        assert folder.suffix == ".part"  # a run is not there before it is whole
+        assert folder.suffix == ".part"  # a whole is not there before it is whole
 
     monkeypatch.setattr(zmq.Context, "socket", refuse)
     monkeypatch.setattr(torch.backends.cudnn, "benchmark", True)
@@ -179,9 +248,9 @@ def test_a_replay_that_fails_leaves_nothing_and_says_what(tmp_path: Path, monkey
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pixels_that_do_not_fit_their_manifest_are_damage(run: RunFolder, tmp_path: Path) -> None:
+def test_pixels_that_do_not_fit_their_manifest_are_damage(whole: RunFolder, tmp_path: Path) -> None:
     flat = np.full((FRAMES * HEIGHT, WIDTH, 3), 7, np.uint8)
-    picture = copied(run, tmp_path / "copy") / "main" / "000001.win.png"
+    picture = copied(whole, tmp_path / "copy") / "main" / "000001.win.png"
     damaged, whole = open_run(tmp_path / "copy"), picture.read_bytes()
     other = (cv2.imencode(".png", each)[1].tobytes() for each in (flat, flat[1:, :, 0]))
     for content in (whole[: len(whole) // 2], *other, b"no picture", None):
@@ -190,8 +259,8 @@ def test_pixels_that_do_not_fit_their_manifest_are_damage(run: RunFolder, tmp_pa
             damaged.read_view(damaged.manifest.windows[1], "main")
 
 
-def test_a_manifest_that_is_none_is_damage_and_says_where(run: RunFolder, tmp_path: Path) -> None:
-    text = encode_manifest(run.manifest)
+def test_a_manifest_that_is_none_is_damage_and_says_where(whole: RunFolder, tmp_path: Path) -> None:
+    text = encode_manifest(whole.manifest)
     for old, new, reason in (
         (b"{", b"", "no manifest of a run"),
         (b'"gcd-run/3"', b'"gcd-run/1"', "gcd-run/1"),
@@ -206,8 +275,8 @@ def test_a_manifest_that_is_none_is_damage_and_says_where(run: RunFolder, tmp_pa
             open_run(tmp_path)
 
 
-def test_what_a_strange_run_states_takes_neither_time_nor_memory(run: RunFolder, tmp_path: Path) -> None:
-    strange = copied(run, tmp_path / "run")
+def test_what_a_strange_run_states_takes_neither_time_nor_memory(whole: RunFolder, tmp_path: Path) -> None:
+    strange = copied(whole, tmp_path / "run")
     manifest = (strange / MANIFEST).read_text()
     (strange / MANIFEST).write_text(manifest.replace('"config": {', '"config": {"model": ' + '{"a":' * 20_000, 1))
     with pytest.raises(DamagedRunError):
@@ -220,7 +289,7 @@ def test_what_a_strange_run_states_takes_neither_time_nor_memory(run: RunFolder,
     (strange / "main" / "000000.win.png").unlink()
     os.mkfifo(strange / "main" / "000000.win.png")
     with pytest.raises(DamagedRunError):
-        compare(run, open_run(strange))
+        compare(whole, open_run(strange))
 
 
 # Two runs compared: what counts as the same, how far apart they are, and what is said and shown of it.
@@ -242,10 +311,10 @@ def classed(folder: Path, columns: Mapping[int, int]) -> RunFolder:
     return made_run(folder, LevelModel(painting_traits(), classes=columns), FakeSource(42, fps=10.0))
 
 
-def restated(run: RunFolder, folder: Path, **changes: object) -> RunFolder:
-    """A copy of a run whose manifest says something else."""
-    copied(run, folder)
-    (folder / MANIFEST).write_bytes(encode_manifest(msgspec.structs.replace(run.manifest, **changes)))
+def restated(whole: RunFolder, folder: Path, **changes: object) -> RunFolder:
+    """A copy of a whole whose manifest says something else."""
+    copied(whole, folder)
+    (folder / MANIFEST).write_bytes(encode_manifest(msgspec.structs.replace(whole.manifest, **changes)))
     return open_run(folder)
 
 
@@ -350,8 +419,8 @@ class Brighter(FakeSource):
 
 
 def test_the_first_divergence_says_whether_input_and_seed_were_the_same(golden: RunFolder, tmp_path: Path) -> None:
-    def told(run: RunFolder) -> str:
-        return report_text(compare(golden, run), LOOSE).splitlines()[-1]
+    def told(whole: RunFolder) -> str:
+        return report_text(compare(golden, whole), LOOSE).splitlines()[-1]
 
     same = told(lowered(tmp_path / "same", {(2, 0): 1}))
     assert same.startswith("first divergence: window 2, view main: ")
@@ -379,3 +448,108 @@ def test_diff_tells_same_near_and_different(golden: RunFolder, tmp_path: Path, c
     assert (plain["a"], plain["b"], plain["views"]) == (a, b, 3)
     (view,) = plain["differences"]
     assert (view["window_id"], view["view_id"], view["worst_frame"]) == (1, "main", 4)
+
+
+# The pytest plugin in a robot team's project: golden runs made, kept, missed and renewed.
+
+
+pytest_plugins = ["pytester"]
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def project(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.Pytester:
+    """A project with a launch file; its replays go through a made-up model."""
+    whole = lockstep.replay
+    monkeypatch.setattr(lockstep, "replay", lambda config, out: whole(config, out, parts=parts()))
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # other plugins would be loaded anew in each session
+    launch = f'[source]\n{SOURCE}\n[model]\nweights = "fake"\nsteps = 1\n[view.main]\n'
+    pytester.makefile(".toml", launch=launch)
+    pytester.makeini("[pytest]\n")
+    return pytester
+
+
+def run_test(project: pytest.Pytester, *options: str, settings: object = None, bounds: str = "") -> pytest.RunResult:
+    project.makepyfile(f"""
+        def test_drive(gcd_replay):
+            gcd_replay("launch.toml", {settings}).assert_same_as("golden/drive"{bounds})
+    """)
+    return project.runpytest_inprocess("-p", "gcd_node.testing", *options)
+
+
+def test_a_golden_run_is_asked_for_made_and_then_met(project: pytest.Pytester) -> None:
+    result = run_test(project)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*no golden run at *golden/drive: make one with `pytest --gcd-update`*"])
+    run_test(project, "--gcd-update").assert_outcomes(passed=1)
+    run_test(project).assert_outcomes(passed=1)
+    (moved,) = project.path.glob("test_*.py")
+    moved.rename(project.mkdir("tests") / moved.name)  # paths are meant from the root of the project
+    result = project.runpytest_inprocess("-p", "gcd_node.testing", "--rootdir", str(project.path), "tests")
+    result.assert_outcomes(passed=1)
+
+
+def test_a_run_that_differs_fails_with_causes_and_passes_if_near_enough(project: pytest.Pytester) -> None:
+    run_test(project, "--gcd-update")
+    result = run_test(project, settings={"model.steps": 3}, bounds=", min_psnr=45.0")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            "*DIFFERENT: 3 of 3 views are not within 45 dB in every frame",
+            "*config model.steps: 1, 3",
+            "*first divergence: window 0, view main: *42.11 dB*the same pictures*",
+        ]
+    )
+    run_test(project, settings={"model.steps": 3}, bounds=", min_psnr=40.0").assert_outcomes(passed=1)
+
+
+def test_settings_are_what_they_are_in_python(project: pytest.Pytester) -> None:
+    run_test(project, "--gcd-update")
+    same = {"source.kind": "synthetic", "model.guidance": [1.0, 2.0], "node_id": "4"}
+    run_test(project, settings=same).assert_outcomes(passed=1)
+    run_test(project, settings={"model.stepps": 4}).stdout.fnmatch_lines(["*ConfigError: *`steps`*"])
+
+
+def test_an_update_makes_a_run_anew_byte_for_byte_and_removes_nothing_else(project: pytest.Pytester) -> None:
+    mine = project.path / "golden" / "drive" / "mine.txt"
+    mine.parent.mkdir(parents=True)
+    mine.touch()
+    run_test(project, "--gcd-update").stdout.fnmatch_lines(["*OutputError*no empty folder*"])
+    mine.unlink()
+    run_test(project, "--gcd-update").assert_outcomes(passed=1)
+    inner = project.makepyfile(
+        inner="""
+        def test_drive(gcd_replay):
+            run = gcd_replay("launch.toml")
+            (run.folder / "away").symlink_to("nowhere")
+            run.assert_same_as("golden/other")
+    """
+    )
+    result = project.runpytest_inprocess("-p", "gcd_node.testing", "--gcd-update", inner)
+    result.stdout.fnmatch_lines(["*OutputError*No such file*"])
+    first = {path.name: path.read_bytes() for path in mine.parent.rglob("*.*")}
+    run_test(project, "--gcd-update")
+    assert {path.name: path.read_bytes() for path in mine.parent.rglob("*.*")} == first
+    (mine.parent / MANIFEST).write_text("{")
+    run_test(project).stdout.fnmatch_lines(["*DamagedRunError*"])
+    run_test(project, "--gcd-update", settings={"model.steps": 2}).assert_outcomes(passed=1)
+    run_test(project, settings={"model.steps": 2}).assert_outcomes(passed=1)
+
+
+def test_the_plugin_brings_no_model_into_a_session_that_replays_nothing(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        import sys
+
+        def test_other(request):
+            assert request.config.getoption("--gcd-update") is False
+            assert not {"torch", "cv2", "zmq", "gcd_model"} & set(sys.modules)
+        """
+    )
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "gcd_node.testing", "-p", "no:cacheprovider"]
+    alone = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]  # which brings the plugin by itself
+    assert project["entry-points"]["pytest11"] == {"gcd_node.testing": "gcd_node.testing"}
+    done = subprocess.run(command, cwd=pytester.path, env=alone, capture_output=True, text=True, timeout=50)
+    assert done.returncode == 0, done.stdout + done.stderr
