@@ -23,7 +23,6 @@ from gcd_node.config import SecurityConfig
 from gcd_node.control import ControlServer, FloodGuard, ReplyCache
 from gcd_node.verbs import VERBS, RequestError, parse_command
 
-pytestmark = pytest.mark.timeout(90)
 Capture = pytest.CaptureFixture[str]
 
 

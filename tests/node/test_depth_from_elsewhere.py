@@ -37,7 +37,6 @@ from gcd_node.image_io import write_video
 from gcd_node.messages import ontology
 from gcd_node.offline import ClipRequest, read_clip
 
-pytestmark = pytest.mark.timeout(30)
 LIVE = live_traits()
 FRAMES = 14
 
@@ -339,6 +338,6 @@ def test_maps_are_never_made_lossy_and_one_sample_of_a_model_that_states_its_spr
     assert plain.of("std") == []
     assert len(raw.ends) == len(plain.ends) + 1
     for family in ("kubric90", "driving", "svd"):  # without a class head
-        box = run(fake_config(), FakeSynthesizer(traits(family)), FakeSource(14, fps=10.0))
+        box = run(fake_config(), FakeSynthesizer(traits(family)), FakeSource(28, fps=10.0))
         assert "view/main/cls" not in {message.topic for message in (*box.views, *box.ends)}
         assert box.told("meta")[0]["classes"] == []

@@ -27,7 +27,6 @@ from gcd_node.sources import SourceConfig, SourcePose
 from gcd_node.verbs import VERBS, RequestError, parse_command
 from gcd_train.cli.main import app as train_app
 
-pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "launch/README", "tools/README", "client/README")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))

@@ -19,7 +19,6 @@ from gcd_node.health import IDLE, THREAD_DIED, Health, Level, SourceState, Stage
 from gcd_node.session import metrics_server
 from gcd_node.status import Announcer
 
-pytestmark = pytest.mark.timeout(60)
 MS = 1_000_000
 S = 1_000_000_000
 

@@ -26,8 +26,6 @@ from gcd_node.publisher import Publisher
 from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.views import InputPreview
 
-pytestmark = pytest.mark.timeout(90)
-
 
 def opened(folder: Path, *, readers: int = 0, data: str = "", status: str = "", **more) -> Publisher:
     data, status = data or f"ipc://{folder}/data", status or f"ipc://{folder}/status"

@@ -32,7 +32,6 @@ from gcd_node.sources import PushSource
 from gcd_node.sources.live import LiveCamera
 from gcd_node.sources.push import open_push
 
-pytestmark = pytest.mark.timeout(120)
 RED = flat(250, 10, 20)
 SHAPE = RED.shape[:2]
 FPS = 50.0
@@ -257,8 +256,15 @@ def seen_by(vis: np.ndarray, inverse: np.ndarray, **header: object) -> list[Rece
     return [arrived(replace(each, header=replace(each.header, **changes | header))) for each in messages]
 
 
-def test_obstacles_are_what_was_seen_now_and_stand_where_it_was() -> None:
+def test_obstacles_are_what_was_seen_now_where_it_was_and_never_of_two_windows(tmp_path: Path) -> None:
     defined = planner("obstacles")
+    obstacles = defined["SeenObstacles"](f"ipc://{tmp_path}/data", "main")
+    obstacles.maps.close()
+    seen, far = seen_by(np.full((2, 4, 6), 2, np.uint8), np.full((2, 4, 6), 0.1))
+    later = replace(far, message=replace(far.message, header=replace(far.header, window_id=1)))
+    late = replace(far, expired=True)
+    obstacles.maps = Scripted(far, seen, later, far, seen, None, late, seen, far)
+    assert [obstacles.poll() is None for _ in range(9)] == [True] * 8 + [False]
     chance = np.random.default_rng(0)
     vis = chance.integers(0, 3, (2, 4, 6), np.uint8)
     inverse = np.where(chance.random((2, 4, 6)) < 0.2, 0.0, 1 / chance.uniform(1, 50, (2, 4, 6)))
@@ -277,13 +283,3 @@ def test_obstacles_are_what_was_seen_now_and_stand_where_it_was() -> None:
     for state, metres in ((2, 10.0), (1, np.inf), (0, np.inf)):  # it brakes for nothing painted
         points = defined["seen_points"](*seen_by(np.full((2, 4, 6), state, np.uint8), everywhere))
         assert defined["nearest_ahead_m"](points) == metres
-
-
-def test_obstacles_never_join_two_windows(tmp_path: Path) -> None:
-    obstacles = planner("obstacles")["SeenObstacles"](f"ipc://{tmp_path}/data", "main")
-    obstacles.maps.close()
-    seen, far = seen_by(np.full((2, 4, 6), 2, np.uint8), np.full((2, 4, 6), 0.1))
-    later = replace(far, message=replace(far.message, header=replace(far.header, window_id=1)))
-    late = replace(far, expired=True)
-    obstacles.maps = Scripted(far, seen, later, far, seen, None, late, seen, far)
-    assert [obstacles.poll() is None for _ in range(9)] == [True] * 8 + [False]

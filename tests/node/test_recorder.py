@@ -434,7 +434,7 @@ def test_stamps_are_those_of_the_capture_and_numbers_those_of_the_source(whole: 
     assert all(abs(each.log_ns - time.time_ns()) < 600 * SECOND_NS for each in heard)
 
 
-def test_pictures_are_what_was_seen_and_published(whole: Run) -> None:
+def test_pictures_and_maps_are_what_was_seen_and_published(whole: Run) -> None:
     heard, box, _ = whole
     for topic, wanted, most in (
         ("/src/image", [np.full((64, 96, 3), 20 + number) for number in range(30)], 2),
@@ -444,10 +444,6 @@ def test_pictures_are_what_was_seen_and_published(whole: Run) -> None:
             assert each.value.format == "jpeg"
             picture = cv2.imdecode(np.frombuffer(each.value.data, np.uint8), cv2.IMREAD_COLOR)
             assert np.abs(picture[..., ::-1].astype(int) - pixels).max() <= most
-
-
-def test_maps_come_back_as_they_were_published(whole: Run) -> None:
-    heard, box, _ = whole
     for topic, kind in (("classes", "cls"), ("std", "std"), ("visibility", "vis"), ("depth", "depth")):
         encoding, pixels_of = ("32FC1", depth_m) if kind == "depth" else ("mono8", images)
         wanted = np.concatenate([pixels_of(message) for message in box.of(kind)]).reshape(-1, 64, 96)

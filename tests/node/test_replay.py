@@ -45,7 +45,6 @@ from gcd_node.replay.lockstep import digest_of, lockstep_config, replay
 from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, keep_pixels, new_folder, open_run, pixel_digest
 from gcd_node.stream_context import config_digest
 
-pytestmark = pytest.mark.timeout(60)
 WINDOWS, FRAMES = 3, 14
 SOURCE = 'kind = "synthetic"\nframes = 42'
 

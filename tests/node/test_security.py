@@ -19,8 +19,6 @@ from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError, NodeError, OutputError
 from gcd_node.publisher import Publisher
 
-pytestmark = pytest.mark.timeout(90)
-
 NODE, VIEWER, OPERATOR, STRANGER = (new_key_pair() for _ in range(4))
 CLIENTS = {VIEWER.public: Client(name="eye", role="viewer"), OPERATOR.public: Client(name="hand", role="operator")}
 SECURITY = ServerSecurity(keys=NODE, find_client=CLIENTS.get)

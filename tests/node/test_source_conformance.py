@@ -13,6 +13,7 @@ import time
 import zlib
 from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import get_args
@@ -75,25 +76,25 @@ def closing(source: FrameSource, hush: Callable[[], None] = lambda: None) -> Gen
         source.close()
 
 
-def play(kind: SourceKind, path: Path, slow: bool, fps: float | None = None) -> AbstractContextManager[Opened]:
-    pace = "realtime" if slow else "lockstep"
-    section = {"kind": kind, "path": str(path), "pace": pace} | ({} if fps is None else {"fps": fps})
-    return closing(open_source(msgspec.convert(section, SourceConfig)))
-
-
-def open_file(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
-    path = write_video(folder / "clip.mkv", [RED] * COUNT, fps=0.5 if slow else 25.0)
-    return play("file", path, slow)
-
-
-def open_folder(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
-    path = write_pictures(folder / "pictures", {f"{i}.png": RED for i in range(COUNT)})
-    return play("folder", path, slow, fps=0.5 if slow else 25.0)
-
-
-def open_synthetic(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
+def open_recording(kind: SourceKind, folder: Path, slow: bool) -> AbstractContextManager[Opened]:
+    """slow: a frame every 2 s, in real time; else 25 in a second of the recording, in lockstep."""
     pace, fps = ("realtime", 0.5) if slow else ("lockstep", 25.0)
-    return closing(MovingPattern(size=(WIDTH, HEIGHT), fps=fps, frames=COUNT, pace=pace))
+    if kind == "synthetic":
+        return closing(MovingPattern(size=(WIDTH, HEIGHT), fps=fps, frames=COUNT, pace=pace))
+    if kind == "file":
+        path = write_video(folder / "clip.mkv", [RED] * COUNT, fps=fps)
+    elif kind == "folder":
+        path = write_pictures(folder / "pictures", {f"{i}.png": RED for i in range(COUNT)})
+    else:  # a ROS 2 log, written by the reference library
+        from robot_logs import START_NS, TOPIC, compressed, ros_log
+
+        path = folder / "log.mcap"
+        with ros_log(path) as say:
+            for i in range(COUNT):
+                stamp_ns = START_NS + round(i * 1e9 / fps)
+                say(TOPIC, *compressed(RED, stamp_ns), log_ns=stamp_ns, sequence=i)
+    section = {"kind": kind, "path": str(path), "pace": pace} | ({"fps": fps} if kind == "folder" else {})
+    return closing(open_source(msgspec.convert(section, SourceConfig)))
 
 
 @contextmanager
@@ -144,29 +145,14 @@ def open_push(folder: Path, slow: bool) -> Generator[Opened]:
             yield opened
 
 
-def open_mcap(folder: Path, slow: bool) -> AbstractContextManager[Opened]:
-    """A ROS 2 log, written by the reference library."""
-    from robot_logs import START_NS, TOPIC, compressed, ros_log
-
-    period_ns = 2_000_000_000 if slow else 40_000_000
-    with ros_log(folder / "log.mcap") as say:
-        for i in range(COUNT):
-            stamp_ns = START_NS + i * period_ns
-            say(TOPIC, *compressed(RED, stamp_ns), log_ns=stamp_ns, sequence=i)
-    return play("mcap", folder / "log.mcap", slow)
-
-
 KINDS: dict[SourceKind, Callable[[Path, bool], AbstractContextManager[Opened]]] = {
-    "file": open_file,
-    "folder": open_folder,
-    "synthetic": open_synthetic,
-    "mcap": open_mcap,
+    **{kind: partial(open_recording, kind) for kind in ("file", "folder", "synthetic", "mcap")},
     "v4l2": open_v4l2_camera,
     "rtsp": open_rtsp,
     "oak": open_oak,
     "push": open_push,
 }
-"""With True a recording plays in real time, a frame every 2 s; else in lockstep. A live one gives 25 FPS, whichever."""
+"""A live one gives 25 FPS, slow or not."""
 MISSING: dict[SourceKind, Callable[[Path], SourceConfig]] = {
     "file": lambda folder: FileSource(path=str(folder / "none.mp4")),
     "folder": lambda folder: FolderSource(path=str(folder / "none"), fps=5.0),
@@ -287,7 +273,12 @@ def test_what_is_missing_is_refused_in_one_line_and_in_time(kind: SourceKind, tm
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "avi", "mkv", "webm"])
-def test_every_container_is_read_with_its_stamps(suffix: str, tmp_path: Path) -> None:
+def test_every_container_is_read_with_its_stamps_and_a_raw_stream_at_its_rate(suffix: str, tmp_path: Path) -> None:
+    coded = write_video(tmp_path / "clip.avi", ramp(8), fps=25.0).read_bytes()
+    pictures = [b"\xff\xd8\xff" + part for part in coded.split(b"\xff\xd8\xff")[1:]]
+    (tmp_path / "raw.mjpeg").write_bytes(b"".join(picture[: picture.rindex(b"\xff\xd9") + 2] for picture in pictures))
+    stamps = [frame.stamp_ns for frame in VideoFile(tmp_path / "raw.mjpeg", fps=20.0).frames()]
+    assert stamps == [50_000_000 * i for i in range(8)]
     video = VideoFile(write_video(tmp_path / f"clip.{suffix}", ramp(COUNT)))
     steps_s = np.diff([frame.stamp_ns for frame in video.frames()]) / 1e9
     assert video.info.fps_nominal == pytest.approx(10.0)
@@ -300,14 +291,6 @@ def test_red_stays_red_through_every_picture_format(suffix: str, tmp_path: Path)
     image = read_picture(folder / f"red.{suffix}")
     tolerance = 6 if suffix in {"jpg", "webp"} else 0
     assert np.abs(image.astype(int) - (250, 10, 20)).max() <= tolerance
-
-
-def test_a_raw_stream_without_stamps_is_counted_at_its_rate(tmp_path: Path) -> None:
-    coded = write_video(tmp_path / "clip.avi", ramp(8), fps=25.0).read_bytes()
-    pictures = [b"\xff\xd8\xff" + part for part in coded.split(b"\xff\xd8\xff")[1:]]
-    (tmp_path / "raw.mjpeg").write_bytes(b"".join(picture[: picture.rindex(b"\xff\xd9") + 2] for picture in pictures))
-    stamps = [frame.stamp_ns for frame in VideoFile(tmp_path / "raw.mjpeg", fps=20.0).frames()]
-    assert stamps == [50_000_000 * i for i in range(8)]
 
 
 @pytest.mark.parametrize(

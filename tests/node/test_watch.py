@@ -32,7 +32,6 @@ from gcd_node.publisher import Publisher
 from gcd_node.sources.files import read_picture
 
 Capture = pytest.CaptureFixture[str]
-pytestmark = pytest.mark.timeout(60)
 SEEN = np.random.default_rng(0).integers(0, 3, (2, 16, 16), np.uint8)
 WALL_NS = 1_800_000_000_000_000_000
 
