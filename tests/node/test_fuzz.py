@@ -1,7 +1,7 @@
 """Whatever arrives from outside ends as something valid or as a documented error, and nothing of it stays.
 
 GCD_MUTATIONS=100000 makes as many inputs for each parser; the default is a fraction. The same for logs is in
-test_damaged_logs.py.
+test_robot_logs.py.
 """
 
 import hashlib

@@ -130,7 +130,7 @@ def test_a_refusal_that_cannot_be_told_holds_up_no_end(dies: bool, monkeypatch: 
     publisher.close()
 
 
-def test_where_a_node_may_be_reached(tmp_path: Path, node: FakeNode) -> None:
+def test_f19_where_a_node_may_be_reached(tmp_path: Path, node: FakeNode) -> None:
     before = os.umask(0)
     try:
         with node.serve(f"ipc://{tmp_path}/c"):  # never open to everybody
