@@ -9,7 +9,6 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from types import TracebackType
 from typing import TypeAlias
 
 import msgspec
@@ -42,7 +41,7 @@ a few ms at most. The role may use the verb, that is checked; `time` never comes
 
 
 class ControlServer:
-    """Answers requests until closed. Use it as a context manager.
+    """Answers requests until closed.
 
     state: the node's lifecycle state, for every reply. on_event: gets AUTH_DENIED, TOO_LARGE and CONTROL_FLOOD.
     on_answer: see AnswerSink. All are called from threads of this server. ignore_s: for how long a client that sends
@@ -95,12 +94,6 @@ class ControlServer:
         self.guard.wake()
         self.thread.join()
         self.guard.close()
-
-    def __enter__(self) -> "ControlServer":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self.close()
 
     # What follows runs in the control thread alone.
 
@@ -254,6 +247,6 @@ class FloodGuard:
             since_s, count = now_s, 0
         is_flood = count == _MOST_BAD_PER_S
         self._bad[peer] = (now_s if is_flood else since_s, count + 1)
-        if len(self._bad) > _MOST_PEERS:
-            self._bad.popitem(last=False)
+        if len(self._bad) > _MOST_PEERS:  # who is ignored is forgotten last
+            del self._bad[min(self._bad, key=lambda each: self.ignores(each, now_s))]
         return is_flood

@@ -64,10 +64,6 @@ class RecordHealth:
     written: int = 0
     dropped: Mapping[str, int] = field(default_factory=dict[str, int])
 
-    def to_status(self) -> dict[str, object]:
-        """The field `rec` of a status message."""
-        return {"state": self.state} if self.file is None else {**asdict(self), "dropped": dict(self.dropped)}
-
 
 class Health:
     """Collects what the node's threads report: each attribute may be set, and each method called, from any thread.
@@ -203,7 +199,7 @@ class Health:
             findings, missing = self._judged(now_ns)
             counts = self.counts | {"window": sum(self.faults.values())}
             stages = {str(name): times.summary(now_ns) for name, times in self._stages.items() if times.count}
-            render, memory_mb, ood = stages.get("render", {}), self.gpu_mem_mb, self.ood_score
+            render, memory_mb, ood, rec = stages.get("render", {}), self.gpu_mem_mb, self.ood_score, self.recording
             age_ns = None if self._arrival_ns is None else max(0, now_ns - self._arrival_ns)
             return {
                 "state": self.state,
@@ -243,7 +239,7 @@ class Health:
                     view_id: {} if at is None else {"last_ms": round((now_ns - at) / 1e6)}
                     for view_id, at in self._views.items()
                 },
-                "rec": self.recording.to_status(),
+                "rec": {"state": rec.state} if rec.file is None else asdict(rec),
             }
 
     # What follows is called with the lock held.

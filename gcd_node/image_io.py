@@ -52,7 +52,7 @@ def make_folder(folder: Path) -> None:
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     """Write one picture, [H, W, 3] RGB or [H, W] grey. Raises OutputError."""
     coded = cv2.imencode(".png", image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    _write_whole(path, lambda file: file.write(coded.tobytes()))
+    write_whole(path, lambda file: file.write(coded.tobytes()))
 
 
 class VideoWriter:
@@ -108,12 +108,13 @@ def read_npy(path: Path, wanted: str) -> NDArray[Any]:
 def write_arrays(path: Path, arrays: NDArray[Any] | Mapping[str, NDArray[Any]]) -> None:
     """Write one array to .npy, several by name to .npz; the file appears whole or not at all. Raises OutputError."""
     if isinstance(arrays, np.ndarray):
-        _write_whole(path, lambda file: np.save(file, arrays, allow_pickle=False))
+        write_whole(path, lambda file: np.save(file, arrays, allow_pickle=False))
     else:
-        _write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+        write_whole(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
-def _write_whole(path: Path, save: Callable[[BinaryIO], object]) -> None:
+def write_whole(path: Path, save: Callable[[BinaryIO], object]) -> None:
+    """Write a file that is there once all of it is. Raises OutputError."""
     part = path.with_name(path.name + ".part")
     make_folder(path.parent)
     try:
@@ -164,13 +165,6 @@ class ViewSaver:
         """Finish the videos; until then they may lack their end."""
         for video in self._videos.values():
             video.close()
-        self._videos.clear()
-
-    def __enter__(self) -> "ViewSaver":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _write(self, view: ReceivedView, frames: Image, folder: Path) -> None:
         header, kind = view.header, kind_of(view.message.topic)

@@ -8,10 +8,12 @@ import errno
 import logging
 import math
 import os
+import shutil
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -57,16 +59,23 @@ class RoomError(Exception):
 def check_room(config: RecordConfig, root: Path) -> float:
     """MB that are free on the disk of `root`. Raises RoomError: recordings may not take more of it, by max_total_mb and
     keep_free_mb; OSError."""
-    taken_mb = sum(each.stat().st_size for each in root.rglob("*.mcap")) / _MB if config.max_total_mb else 0.0
+    taken_mb = _taken_bytes(root) / _MB if config.max_total_mb else 0.0
     if taken_mb > config.max_total_mb:
         limit = f"max_total_mb is {config.max_total_mb:g}: move some away"
         raise RoomError("TOTAL_LIMIT", f"recordings in {root} take {taken_mb:.0f} MB, {limit}")
-    disk = os.statvfs(root)
-    free_mb = disk.f_bavail * disk.f_frsize / _MB
+    free_mb = shutil.disk_usage(root).free / _MB
     if free_mb < config.keep_free_mb:
         limit = f"keep_free_mb is {config.keep_free_mb:g}: make room on it"
         raise RoomError("DISK_LOW", f"the disk of {root} has {free_mb:.0f} MB left, {limit}")
     return free_mb
+
+
+def _taken_bytes(root: Path) -> int:
+    total = 0
+    for path in (Path(folder, name) for folder, _, names in os.walk(root) for name in names):
+        with suppress(FileNotFoundError):  # somebody moved it away meanwhile
+            total += path.stat().st_size if path.suffix == ".mcap" else 0
+    return total
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

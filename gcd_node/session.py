@@ -113,7 +113,7 @@ def open_session(
                 on_answer=node.recorder.command,
                 security=security,
             )
-            stack.enter_context(control)
+            stack.callback(control.close)
             node.needed += [control.thread, *control.guard.threads]
         if config.health.http is not None:
             stack.enter_context(metrics_server(config.health.http, node.health))

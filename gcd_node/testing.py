@@ -44,9 +44,10 @@ class ReplayedRun:
             max_class_share: of a view's class pixels in a window, how many may differ, 0 to 1.
         Raises:
             AssertionError: it differs, or there is no golden run yet. DamagedRunError: the golden is damaged.
-            OutputError: with --gcd-update, there is something else than a run.
+            OutputError: with --gcd-update, there is something else than a run, or it cannot be copied.
         """
         __tracebackhide__ = True
+        from gcd_node.errors import OutputError
         from gcd_node.replay.compare import Tolerance, compare, report_text
         from gcd_node.replay.run import MANIFEST, new_folder, open_run
 
@@ -56,8 +57,11 @@ class ReplayedRun:
             if (path / MANIFEST).is_file():
                 shutil.rmtree(former, ignore_errors=True)
                 path.replace(former)
-            with new_folder(path) as folder:
-                shutil.copytree(self.folder, folder, dirs_exist_ok=True)
+            try:
+                with new_folder(path) as folder:
+                    shutil.copytree(self.folder, folder, dirs_exist_ok=True)
+            except OSError as error:
+                raise OutputError(f"cannot copy {self.folder} to {path}: {error}; replay again") from error
             shutil.rmtree(former, ignore_errors=True)
             return
         if not path.exists():

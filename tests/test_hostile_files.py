@@ -1,7 +1,7 @@
 """Files made to break, stop or fill whatever opens them, given to the real commands: each ends in one line, in time.
 
 Every kind of hostile file goes to every door that takes such files, in a process of its own. Logs have their own tests,
-`node/test_damaged_logs.py`.
+`node/test_robot_logs.py`.
 """
 
 import json

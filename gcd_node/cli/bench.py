@@ -127,10 +127,11 @@ def view_figures(views: Mapping[str, Sequence[Arrival]]) -> dict[str, float]:
     ages_ms = [arrival.age_ms for one in each for arrival in one]
     at_ms = [np.array([arrival.at_ns for arrival in one]) / 1e6 for one in each]
     jitter_ms = np.concatenate([np.abs(np.diff(times, 2)) for times in at_ms])
+    answered = [len({seq for view in one[1:] for seq in view.seqs}.difference(one[0].seqs)) for one in each]
     basic = {
         "RECEIVED_DURATION": max(times[-1] - times[0] for times in at_ms),
         "MEAN_PLAYBACK_FRAME_RATE": max(_per_second(one, one[-1].seqs[-1] - one[0].seqs[-1]) for one in each),
-        "MEAN_FRAME_RATE": min(_per_second(one, _answered(one)) for one in each),
+        "MEAN_FRAME_RATE": min(map(_per_second, each, answered)),
         "NUM_FRAMES_SENT": len(sent),
         "NUM_MISSED_FRAMES": len(missed),
         "FIRST_SENT_RECEIVED_LATENCY": max(one[0].age_ms for one in each),
@@ -147,11 +148,6 @@ def view_figures(views: Mapping[str, Sequence[Arrival]]) -> dict[str, float]:
     for share in (50, 95, 99):
         figures[f"GcdNodeMetrics.P{share}_LATENCY"] = float(np.percentile(ages_ms, share, method="higher"))
     return figures | {"GcdNodeMetrics.NUM_VIEWS": len(ages_ms)}
-
-
-def _answered(arrivals: Sequence[Arrival]) -> int:
-    """Input frames that views after the first one answered."""
-    return len({seq for arrival in arrivals[1:] for seq in arrival.seqs}.difference(arrivals[0].seqs))
 
 
 def _per_second(arrivals: Sequence[Arrival], count: int) -> float:

@@ -8,7 +8,7 @@ import time
 import webbrowser
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -66,7 +66,7 @@ def view(
         if save is not None:
             from gcd_node.image_io import ViewSaver  # takes seconds, in which a subscriber would lose views
 
-            saver = stack.enter_context(ViewSaver(save, hatch=hatch))
+            saver = stack.enter_context(closing(ViewSaver(save, hatch=hatch)))
         keys = client_keys(key_folder, node_key)
         views = stack.enter_context(ViewSubscriber(endpoint, name, kinds, conflate=False, keys=keys))
         live = stack.enter_context(_live(console, lambda: shown.render(where, ended=views.ended)))

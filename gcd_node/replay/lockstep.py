@@ -19,6 +19,7 @@ from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessa
 from gcd_model import Traits
 from gcd_node.config import LifeConfig, NodeConfig
 from gcd_node.errors import ConfigError, ModelFailedError, SourceError
+from gcd_node.image_io import write_whole
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import PublisherStats
@@ -106,7 +107,7 @@ def replay(
             troubles=writer.troubles,
             windows=tuple(writer.windows),
         )
-        (folder / MANIFEST).write_bytes(encode_manifest(manifest))
+        write_whole(folder / MANIFEST, lambda file: file.write(encode_manifest(manifest)))
     return open_run(out)
 
 

@@ -166,7 +166,7 @@ def new_folder(path: Path) -> Generator[Path]:
 
     Until then its name ends in .part. What is killed leaves that behind.
     Raises:
-        OutputError: there is something at `path`, other than an empty folder; or it cannot be written.
+        OutputError: there is something at `path`, other than an empty folder; or nothing can be there.
     """
     path = path.expanduser().absolute()
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
@@ -176,8 +176,9 @@ def new_folder(path: Path) -> Generator[Path]:
     make_folder(part)
     try:
         yield part
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}; is there space? Or name another folder") from error
+        try:
+            part.replace(path)
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}; name another folder") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)

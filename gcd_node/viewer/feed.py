@@ -242,16 +242,19 @@ class Browser:
         self._role: Role = "viewer"
         self._waiting: dict[str, tuple[float, str | bytes]] = {}  # since when (monotonic), and what
         self._changed = asyncio.Event()
-        self._unseen = self._heard = 0
+        self._unseen = 0
 
     async def serve(self) -> None:
         """Returns when the browser has gone or was sent away."""
         sender = asyncio.create_task(self._send())
         try:
             self._link.join(self)
+            beat_s, heard = time.monotonic(), 0
             async for text in self._connection:
-                self._heard += 1
-                if self._heard > _MOST_A_BEAT:
+                if time.monotonic() >= beat_s + BEAT_S:
+                    beat_s, heard = time.monotonic(), 0
+                heard += 1
+                if heard > _MOST_A_BEAT:
                     return await self.close(NOT_OURS, "too many messages")
                 await self._take(parse_request(text))
         except MessageError as error:
@@ -315,7 +318,7 @@ class Browser:
             while True:
                 self._changed.clear()
                 if time.monotonic() >= beat_s:
-                    beat_s, self._heard = time.monotonic() + BEAT_S, 0
+                    beat_s = time.monotonic() + BEAT_S
                     message = text_message("beat", {"silent_ms": self._link.silent_ms})
                 else:
                     message = self.next_message()

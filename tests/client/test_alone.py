@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def test_the_client_alone_reads_views_and_commands(tmp_path: Path) -> None:
         lockstep=True,
     )
     with (
-        ControlServer(f"ipc://{tmp_path}/c", Views().handle, lambda: "active", print) as server,
+        closing(ControlServer(f"ipc://{tmp_path}/c", Views().handle, lambda: "active", print)) as server,
         opened() as publisher,
     ):
         command = [python, "-c", PROGRAM, publisher.endpoint, server.endpoint]

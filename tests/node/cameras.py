@@ -1,12 +1,16 @@
 """Live cameras that do what a test tells them, and the bench they are plugged into."""
 
+import os
 import queue
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gcd_client import ClientKeys, FramePusher
@@ -124,3 +128,139 @@ def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < deadline_s, "it did not come about in time"
         time.sleep(0.005)
+
+
+# A camera behind cv2.VideoCapture that needs no hardware: it does what a test tells it, in real time.
+
+
+class FakeVideoCapture:
+    """Stands in for cv2.VideoCapture on a Video4Linux device.
+
+    picture: RGB, given again and again. stamps: "driver" are monotonic as of a USB camera, "zero" are none,
+    "wall" are of another clock. Give the instance's `open` as `open_capture`.
+    """
+
+    def __init__(
+        self, picture: Image, *, fps: float = 25.0, stamps: str = "driver", fixed: dict[int, float] | None = None
+    ) -> None:
+        self.calls: list[tuple[int, float]] = []
+        self.released = threading.Event()
+        self.awake = threading.Event()
+        self.awake.set()
+        self.gone = self.breaks = False
+        self.there = True
+        self.damaged: set[int] = set()
+        self.grabbed = -1
+        self.stated_ms: list[float] = []
+        self._picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        self._fps, self._stamps, self._fixed = fps, stamps, fixed or {}
+        height, width = picture.shape[:2]
+        self._values = {
+            cv2.CAP_PROP_FRAME_WIDTH: float(width),
+            cv2.CAP_PROP_FRAME_HEIGHT: float(height),
+            cv2.CAP_PROP_FPS: fps,
+            cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")),
+        } | self._fixed
+
+    def open(self, name: str, backend: int, parameters: Sequence[int] = ()) -> "FakeVideoCapture":
+        return self
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return self.there
+
+    def set(self, prop: int, value: float) -> bool:
+        self.calls.append((prop, value))
+        if prop not in self._fixed:
+            self._values[prop] = value
+        return True
+
+    def get(self, prop: int) -> float:
+        if prop != cv2.CAP_PROP_POS_MSEC:
+            return self._values.get(prop, 0.0)
+        stated_ms = {"driver": time.monotonic() * 1e3 - 5.0, "zero": 0.0, "wall": time.time() * 1e3}[self._stamps]
+        self.stated_ms.append(stated_ms)
+        return stated_ms
+
+    def grab(self) -> bool:
+        time.sleep(1.0 / self._fps)
+        while not self.awake.wait(0.01):
+            if self.gone:
+                return False
+        if self.breaks:
+            raise cv2.error("the driver gave up")
+        self.grabbed += 1
+        return not self.gone
+
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        if self.grabbed in self.damaged:
+            return False, None
+        return True, self._picture.copy()
+
+    def release(self) -> None:
+        self.released.set()
+
+
+# Small recordings for tests, written with OpenCV; pictures are RGB. And what processes of tests need.
+
+
+WIDTH, HEIGHT = 64, 48
+CODECS = {"mp4": "mp4v", "avi": "MJPG", "mkv": "FFV1", "webm": "VP80"}
+
+
+def environment() -> dict[str, str]:
+    """Of a process that finds what this one finds."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+
+
+def flat(red: int, green: int, blue: int, width: int = WIDTH, height: int = HEIGHT) -> Image:
+    return np.full((height, width, 3), (red, green, blue), np.uint8)
+
+
+def ramp(count: int, width: int = WIDTH, height: int = HEIGHT) -> list[Image]:
+    """Pictures that get brighter, each with the same coarse pattern."""
+    pattern = (np.indices((height, width)).sum(axis=0) // 8 % 2 * 40).astype(np.uint8)
+    return [np.repeat((pattern + 5 * i)[:, :, None], 3, axis=2) for i in range(count)]
+
+
+def write_video(path: Path, images: Iterable[Image], fps: float = 10.0, codec: str | None = None) -> Path:
+    images = list(images)
+    height, width = images[0].shape[:2]
+    code = cv2.VideoWriter.fourcc(*(codec or CODECS[path.suffix[1:]]))
+    writer = cv2.VideoWriter(str(path), code, fps, (width, height))
+    assert writer.isOpened(), f"OpenCV cannot write {path.name}"
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    return path
+
+
+def write_pictures(folder: Path, images: dict[str, Image]) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, image in images.items():
+        assert cv2.imwrite(str(folder / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    return folder
+
+
+def noise(folder: Path, height: int, width: int) -> Path:
+    """Fourteen pictures, enough for a clip."""
+    drawn = np.random.default_rng(0).integers(0, 256, (14, height, width, 3), np.uint8)
+    return write_pictures(folder, {f"{i:02d}.png": image for i, image in enumerate(drawn)})
+
+
+def frames_at(stamps_ms: Iterable[float], width: int = 4, height: int = 2) -> list[Frame]:
+    """Tiny frames whose pixels hold their sequence number."""
+    return [
+        Frame(image=np.full((height, width, 3), seq % 256, np.uint8), stamp_ns=round(ms * 1e6), seq=seq)
+        for seq, ms in enumerate(stamps_ms)
+    ]
+
+
+def calibration(folder: Path, size: tuple[int, int], focal: float, d: Sequence[float] = (-0.1, 0.01, 0, 0, 0)) -> Path:
+    """A file as ROS writes it."""
+    path, (width, height) = folder / "camera.yaml", size
+    matrix = [focal, 0, width / 2 - 0.5, 0, focal, height / 2 - 0.5, 0, 0, 1]
+    path.write_text(
+        f"image_width: {width}\nimage_height: {height}\ncamera_matrix: {{rows: 3, cols: 3, data: {matrix}}}\n"
+        f"distortion_model: plumb_bob\ndistortion_coefficients: {{rows: 1, cols: 5, data: {list(d)}}}\n"
+    )
+    return path

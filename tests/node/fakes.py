@@ -1,16 +1,20 @@
-"""A model, a source and an outbox that do what a test tells them."""
+"""A model, a source, an outbox and a node behind a control socket that do what a test tells them."""
 
 import functools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from cameras import until
 from msgspec.structs import replace as struct_replace
 
+from gcd_client.control import Code
 from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_model import (
     Augmentation,
@@ -24,13 +28,20 @@ from gcd_model import (
     load_synthesizer,
 )
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL
+from gcd_model.networks import random_networks
+from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.load import save_weights
+from gcd_node.auth import Role
 from gcd_node.config import NodeConfig, parse_config
+from gcd_node.control import ControlServer
+from gcd_node.errors import NodeError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import MessageSink, PublisherStats
 from gcd_node.node import Node
+from gcd_node.verbs import Command, Outcome, RequestError
 
 HEIGHT, WIDTH = 64, 96
 
@@ -130,25 +141,30 @@ class FakeSynthesizer:
 class FakeSource:
     """`count` frames, the number of a frame in its pixels; `fails` is raised after the last."""
 
-    def __init__(self, count: int, *, fps: float = 24.0, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+    def __init__(
+        self,
+        count: int,
+        *,
+        fps: float = 24.0,
+        size: tuple[int, int] = (WIDTH, HEIGHT),
+        period_s: float = 0.0,
+        fails: Exception | None = None,
+    ) -> None:
         self.info = SourceInfo(
             kind="synthetic", id="fake", width=size[0], height=size[1], fps_nominal=fps, clock="replay"
         )
-        self._count, self.fails, self.period_s = count, None, 0.0
-        self.closed = False
-        self.corrupt = 0
-
-    fails: Exception | None
+        self.closed, self.corrupt = False, 0
+        self._count, self._period_s, self._fails = count, period_s, fails
 
     def frames(self) -> Iterator[Frame]:
         for seq in range(self._count):
             if self.closed:
                 return
-            time.sleep(self.period_s)
+            time.sleep(self._period_s)
             image = np.full((self.info.height, self.info.width, 3), 20 + seq % 200, np.uint8)
             yield Frame(image=image, stamp_ns=round(seq * 1e9 / self.info.fps_nominal), seq=seq)
-        if self.fails is not None:
-            raise self.fails
+        if self._fails is not None:
+            raise self._fails
 
     def close(self) -> None:
         self.closed = True
@@ -157,9 +173,8 @@ class FakeSource:
 class Steady(FakeSource):
     """Frames at their rhythm until it is closed."""
 
-    def __init__(self, period_s: float = 0.002) -> None:
-        super().__init__(10_000_000)
-        self.period_s = period_s
+    def __init__(self) -> None:
+        super().__init__(10_000_000, period_s=0.002)
 
 
 def made_node(
@@ -206,19 +221,97 @@ class Box:
     def of(self, kind: str, view: str = "main") -> list[ViewMessage]:
         return [message for message in self.views if message.topic == f"view/{view}/{kind}"]
 
+    def ids(self) -> list[int]:
+        """Of the windows."""
+        return [message.header.window_id for message in self.of("win")]
 
-def fake_config(more: str = "", *, samples: int = 1, encoding: str = "rgb8") -> NodeConfig:
-    """A lockstep node of one view with a model of these fakes. more: further lines of [model]."""
-    text = f"""
-        [source]
-        kind = "synthetic"
-        pace = "lockstep"
-        [model]
-        weights = "fake"
-        samples = {samples}
-        {more}
-        [publish]
-        encoding = "{encoding}"
-        [view.main]
-    """
-    return parse_config(text.encode(), "test")
+    def seqs(self) -> list[int]:
+        """Of the first frame of each window."""
+        return [message.header.src.seq[0] for message in self.of("win")]
+
+    def told(self, topic: StatusTopic) -> list[Mapping[str, Any]]:
+        return [fields for each, fields in self.notes if each == topic]
+
+    def events(self, code: str) -> list[Mapping[str, Any]]:
+        return [fields for fields in self.told("event") if fields["code"] == code]
+
+
+LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
+
+
+def fake_config(*changes: str, source: str = LOCKSTEP) -> NodeConfig:
+    """A node of one view with a model of these fakes. changes: KEY=VALUE. source: of [source]."""
+    text = f'[source]\n{source}\n[model]\nweights = "fake"\n[view.main]'
+    return parse_config(text.encode(), "test", changes)
+
+
+def run(config: NodeConfig, model: ViewSynthesizer | None = None, source: FrameSource | None = None) -> Box:
+    """A node's whole life, by default over 28 frames."""
+    box = Box()
+    made_node(config, model or FakeSynthesizer(traits()), source or FakeSource(28), box).run()
+    return box
+
+
+class FakeNode:
+    """A node behind the control socket that only remembers what it was told; knows one view, `top`, whose revision
+    rises with each set_view."""
+
+    def __init__(self) -> None:
+        self.heard: list[Command] = []
+        self.view_rev = 1
+        self.result: Any = None
+        self.events: list[tuple[str, dict[str, object]]] = []
+
+    @contextmanager
+    def serve(self, endpoint: str, **options: Any) -> Iterator[ControlServer]:
+        with closing(ControlServer(endpoint, self.handle, lambda: "active", self.event, **options)) as server:
+            yield server
+
+    def handle(self, command: Command, role: Role) -> Outcome:
+        self.heard.append(command)
+        match command.verb:
+            case "set_view":
+                if abs(command.args.azimuth_deg or 0.0) > 90:
+                    allowed: dict[str, object] = {"allowed": {"azimuth_deg": [-90, 90]}}
+                    raise RequestError("azimuth_deg is beyond what was trained", Code.OUT_OF_RANGE, "", allowed)
+                self.view_rev += 1
+                return Outcome(result={"view_rev": self.view_rev})
+            case "configure":
+                raise NodeError("no model here")
+            case "cleanup":
+                raise ZeroDivisionError("a secret of the code")
+            case "stats":
+                return Outcome(result=self.result)
+            case _:
+                return Outcome(result={"role": role})
+
+    def event(self, code: str, level: int, fields: Mapping[str, object]) -> None:
+        self.events.append((code, {"level": int(level), **fields}))
+
+    @property
+    def codes(self) -> list[str]:
+        """Of the events so far."""
+        return [code for code, _ in self.events]
+
+    def await_event(self, code: str) -> dict[str, object]:
+        """The fields of the first event with this code."""
+        until(lambda: code in self.codes)
+        return next(fields for each, fields in self.events if each == code)
+
+
+TINY = struct_replace(
+    PLAIN_SMALL,
+    height=HEIGHT,
+    width=WIDTH,
+    unet=struct_replace(PLAIN_SMALL.unet, width=16, head_width=16, embedding_width=32),
+    vae=struct_replace(PLAIN_SMALL.vae, width=8),
+    semantic_classes=DRIVING_CLASSES,
+)
+
+
+def write_tiny(folder: Path) -> Path:
+    """`tiny.safetensors` in a folder: real weights of a tiny driving model at random, which paint class colours and
+    take no time."""
+    card = Card(name="tiny", config=TINY, family="driving-semantic", move_time=13, trained=False)
+    save_weights(random_networks(TINY, seed=0), folder / "tiny.safetensors", card)
+    return folder / "tiny.safetensors"

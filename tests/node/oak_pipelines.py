@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from media import HEIGHT, WIDTH
+from cameras import HEIGHT, WIDTH
 
 from gcd_node.frame import Image, LensModel
 from gcd_node.sources.oak import OakStream, load_depthai
@@ -64,7 +64,6 @@ class Scripted:
 
     def device_turns(self, state: dai.DeviceState) -> None:
         """What DepthAI would call on a thread of its own."""
-        assert self.pipeline is not None
         self.pipeline.on_state(None, state)
 
 

@@ -4,7 +4,6 @@ import contextlib
 import gc
 import socket
 import threading
-import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from gcd_node.session import open_session
 from gcd_node.sources import SourceConfig
 
 CAMERA = 'kind = "v4l2"'
-LOCKSTEP = 'kind = "synthetic"\npace = "lockstep"'
 _LOOK_MS, _SILENT_LOOKS = 50, 6
 """How long a reader waits for more, and how often in vain once the node is done: once, after a last word."""
 
@@ -87,7 +85,7 @@ class Rig:
         opened = open_session(self.config, parts=parts, once=once, service=service)
         self.node, self.publisher, self.control = self._session.enter_context(opened)
         self.folder = folder
-        self.notes: list[tuple[float, str, Mapping[str, Any]]] = []
+        self.notes: list[tuple[str, Mapping[str, Any]]] = []
         self.views: list[ReceivedView] = []
         self.ended = False
         self.summary: Summary | None = None
@@ -128,11 +126,11 @@ class Rig:
 
     def _hear(self) -> None:
         def is_over() -> bool:
-            return bool(self.notes) and self.notes[-1][2].get("state") == "finalized"
+            return bool(self.notes) and self.notes[-1][1].get("state") == "finalized"
 
         with StatusSubscriber(f"ipc://{self.folder}/status") as notes:
             for note in self._received(notes, is_over):
-                self.notes.append((time.monotonic(), note.topic, note.fields))
+                self.notes.append((note.topic, note.fields))
 
     def _see(self) -> None:
         with ViewSubscriber(f"ipc://{self.folder}/data", None, "win", conflate=False) as views:
@@ -152,14 +150,13 @@ class Rig:
     # What it said.
 
     def events(self, code: str | None = None) -> list[Mapping[str, Any]]:
-        heard = [fields for _, topic, fields in list(self.notes) if topic == "event"]
-        return heard if code is None else [fields for fields in heard if fields["code"] == code]
+        return [fields for fields in self.told("event") if code in (None, fields["code"])]
+
+    def told(self, topic: str) -> list[Mapping[str, Any]]:
+        return [fields for each, fields in list(self.notes) if each == topic]
 
     def statuses(self) -> list[Mapping[str, Any]]:
-        return [fields for _, topic, fields in list(self.notes) if topic == "status"]
-
-    def metas(self) -> list[Mapping[str, Any]]:
-        return [fields for _, topic, fields in list(self.notes) if topic == "meta"]
+        return self.told("status")
 
     def of(self, view: str = "main") -> list[ReceivedView]:
         return [each for each in list(self.views) if each.header.view_id == view]

@@ -2,33 +2,31 @@
 
 import threading
 import time
-from dataclasses import replace
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cameras import FPS, Bench, Camera, until
-from fakes import HEIGHT, WIDTH
+import zmq
+from cameras import FPS, Bench, Camera, calibration, until
+from fakes import HEIGHT, LOCKSTEP, WIDTH, FakeSynthesizer, Steady, painting_traits, traits
 from rig import Rig
 
 from gcd_client.control import Code
+from gcd_client.protocol import EndMessage, StatusMessage, ViewMessage, decode
 from gcd_client.subscriber import ReceivedView
+from gcd_model import RenderOptions
 from gcd_node.errors import SourceLostError
 from gcd_node.sources import OakSource, SourceConfig
 from gcd_node.sources.live import LiveCamera
 
-CALIBRATION = """
-image_width: 384
-image_height: 256
-camera_matrix: {rows: 3, cols: 3, data: [200.0, 0, 191.5, 0, 200.0, 127.5, 0, 0, 1]}
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0, 0, 0]}
-"""
 GUARD_S = 30.0
 WHOLE, HALF, SQUARE, TINY = (384, 256), (192, 128), (256, 256), (48, 32)
 
 
-class Steady(Camera):
+class Even(Camera):
     """Its stamps lie on an even grid, however fast it is asked."""
 
     def __init__(self, *, size: tuple[int, int] = (WIDTH, HEIGHT), fps: float = FPS) -> None:
@@ -45,16 +43,14 @@ class Steady(Camera):
 
 
 def calibrated(folder: Path) -> str:
-    path = folder / "camera.yaml"
-    path.write_text(CALIBRATION)
-    return f'kind = "v4l2"\ncalibration = "{path}"'
+    return f'kind = "v4l2"\ncalibration = "{calibration(folder, WHOLE, 200.0)}"'
 
 
 def reasons(rig: Rig) -> list[str]:
     return list(rig.statuses()[-1]["reasons"])
 
 
-def view_of(rig: Rig, camera: Steady, epoch: int, size: tuple[int, int] | None = None) -> ReceivedView:
+def view_of(rig: Rig, camera: Even, epoch: int, size: tuple[int, int] | None = None) -> ReceivedView:
     """Take pictures until there is a view of them, and give that; it is of this epoch.
 
     A machine too busy to fetch the pictures of a second sees a step of the clock, which begins an epoch of its own.
@@ -66,13 +62,8 @@ def view_of(rig: Rig, camera: Steady, epoch: int, size: tuple[int, int] | None =
     return seen[0]
 
 
-# Another size.
-
-
-def test_a_calibration_of_another_shape_is_left_out_and_the_field_of_view_is_flagged_until_it_is_back(
-    tmp_path: Path,
-) -> None:
-    camera = Steady(size=WHOLE)
+def test_a_calibration_of_another_shape_is_left_out_and_flagged_until_it_fits_again(tmp_path: Path) -> None:
+    camera = Even(size=WHOLE)
     with Rig(tmp_path, Bench(camera), config=calibrated(tmp_path)) as rig:
         rig.await_state("active")
         view_of(rig, camera, 0)
@@ -93,10 +84,10 @@ def test_a_calibration_of_another_shape_is_left_out_and_the_field_of_view_is_fla
     [("", TINY, "allow_upscale"), ("strict = true", SQUARE, "strict: field of view")],
     ids=["too small", "strict"],
 )
-def test_pictures_the_model_cannot_be_given_are_refused_until_they_change_and_the_node_lives_on(
+def test_pictures_the_model_cannot_take_are_refused(
     more: str, size: tuple[int, int], words: str, tmp_path: Path
 ) -> None:
-    camera = Steady(size=WHOLE)
+    camera = Even(size=WHOLE)
     with Rig(tmp_path, Bench(camera), config=calibrated(tmp_path), more=more) as rig:
         rig.await_state("active")
         view_of(rig, camera, 0)
@@ -114,26 +105,21 @@ def test_pictures_the_model_cannot_be_given_are_refused_until_they_change_and_th
     assert rig.statuses()[-1]["drops"]["source"] >= 15
 
 
-# Another rate, and what is told meanwhile.
-
-
 def lose(rig: Rig, camera: Camera, count: int = 1) -> None:
     camera.feed(SourceLostError("unplugged"))
     rig.await_event("SRC_LOST", count)
 
 
 def test_a_camera_that_returns_at_another_rate_gets_windows_of_the_nearest_trained_rate(tmp_path: Path) -> None:
-    camera, bench = Steady(), Bench()
-    bench.plug(camera)
-    with Rig(tmp_path, bench) as rig:
+    with Rig(tmp_path, bench := Bench(camera := Even())) as rig:
         rig.await_state("active")
         before = view_of(rig, camera, 0).header
         lose(rig, camera)
-        slower = bench.plug(Steady(fps=12.5))
+        slower = bench.plug(Even(fps=12.5))
         after = view_of(rig, slower, 1).header
-        until(lambda: rig.metas()[-1]["fps"] == 12.0)
+        until(lambda: rig.told("meta")[-1]["fps"] == 12.0)
         lose(rig, slower, 2)
-        slowest = bench.plug(Steady(fps=4.0))
+        slowest = bench.plug(Even(fps=4.0))
         flagged = view_of(rig, slowest, 2).header
         until(lambda: "fps" in reasons(rig))
         states = [status["state"] for status in rig.statuses()]
@@ -145,28 +131,22 @@ def test_a_camera_that_returns_at_another_rate_gets_windows_of_the_nearest_train
     assert set(states[states.index("active") :]) == {"active"}
 
 
-def test_a_camera_that_returns_too_slow_for_the_stated_rate_is_refused_and_the_next_one_is_taken(
-    tmp_path: Path,
-) -> None:
-    camera, bench = Steady(), Bench()
-    bench.plug(camera)
-    with Rig(tmp_path, bench, more="window = {fps = 24.0}") as rig:
+def test_a_camera_that_returns_too_slow_is_refused_and_the_next_one_taken(tmp_path: Path) -> None:
+    with Rig(tmp_path, bench := Bench(camera := Even()), more="window = {fps = 24.0}") as rig:
         rig.await_state("active")
         view_of(rig, camera, 0)
         lose(rig, camera)
-        slow = bench.plug(Steady(fps=10.0))
+        slow = bench.plug(Even(fps=10.0))
         for _ in range(15):
             slow.step()
         assert "fps 24 is more than the 10 the source gives" in rig.await_event("SRC_REFUSED")["message"]
         lose(rig, slow, 2)
-        right = bench.plug(Steady())
-        view_of(rig, right, 2)
-        assert rig.node.state.label == "active"
+        view_of(rig, bench.plug(Even()), 2)
     assert len({view.header.src.epoch for view in rig.of()}) == 2  # none of what was refused
 
 
 def test_a_node_can_be_stopped_and_started_while_its_camera_takes_for_ever_to_open(tmp_path: Path) -> None:
-    first, late, answer = Steady(), Steady(), threading.Event()
+    first, late, answer = Even(), Even(), threading.Event()
     asked: list[SourceConfig] = []
 
     def open_source(config: SourceConfig) -> LiveCamera:
@@ -189,21 +169,18 @@ def test_a_node_can_be_stopped_and_started_while_its_camera_takes_for_ever_to_op
     assert not rig.node.left_behind
 
 
-# The same device.
-
-
 @pytest.mark.parametrize("stated", [None, "192.168.1.20"])
 def test_an_oak_is_opened_again_by_its_own_id_unless_its_place_was_stated(stated: str | None, tmp_path: Path) -> None:
     wanted: list[str | None] = []
 
-    def open_oak(config: OakSource) -> Steady:
+    def open_oak(config: OakSource) -> Even:
         wanted.append(config.device)
-        camera = Steady()
+        camera = Even()
         camera.info = replace(camera.info, kind="oak", id="18443010A1B2")
         cameras.append(camera)
         return camera
 
-    cameras: list[Steady] = []
+    cameras: list[Even] = []
     config = 'kind = "oak"' + ("" if stated is None else f'\ndevice = "{stated}"')
     with Rig(tmp_path, open_oak, config=config) as rig:
         rig.await_state("active")
@@ -212,3 +189,109 @@ def test_an_oak_is_opened_again_by_its_own_id_unless_its_place_was_stated(stated
         until(lambda: len(cameras) == 2)
         view_of(rig, cameras[1], 1)
     assert wanted == [stated, stated or "18443010A1B2"]
+
+
+# Several views of one input while commands change them: on every topic, down to its end-of-stream.
+
+
+TWO_VIEWS = '[view.top]\n[view.swing]\nkind = "orbit"\nrate_deg_s = 24.0\namplitude_deg = 60.0'
+
+
+@dataclass
+class Tape:
+    """Every message of the data socket, in its order."""
+
+    said: list[ViewMessage | EndMessage] = field(default_factory=list[ViewMessage | EndMessage])
+
+    def views(self, topic: str) -> list[ViewMessage]:
+        return [each for each in list(self.said) if isinstance(each, ViewMessage) and each.topic == topic]
+
+    def ends(self, topic: str) -> list[EndMessage]:
+        return [each for each in list(self.said) if isinstance(each, EndMessage) and each.topic == topic]
+
+    def await_more(self, topic: str, count: int = 2) -> None:
+        wanted = len(self.views(topic)) + count
+        until(lambda: len(self.views(topic)) >= wanted)
+
+    def after_its_end(self, topic: str) -> list[ViewMessage | EndMessage]:
+        of_topic = [each for each in list(self.said) if each.topic == topic]
+        first = next(index for index, each in enumerate(of_topic) if isinstance(each, EndMessage))
+        return of_topic[first + 1 :]
+
+
+@contextmanager
+def taped(folder: Path) -> Generator[Tape]:
+    """Listens from before the node's start to after its end."""
+    tape, done, there = Tape(), threading.Event(), threading.Event()
+
+    def hear() -> None:
+        with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+            socket.set(zmq.SUBSCRIBE, b"view/")
+            socket.set(zmq.LINGER, 0)
+            socket.connect(f"ipc://{folder}/data")
+            there.set()
+            while not done.is_set() or socket.poll(200):
+                if socket.poll(50):
+                    message = decode(socket.recv())
+                    assert not isinstance(message, StatusMessage)
+                    if not (isinstance(message, EndMessage) and message in tape.said[-20:]):  # ends are repeated
+                        tape.said.append(message)
+
+    thread = threading.Thread(target=hear, daemon=True)
+    thread.start()
+    assert there.wait(20)
+    try:
+        yield tape
+    finally:
+        done.set()
+        thread.join(20)
+
+
+def test_a_topic_that_a_command_opens_and_closes_and_a_removed_view_begin_and_end_with_it(tmp_path: Path) -> None:
+    model, views = FakeSynthesizer(painting_traits()), "[view.top]\n[view.second]"
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=views) as rig:
+        until(lambda: rig.publisher.stats.subscribers >= 2)  # the tape hears
+        tape.await_more("view/top/win")
+        assert rig.ask("set_param", samples=2).code is Code.OK
+        tape.await_more("view/top/std")
+        assert rig.ask("set_param", samples=1).code is Code.OK
+        until(lambda: tape.ends("view/top/std") != [] and tape.ends("view/second/std") != [])
+        assert tape.ends("view/top/win") == []
+        tape.await_more("view/top/win", 4)
+        assert tape.after_its_end("view/top/std") == []
+        assert rig.ask("set_param", samples=2).code is Code.OK
+        until(lambda: len(tape.after_its_end("view/top/std")) >= 2)  # the sequence goes on where it was
+        tape.await_more("view/second/std")
+        tape.await_more("view/second/cls")
+        assert rig.ask("remove_view", view="second").code is Code.OK
+        topics = {"view/second/win": 1, "view/second/std": 2, "view/second/cls": 1}
+        until(lambda: all(len(tape.ends(topic)) == count for topic, count in topics.items()))
+        tape.await_more("view/top/cls")
+        assert rig.ask("set_view", view="second").code is Code.OK
+        tape.await_more("view/second/cls")
+    sequences = [each.sequence for each in tape.said if each.topic == "view/top/std"]
+    assert sequences == list(range(len(sequences)))
+    assert [len(tape.ends(f"view/top/{kind}")) for kind in ("win", "std")] == [1, 2]
+    assert [len(tape.ends(topic)) for topic in topics] == [2, 3, 2]
+    revisions = [each.header.view_rev for each in tape.said if each.topic == "view/second/cls"]
+    assert revisions == sorted(revisions)
+    assert set(revisions) == {1, 2}
+
+
+def test_a_view_removed_in_the_last_window_still_ends(tmp_path: Path) -> None:
+    begun = threading.Event()
+
+    def slow(options: RenderOptions) -> None:
+        begun.set()
+        assert options.cancel is not None
+        until(options.cancel.is_set)
+
+    model = FakeSynthesizer(traits(), slow)
+    with taped(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=TWO_VIEWS) as rig:
+        until(lambda: rig.publisher.stats.subscribers >= 2)  # the tape hears
+        assert begun.wait(30)
+        assert rig.ask("remove_view", view="swing").code is Code.OK
+        assert rig.ask("deactivate").code is Code.ACCEPTED
+        rig.await_state("inactive")
+        until(lambda: tape.ends("view/swing/win") != [] and tape.ends("view/top/win") != [])
+    assert all(isinstance(each, EndMessage) for each in tape.said)  # what was in work when it was told to stop is lost

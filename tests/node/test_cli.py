@@ -1,5 +1,6 @@
 """The command line as a user meets it: real arguments in, exit code and one line out."""
 
+import json
 import subprocess
 import sys
 from importlib.metadata import version
@@ -9,21 +10,24 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fakes import FakeSynthesizer, live_traits
-from media import environment, noise
-from tiny_weights import HEIGHT, WIDTH, write_tiny
+from cameras import environment, noise
+from fakes import HEIGHT, WIDTH, FakeSynthesizer, live_traits, traits, write_tiny
 from typer.main import get_command
 
-from gcd_model import CameraMount, SphericalDelta
+from gcd_model import CameraMount, Clip, OptionError, SphericalDelta
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import spherical_trajectory
 from gcd_model.traits import ASSUMED_SOURCE
 from gcd_node.cli import offline as cli_offline
+from gcd_node.cli.bench import Arrival, view_figures
 from gcd_node.cli.main import COMMANDS, new_app, run_app
-from gcd_node.image_io import write_video
+from gcd_node.errors import NodeError, TooShortError, UsageError
+from gcd_node.image_io import write_png, write_video
+from gcd_node.offline import ClipRequest, read_clip
 
 SIZE = (128, 192)  # of the small random model
 TINY = "tiny"  # weights of a model that draws class maps
+Capture = pytest.CaptureFixture[str]
 KUBRIC, DRIVING, LIVE = "random:kubric90", "random:driving", "random:live"
 
 
@@ -52,7 +56,7 @@ def synthesize(source: Path, weights: Path | str, out: Path, *options: str | Pat
     return run_app([str(argument) for argument in arguments])
 
 
-def last_error(capsys: pytest.CaptureFixture[str]) -> str:
+def last_error(capsys: Capture) -> str:
     """The one line that was said."""
     lines = [line for line in capsys.readouterr().err.strip().splitlines() if "weights are random" not in line]
     assert lines[-1].startswith("error: ")
@@ -63,9 +67,7 @@ def last_error(capsys: pytest.CaptureFixture[str]) -> str:
 # One clip.
 
 
-def test_synthesize_writes_frames_video_strip_and_arrays_and_says_what_nobody_stated(
-    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_synthesize_writes_all_it_drew_and_says_what_nobody_stated(clip: Path, tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "out"
     options = ["--azimuth-deg", "20", "--elevation-deg", "-5", "--radius", "1"]
     assert synthesize(clip, KUBRIC, out, *options) == 0
@@ -78,7 +80,7 @@ def test_synthesize_writes_frames_video_strip_and_arrays_and_says_what_nobody_st
     assert (arrays["latents"].shape, arrays["latents"].dtype) == ((1, 14, 4, 16, 24), np.float32)
 
 
-def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path, capsys: Capture) -> None:
     path = spherical_trajectory(ASSUMED_SOURCE, SphericalDelta(azimuth_deg=20.0), frames=14, move_time=13)
     np.save(tmp_path / "poses.npy", path.source_from_target.numpy())
     outs = [tmp_path / "angles", tmp_path / "poses"]
@@ -90,9 +92,7 @@ def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path, capsys: pyt
     assert np.abs(angles - poses).max() < 1e-4
 
 
-def test_synthesize_writes_the_class_map_with_its_meaning_and_where_samples_differ(
-    small_clip: Path, tiny: Path, tmp_path: Path
-) -> None:
+def test_synthesize_writes_class_maps_and_where_samples_differ(small_clip: Path, tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert synthesize(small_clip, tiny, out, "--samples", "2") == 0
     assert len(list((out / "frames_s1").glob("*.png"))) == 14
@@ -110,6 +110,14 @@ def test_synthesize_writes_the_class_map_with_its_meaning_and_where_samples_diff
     assert len(strip) > 3 * HEIGHT + 8  # the legend below
 
 
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeSynthesizer:
+    """A live model in place of the one that is loaded."""
+    model = FakeSynthesizer(live_traits())
+    monkeypatch.setattr(cli_offline, "load_synthesizer", lambda *_, **__: model)
+    return model
+
+
 @pytest.mark.parametrize(
     ("options", "mount"),
     [
@@ -119,23 +127,18 @@ def test_synthesize_writes_the_class_map_with_its_meaning_and_where_samples_diff
     ],
 )
 def test_the_mount_reaches_clip_and_path(
-    options: list[str], mount: CameraMount | None, small_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: list[str], mount: CameraMount | None, small_clip: Path, tmp_path: Path, fake: FakeSynthesizer
 ) -> None:
-    model = FakeSynthesizer(live_traits())
-    monkeypatch.setattr(cli_offline, "load_synthesizer", lambda *_, **__: model)
     assert synthesize(small_clip, "fake", tmp_path / "out", *options) == 0
-    assert model.clips[0].mount == mount
-    wanted = model.traits.plan_view(mount=mount).source_from_target
-    assert torch.equal(model.asked[0][0][0].source_from_target, wanted)
+    assert fake.clips[0].mount == mount
+    wanted = fake.traits.plan_view(mount=mount).source_from_target
+    assert torch.equal(fake.asked[0][0][0].source_from_target, wanted)
 
 
-def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, fake: FakeSynthesizer) -> None:
     write_video(tmp_path / "wide.mkv", [np.zeros((2 * WIDTH, 4 * WIDTH, 3), np.uint8)] * 14, 10.0)
-    model = FakeSynthesizer(live_traits())
-    monkeypatch.setattr(cli_offline, "load_synthesizer", lambda *_, **__: model)
     assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / "out", "--hfov-deg", "90", "--mount-height", "2") == 0
-    mount = model.clips[0].mount
-    assert mount is not None
+    mount = fake.clips[0].mount
     assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # 2:1 became 3:2
 
 
@@ -143,13 +146,16 @@ def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, monkey
     ("weights", "options", "code", "reason"),
     [
         (KUBRIC, ["--azimuth-deg", "91"], 64, "[-90, 90]"),
-        (DRIVING, ["--azimuth-deg", "5"], 64, "fixed view"),
+        (DRIVING, ["--azimuth-deg", "5"], 64, ""),
         (KUBRIC, ["--samples", "0"], 64, "samples"),
-        (KUBRIC, ["--poses", "p.npy", "--move-time", "3"], 64, "whole path"),
-        (KUBRIC, ["--guidance", "nan", "1.5"], 64, "finite"),
+        (KUBRIC, ["--poses", "p.npy", "--move-time", "3"], 64, ""),
+        (KUBRIC, ["--guidance", "nan", "1.5"], 64, ""),
         (KUBRIC, ["--poses", "none.npy"], 66, "none.npy"),
         (KUBRIC, ["--device", "abacus"], 64, "abacus"),
         ("package:none", [], 65, "none"),
+        ("empty.ckpt", [], 65, "empty.ckpt"),
+        ("html.ckpt", [], 65, "html.ckpt"),
+        ("zeros.safetensors", [], 65, "zeros.safetensors"),
         (KUBRIC, ["--family", "driving"], 64, "family"),
         (KUBRIC, ["--mount-height", "1.5"], 64, ""),
         (DRIVING, ["--mount-tilt", "3"], 64, ""),
@@ -159,125 +165,36 @@ def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, monkey
     ],
 )
 def test_bad_options_are_one_line_with_cause_and_remedy(
-    weights: str,
-    options: list[str],
-    code: int,
-    reason: str,
-    clip: Path,
-    small_clip: Path,
-    tiny: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    weights: str, options: list[str], code: int, reason: str, tiny: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    source, chosen = (small_clip if weights in (TINY, LIVE) else clip), (tiny if weights == TINY else weights)
-    assert synthesize(source, chosen, tmp_path / "out", *options) == code
+    contents = {"empty.ckpt": b"", "html.ckpt": b"<html>not found</html>", "zeros.safetensors": bytes(64)}
+    if weights in contents:
+        (tmp_path / weights).write_bytes(contents[weights])
+    clip = noise(tmp_path / "clip", *((HEIGHT, WIDTH) if weights in (TINY, LIVE) else SIZE))
+    chosen = tiny if weights == TINY else tmp_path / weights if weights in contents else weights
+    assert synthesize(clip, chosen, tmp_path / "out", *options) == code
     assert reason in last_error(capsys)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("name", ["missing.mp4", "junk.mp4", "empty_folder"])
-def test_an_input_that_cannot_be_decoded_is_exit_66(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "empty_folder").mkdir()
     (tmp_path / "junk.mp4").write_bytes(b"this is no picture" * 100)
-    assert synthesize(tmp_path / name, DRIVING, tmp_path / "out") == 66
-    assert name in last_error(capsys)
-
-
-def test_a_wrong_checkpoint_is_exit_65(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name, content in (("empty.ckpt", b""), ("html.ckpt", b"<html>not found</html>"), ("x.safetensors", b"\0" * 64)):
-        (tmp_path / name).write_bytes(content)
-        assert synthesize(clip, tmp_path / name, tmp_path / "out") == 65
+    (tmp_path / "empty_folder").mkdir()
+    for name in ("missing.mp4", "junk.mp4", "empty_folder") if code == 66 else ():
+        assert synthesize(tmp_path / name, DRIVING, tmp_path / "out") == 66
         assert name in last_error(capsys)
-    for file, reason in ((str(tmp_path / "x.safetensors"), "x.safetensors"), ("package:none", "package")):
-        assert run_app(["weights", "inspect", file]) == 65
-        assert reason in last_error(capsys)
-
-
-# A node.
-
-
-def launch_file(folder: Path, weights: Path | str, size: tuple[int, int] = SIZE, **changes: str) -> Path:
-    """Of a video of 28 pictures."""
-    frames = [np.full((2 * size[0], 2 * size[1], 3), 5 * i, np.uint8) for i in range(28)]
-    write_video(folder / "v.mkv", frames, 10.0)
-    (folder / "launch.toml").write_text(f"""
-        [source]
-        path = "{folder}/v.mkv"
-        pace = "lockstep"
-        {changes.get("source", "")}
-        [model]
-        weights = "{weights}"
-        steps = 1
-        [view.main]
-        {changes.get("view", "")}
-        [publish]
-        data = "ipc://{folder}/data"
-        status = "ipc://{folder}/status"
-        end_delay_ms = 10
-        {changes.get("publish", "")}
-        [control]
-        endpoint = "ipc://{folder}/control"
-    """)
-    return folder / "launch.toml"
-
-
-def test_run_publishes_and_ends_with_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(["run", str(launch_file(tmp_path, DRIVING))]) == 0
-    told = capsys.readouterr().err
-    assert "windows rendered" in told
-    assert "noise" in told
-
-
-def test_view_saves_windows_and_class_maps_of_a_running_node(tiny: Path, tmp_path: Path) -> None:
-    settings = launch_file(tmp_path, tiny, (HEIGHT, WIDTH), publish="min_subscribers = 1")
-    node = subprocess.Popen([sys.executable, "-m", "gcd_node", "run", str(settings)], stderr=subprocess.DEVNULL)
-    try:
-        saving = ["--kind", "all", "--save", str(tmp_path / "s"), "--timeout", "60"]
-        assert run_app(["view", f"ipc://{tmp_path}/data", "--view", "main", *saving]) == 0
-        assert node.wait(30) == 0
-    finally:
-        node.kill()
-    saved = tmp_path / "s" / "main"
-    assert len(list(saved.glob("*.png"))) == len(list((saved / "cls").glob("*_*.png"))) == 28
-    assert [np.load(path).shape for path in sorted((saved / "cls").glob("*.npy"))] == [(14, HEIGHT, WIDTH)] * 2
-    assert (saved / "cls" / "legend.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("changes", "code", "reason"),
-    [
-        ({"view": "azimuth_deg = 10.0"}, 64, "fixed view"),
-        ({"view": "azimut_deg = 10.0"}, 78, "azimuth_deg"),
-        ({"source": "hfov_deg = -1.0"}, 78, "> 0"),
-        ({"weights": "random:unheard"}, 78, "unheard"),
-    ],
-)
-def test_a_launch_file_that_asks_for_the_impossible_is_refused(
-    changes: dict[str, str], code: int, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_app(["run", str(launch_file(tmp_path, **{"weights": DRIVING, **changes}))]) == code  # type: ignore[arg-type]
-    assert reason in last_error(capsys)
+    assert not (tmp_path / "out").exists()
+    if code == 65:
+        assert run_app(["weights", "inspect", str(chosen)]) == 65
 
 
 # The program.
 
 
-def test_usage_errors_are_exit_64(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["synthesize"], ["view", "ipc", "--kind", "cls", "--hatch"], ["no-such-command"]):
-        assert run_app(arguments) == 64
-    assert "no-such-command" in capsys.readouterr().err
-
-
-def test_every_command_has_the_help_that_the_list_says_and_the_list_needs_no_torch(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_every_command_has_the_help_of_the_list_which_needs_no_torch(capsys: Capture) -> None:
     whole = get_command(new_app(COMMANDS)).commands  # type: ignore[attr-defined]
     for name, (_, summary) in COMMANDS.items():
         assert " ".join(str(whole[name].help).split("\n\n")[0].split()) == summary, name
         assert run_app([name, "--help"]) == 0
-    capsys.readouterr()
+    for arguments in (["synthesize"], ["view", "ipc", "--kind", "cls", "--hatch"], ["no-such-command"]):
+        assert run_app(arguments) == 64
+    assert "no-such-command" in capsys.readouterr().err
     assert run_app(["export", "--help"]) == 0
     assert "[model] weights" in " ".join(capsys.readouterr().out.split())
     assert run_app(["--version"]) == 0
@@ -305,3 +222,102 @@ def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_pa
     assert "pictures in the other process" in done.stdout
     for name in ("side_by_side.mp4", "side_by_side.png"):
         assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000
+
+
+# The bench counts right and reads a real node; how fast this machine is, no test says.
+
+
+def arrivals(*views: tuple[int, int, range]) -> list[Arrival]:
+    """Of (arrival in ms, age in ms, sequence numbers)."""
+    return [Arrival(at_ns=at_ms * 1_000_000, age_ms=age_ms, seqs=tuple(seqs)) for at_ms, age_ms, seqs in views]
+
+
+def named(views: dict[str, list[Arrival]], *names: str) -> list[float]:
+    figures = {name.partition(".")[2]: value for name, value in view_figures(views).items()}
+    return [figures[name] for name in names]
+
+
+def test_a_frame_is_answered_once_every_view_has_it_and_a_lost_window_misses_as_many() -> None:
+    windows = arrivals((1000, 500, range(14)), (2400, 700, range(14, 28)), (5200, 600, range(42, 56)))
+    names = ("NUM_FRAMES_SENT", "NUM_MISSED_FRAMES", "MEAN_FRAME_RATE", "P95_LATENCY", "MAX_JITTER")
+    assert named({"top": windows}, *names) == pytest.approx([56, 14, 28 / 4.2, 700, 1400])
+    top = arrivals(*((100 * seq, 80, range(seq, seq + 1)) for seq in range(10)))
+    side = arrivals(*((100 * seq + 50, 120, range(seq, seq + 1)) for seq in range(1, 10) if seq != 5))
+    counted = named({"top": top, "side": side}, "NUM_FRAMES_SENT", "NUM_MISSED_FRAMES", "NUM_VIEWS", "MAX_LATENCY")
+    assert counted == [9, 1, 18, 120]
+    with pytest.raises(NodeError, match="--seconds"):
+        view_figures({"top": top, "side": side[:2]})
+
+
+@pytest.mark.timeout(300)
+def test_a_real_node_is_measured_under_the_published_names(tmp_path: Path) -> None:
+    launch = tmp_path / "launch.toml"
+    launch.write_text(f'[source]\nkind = "synthetic"\n[model]\nweights = "{write_tiny(tmp_path)}"\n[view.top]\n')
+    out = tmp_path / "bench.json"
+    options = ["--set", "model.threads=1", "--seconds", "12", "--json", str(out)]
+    assert run_app(["bench", str(launch), "--rate", "50", *options]) == 0
+    figures = json.loads(out.read_text())
+    assert figures["metadata"]["BenchmarkMetadata.INPUT_DATA_PATH"] == "synthetic"
+    for run in (figures, figures["50.0fps"]):
+        assert run["BasicPerformanceMetrics.NUM_FRAMES_SENT"] >= 42
+        assert run["BasicPerformanceMetrics.MEAN_FRAME_RATE"] > 0
+        assert 0 < run["GcdNodeMetrics.P50_LATENCY"] <= run["BasicPerformanceMetrics.MAX_LATENCY"]
+        assert run["BasicPerformanceMetrics.MEAN_JITTER"] >= 0
+        assert 0 <= run["ResourceMetrics.MEAN_OVERALL_CPU_UTILIZATION"] <= 100
+        assert run["GcdNodeMetrics.PEAK_MEMORY"] > 100
+        assert run["GcdNodeMetrics.FIRST_VIEW"] > 0
+    assert figures["BasicPerformanceMetrics.NUM_MISSED_FRAMES"] == 0  # in lockstep
+    for source, code in (('kind = "v4l2"', 64), ('path = "none.mp4"', 70)):
+        launch.write_text(f'[source]\n{source}\n[model]\nweights = "random:kubric90"\n[view.top]\n')
+        assert run_app(["bench", str(launch)]) == code
+
+
+# Clips from files.
+
+
+def numbered(count: int, height: int = 2 * HEIGHT, width: int = 2 * WIDTH) -> list[np.ndarray]:
+    return [np.full((height, width, 3), 10 * i % 250, np.uint8) for i in range(count)]
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    write_video(tmp_path / "v.mkv", numbered(24), 24.0)
+    return tmp_path / "v.mkv"
+
+
+def read(path: Path, family: str = "kubric90", **request: object) -> Clip:
+    return read_clip(path, ClipRequest(**request), traits(family))  # type: ignore[arg-type]
+
+
+def levels(clip: Clip) -> list[int]:
+    return [round((float(frame[0, 0, 0]) + 1) * 127.5) for frame in clip.video]
+
+
+def test_a_video_goes_to_the_size_and_the_range_of_the_model(video: Path, caplog: pytest.LogCaptureFixture) -> None:
+    clip = read(video)
+    assert clip.video.shape == (14, 3, HEIGHT, WIDTH)
+    assert levels(clip) == [10 * i for i in range(14)]
+    assert clip.video[1].unique().tolist() == pytest.approx([10 / 127.5 - 1])
+    assert (clip.fps, read(video, fps=7.5).fps) == (24.0, 7.5)  # the label is what the user says
+    assert read(video, "driving").fps == 24.0  # and a foreign rate is kept and said
+    assert "24 frames per second" in caplog.text
+    assert read(video, height=2 * HEIGHT, width=2 * WIDTH).video.shape == (14, 3, 2 * HEIGHT, 2 * WIDTH)
+    for size, error in (({"height": HEIGHT + 1, "width": WIDTH}, OptionError), ({"height": HEIGHT}, UsageError)):
+        with pytest.raises(error):
+            read(video, **size)
+
+
+def test_start_and_stride_count_frames_of_the_input_and_too_few_is_an_error_with_the_count(video: Path) -> None:
+    assert levels(read(video, start=5)) == [10 * i for i in range(5, 19)]
+    for options, found in (({"stride": 2}, 12), ({"start": 500}, 0)):
+        with pytest.raises(TooShortError, match=f"n={found}"):
+            read(video, **options)
+    write_video(video, numbered(41), 24.0)
+    clip = read(video, start=1, stride=3)
+    assert (levels(clip), clip.fps) == ([10 * i % 250 for i in range(1, 41, 3)], 8.0)
+    write_png(video.parent / "s.png", numbered(5)[4])  # a still is repeated, a folder read in order
+    still = read(video.parent / "s.png")
+    assert (levels(still), still.fps) == ([40] * 14, 12.0)
+    for index, picture in enumerate(numbered(15)):
+        write_png(video.parent / "folder" / f"{index}.png", picture)
+    assert levels(read(video.parent / "folder", start=1)) == [10 * i for i in range(1, 15)]

@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from cameras import until
+from cameras import until, write_video
 from fakes import HEIGHT, WIDTH, FakeSynthesizer, traits
-from media import write_video
 from msgspec.structs import replace
 from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator
 from numpy.typing import NDArray
@@ -119,9 +118,6 @@ def sent(message: ViewMessage, sequence: int) -> bytes:
 ENDING = encode(replace(end(), sequence=1000))
 
 
-# Against the live node.
-
-
 def fnv(image: NDArray[np.uint8]) -> str:
     number = 0xCBF29CE484222325
     for byte in image.tobytes():
@@ -159,27 +155,14 @@ def test_both_languages_read_the_same_from_a_live_node(client: Client, tmp_path:
 def expected(view: ReceivedView) -> dict[str, str]:
     """What the client must say of a view that Python has received; without the age."""
     header = view.header
-    return {
-        "view": "top",
-        "kind": "win",
-        "window": str(header.window_id),
-        "seq": str(view.message.sequence),
-        "rev": str(header.view_rev),
-        "skipped": "0",
-        "age_ms": "",
-        "shape": "x".join(map(str, header.shape)),
-        "encoding": "rgb8",
-        "mean": ",".join(f"{level:.2f}" for level in view.images.mean(axis=(0, 1, 2))),
-        "hash": fnv(view.images[-1]),
-        "roles": "in_transit*13,at_goal*1",
-        "synthetic": "true",
-    }
+    told = {"view": "top", "kind": "win", "window": header.window_id, "seq": view.message.sequence, "skipped": 0}
+    told |= {"rev": header.view_rev, "age_ms": "", "shape": "x".join(map(str, header.shape)), "encoding": "rgb8"}
+    told["mean"] = ",".join(f"{level:.2f}" for level in view.images.mean(axis=(0, 1, 2)))
+    told |= {"hash": fnv(view.images[-1]), "roles": "in_transit*13,at_goal*1", "synthetic": "true"}
+    return {key: str(value) for key, value in told.items()}
 
 
-# What it remembers, and what it leaves out.
-
-
-def test_gaps_restarts_and_old_revisions_are_noticed(client: Client) -> None:
+def test_gaps_restarts_old_revisions_and_old_views_are_noticed(client: Client) -> None:
     parts = [
         sent(window(0, view_rev=3), 10),
         sent(window(1, view_rev=3), 14),
@@ -193,10 +176,7 @@ def test_gaps_restarts_and_old_revisions_are_noticed(client: Client) -> None:
     assert lines[2].endswith("rule=sequence seen before")
     assert lines[3].endswith("rule=older revision of the view")
     assert lines[4] == f"restarted boot_id={OTHER_BOOT}"
-
-
-def test_what_is_too_old_is_left_out_and_a_clock_ahead_makes_nothing_younger(client: Client) -> None:
-    ahead, long_ago = window(1, age_ms=5000.0), window(2)
+    ahead, long_ago = window(1, age_ms=5000.0), window(2)  # a clock ahead makes nothing younger
     ahead = replace(ahead, header=replace(ahead.header, t_publish_ns=ahead.header.t_publish_ns + 3_600_000_000_000))
     long_ago = replace(long_ago, header=replace(long_ago.header, t_publish_ns=1_700_000_000_000_000_000))
     lines = client.told_of(sent(ahead, 1), sent(long_ago, 2), sent(window(3, age_ms=50_000_000.0), 3))
@@ -207,16 +187,12 @@ def test_what_is_too_old_is_left_out_and_a_clock_ahead_makes_nothing_younger(cli
     assert lines[0].endswith("rule=older than --max-age-ms")
 
 
-def test_jpeg_is_written_as_it_came(client: Client, tmp_path: Path) -> None:
+def test_jpeg_is_written_as_it_came_and_maps_as_grey(client: Client, tmp_path: Path) -> None:
     message = jpeg_window()
-    lines = client.told_of(sent(message, 0), options=["--ppm", str(tmp_path)])
-    told = fields_of(lines[0])
+    told = fields_of(client.told_of(sent(message, 0), options=["--ppm", str(tmp_path)])[0])
     assert (told["encoding"], told["mean"], told["hash"]) == ("jpeg", "-", "-")
     written = b"".join((tmp_path / f"top_win_000000_0{i}.jpg").read_bytes() for i in range(2))
     assert written == message.payload
-
-
-def test_maps_are_written_as_grey(client: Client, tmp_path: Path) -> None:
     for kind, made in (("cls", class_map), ("vis", visibility)):
         message = made(5)
         told = fields_of(client.told_of_map(message, tmp_path))
@@ -236,9 +212,6 @@ def test_every_depth_is_read_as_in_python_and_one_that_is_none_dropped(client: C
     for value in (-0.5, np.nan, np.inf):
         wrong = depth(inverse=np.array([[[0.5, value]]], "<f2"))
         assert client.told_of_map(wrong, tmp_path).endswith("rule=7: inverse depth is negative or not finite")
-
-
-# Messages somebody has tampered with.
 
 
 def header_of(part: bytes) -> bytes:
@@ -306,12 +279,9 @@ def test_each_rule_of_the_protocol_drops_its_message_in_both_languages(client: C
     for part in BROKEN.values():
         with pytest.raises(MessageError):
             decode(part)
-
-
-def test_a_message_in_parts_is_none_and_what_follows_is_read(client: Client) -> None:
     process = client.start("--every")
     client.wait_for()
-    client.socket.send_multipart([GOOD, sent(window(1), 1)])
+    client.socket.send_multipart([GOOD, sent(window(1), 1)])  # in parts it is none
     client.send(sent(window(2), 2), ENDING)
     lines = lines_of(process)
     assert [line.partition("rule=")[2] for line in lines[:2]] == ["1: a message of several parts"] * 2
@@ -353,18 +323,12 @@ def mutated_headers() -> Iterator[bytes]:
         yield joined(header, nearest[64 + len(header_of(nearest)) :], sequence=sequence)
 
 
-# Its options.
-
-
-def test_silence_ends_it_if_wanted_and_the_runtime_folder_is_found(client: Client, tmp_path: Path) -> None:
+def test_silence_ends_it_if_wanted_and_a_signal_and_the_runtime_folder_is_found(client: Client, tmp_path: Path) -> None:
     environment = os.environ | {"RUNTIME_DIRECTORY": f"{tmp_path}:/other"}
     command = [client.program, "--timeout", "0.2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, env=environment, check=False)
     assert done.returncode == 69
     assert done.stderr.startswith(f"nothing from ipc://{tmp_path}/data")
-
-
-def test_a_signal_ends_it_in_order(client: Client) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         process = client.start()
         client.wait_for()

@@ -9,16 +9,32 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, Box, FakeSource, FakeSynthesizer, fake_config, live_traits, made_node, traits
-from media import noise
+import torch
+from cameras import noise
+from fakes import (
+    HEIGHT,
+    WIDTH,
+    Box,
+    FakeSource,
+    FakeSynthesizer,
+    fake_classes,
+    fake_config,
+    fake_maps,
+    live_traits,
+    painting_traits,
+    run,
+    traits,
+)
 from msgspec.structs import replace as struct_replace
 
+from gcd_client.images import depth_m, images, inverse_depth
 from gcd_client.protocol import to_json
 from gcd_model import Clip, RenderOptions, SourceFeatures, Traits, Trajectory, View
 from gcd_node.cli.main import run_app
 from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError
 from gcd_node.frame import Frame, Image
 from gcd_node.image_io import write_video
+from gcd_node.messages import ontology
 from gcd_node.offline import ClipRequest, read_clip
 
 LIVE = live_traits()
@@ -33,31 +49,19 @@ def video(tmp_path: Path) -> Path:
     return tmp_path / "v.mkv"
 
 
-def numbered_depth(frames: int = 30) -> np.ndarray:
-    """Metres: the number of the frame, plus a hundredth of the column."""
-    return (np.arange(1, frames + 1)[:, None, None] + np.zeros((HEIGHT, 1)) + np.arange(2 * WIDTH) / 100).astype(
-        np.float32
-    )
-
-
 def read(path: Path, **request: Any) -> Clip:
     return read_clip(path, ClipRequest(**request), LIVE)
 
 
-def as_folder(folder: Path, depth: np.ndarray) -> Path:
-    folder.mkdir()
-    for i, each in enumerate(depth):
-        cv2.imwrite(str(folder / f"{i}.png"), np.rint(each * 1000).astype(np.uint16))
-    return folder
-
-
 def test_depth_takes_the_way_of_its_pictures_from_a_file_as_from_a_folder(video: Path, tmp_path: Path) -> None:
-    np.save(tmp_path / "d.npy", numbered_depth())
-    folder = as_folder(tmp_path / "d", numbered_depth())
-    wanted = numbered_depth()[1 : 1 + 2 * FRAMES : 2, :, WIDTH // 2 : 3 * WIDTH // 2]
-    for path in (tmp_path / "d.npy", folder):
+    depth = np.arange(1, 31)[:, None, None] + np.zeros((HEIGHT, 1)) + np.arange(2 * WIDTH) / 100  # metres
+    np.save(tmp_path / "d.npy", depth.astype(np.float32))
+    (tmp_path / "d").mkdir()
+    for i, each in enumerate(depth):
+        cv2.imwrite(str(tmp_path / "d" / f"{i}.png"), np.rint(each * 1000).astype(np.uint16))
+    wanted = depth[1 : 1 + 2 * FRAMES : 2, :, WIDTH // 2 : 3 * WIDTH // 2]
+    for path in (tmp_path / "d.npy", tmp_path / "d"):
         clip = read(video, depth=path, start=1, stride=2)
-        assert clip.depth is not None
         assert np.allclose(clip.depth.numpy(), wanted, atol=6e-4)
 
 
@@ -71,7 +75,7 @@ def test_depth_takes_the_way_of_its_pictures_from_a_file_as_from_a_folder(video:
         (np.ones((13, HEIGHT, 2 * WIDTH), np.float32), TooShortError),
     ],
 )
-def test_depth_that_does_not_belong_to_the_pictures_is_refused(
+def test_depth_of_other_pictures_is_refused(
     video: Path, tmp_path: Path, depth: np.ndarray, error: type[Exception]
 ) -> None:
     np.save(tmp_path / "d.npy", depth)
@@ -100,9 +104,7 @@ def test_a_live_view_is_written_with_all_it_tells(still_clip: Path, tmp_path: Pa
     assert (tmp_path / "seen.mp4").stat().st_size > 0
 
 
-def test_with_depth_a_published_model_tells_what_was_seen_in_the_units_of_its_radius(
-    still_clip: Path, tmp_path: Path
-) -> None:
+def test_with_depth_a_published_model_tells_what_was_seen_in_its_units(still_clip: Path, tmp_path: Path) -> None:
     orbit = ("--azimuth-deg", 5, "--steps", 1, "--height", HEIGHT, "--width", WIDTH)
     np.save(tmp_path / "small.npy", np.load(tmp_path / "depth.npy") / 10)
     for name, (file, unit_m) in {"a": ("depth.npy", 1), "b": ("small.npy", 0.1), "c": ("small.npy", 1)}.items():
@@ -154,34 +156,32 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> set[int]:
     return failing
 
 
-def run(model: FakeSynthesizer, more: str, frames: int = 28) -> Box:
-    box = Box()
-    made_node(fake_config(more), model, FakeSource(frames, fps=10.0), box).run()
-    return box
+def played(model: FakeSynthesizer, *changes: str, frames: int = 28) -> Box:
+    return run(fake_config(*changes), model, FakeSource(frames, fps=10.0))
 
 
-def statuses(box: Box) -> list[dict[str, Any]]:
-    return [dict(fields) for topic, fields in box.notes if topic == "status"]
+def reasons(box: Box) -> list[str]:
+    """In the last status."""
+    return box.told("status")[-1]["reasons"]
 
 
 def test_a_network_beside_the_model_gives_every_frame_its_depth(bad: set[int]) -> None:
     model = FakeSynthesizer(LIVE)
     bad |= {0, 3}  # and frame 0 is 0 m everywhere: all holes
-    box = run(model, 'depth_model = "net.onnx"')
+    box = played(model, "model.depth_model=net.onnx")
     depths = [None if clip.depth is None else int(clip.depth.unique().item()) for clip in model.clips]
     assert depths == [None, 1, 2, None, *range(4, 28)]
-    assert [message.header.window_id for message in box.of("win")] == [0, 1]
-    events = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "DEPTH_BAD"]
-    assert [event["message"] for event in events] == ["no depth today"]
-    assert statuses(box)[-1]["model"]["bad_depths"] == 2
-    assert "DEPTH_BAD" not in statuses(box)[-1]["reasons"]  # the second window had none
+    assert box.ids() == [0, 1]
+    assert [event["message"] for event in box.events("DEPTH_BAD")] == ["no depth today"]
+    assert box.told("status")[-1]["model"]["bad_depths"] == 2
+    assert "DEPTH_BAD" not in reasons(box)  # the second window had none
 
 
 def test_windows_without_the_right_depth_are_dropped_where_that_is_asked_for(bad: set[int]) -> None:
     bad.add(5)
-    box = run(FakeSynthesizer(LIVE), 'depth_model = "net.onnx"\non_bad_depth = "stop"', frames=42)
-    assert [message.header.window_id for message in box.of("win")] == [1, 2]
-    assert statuses(box)[-1]["drops"]["model"] == 1
+    box = played(FakeSynthesizer(LIVE), "model.depth_model=net.onnx", "model.on_bad_depth=stop", frames=42)
+    assert box.ids() == [1, 2]
+    assert box.told("status")[-1]["drops"]["model"] == 1
 
 
 class Measuring(FakeSource):
@@ -203,30 +203,24 @@ def test_what_a_source_measures_reaches_the_live_model_frame_by_frame() -> None:
     holes, far, torn = np.zeros((HEIGHT, 2 * WIDTH), np.float32), np.eye(4), np.full((4, 4), np.nan)
     far[0, 3] = 100.0
     streaming = replace(LIVE, config=struct_replace(LIVE.config, frames=1))
-    model, box = FakeSynthesizer(streaming), Box()
-    made_node(fake_config(), model, Measuring(14, {3: holes}, {5: far, 9: torn}), box).run()
+    model = FakeSynthesizer(streaming)
+    box = run(fake_config(), model, Measuring(14, {3: holes}, {5: far, 9: torn}))
     assert [n for n, clip in enumerate(model.clips) if clip.depth is None] == [3]
     assert [n for n, clip in enumerate(model.clips) if clip.odometry is None] == [5, 6, 9]  # there and back
     depth, pose = model.clips[-1].depth, model.clips[-1].odometry
-    assert depth is not None
-    assert pose is not None
     assert np.array_equal(depth[0, 0].numpy(), np.arange(WIDTH / 2, 3 * WIDTH / 2))  # cut as its picture
     assert pose[0, 2, 3].item() == pytest.approx(1.3)
-    codes = [fields["code"] for topic, fields in box.notes if topic == "event"]
-    assert (codes.count("DEPTH_BAD"), codes.count("ODOMETRY_BAD")) == (1, 2)
+    assert [len(box.events(code)) for code in ("DEPTH_BAD", "ODOMETRY_BAD")] == [1, 2]
     assert len(box.of("win")) == 14
-
-
-def test_other_models_are_given_neither() -> None:
-    model = FakeSynthesizer(traits())
-    made_node(fake_config(), model, Measuring(28, {}, {}), Box()).run()
+    model = FakeSynthesizer(traits())  # others are given neither
+    run(fake_config(), model, Measuring(28, {}, {}))
     assert {(clip.depth, clip.odometry) for clip in model.clips} == {(None, None)}
 
 
 @pytest.mark.parametrize(("made", "kind"), [(traits(), "metric"), (LIVE, "metric"), (LIVE, "inverse")])
 def test_a_node_refuses_depth_that_it_cannot_use(made: Traits, kind: str) -> None:
     with pytest.raises(ConfigError):
-        run(FakeSynthesizer(made), f'depth_model = "missing.onnx"\ndepth_kind = "{kind}"')
+        played(FakeSynthesizer(made), "model.depth_model=missing.onnx", f"model.depth_kind={kind}")
 
 
 class Telling(FakeSynthesizer):
@@ -244,32 +238,106 @@ class Telling(FakeSynthesizer):
 
 
 def test_a_source_of_another_world_is_flagged_as_long_as_it_lasts() -> None:
-    assert LIVE.ood_threshold is not None
     above, below = LIVE.ood_threshold + 0.2, LIVE.ood_threshold - 0.2
-    box = run(Telling({"ood": below}, {"ood": above}), "")
+    box = played(Telling({"ood": below}, {"ood": above}))
     headers = [message.header for message in box.of("win")]
     assert [header.quality.ood_score for header in headers] == [below, above]
     assert ["world" in header.quality.ood for header in headers] == [False, True]
-    status = statuses(box)[-1]
-    assert "world" in status["reasons"]
-    assert [fields["code"] for topic, fields in box.notes if topic == "event"].count("world") == 1
-    assert status["model"]["ood_score"] == round(above, 3)
-    again = statuses(run(Telling({"ood": above}, {"ood": below}), ""))[-1]
-    assert "world" not in again["reasons"]
+    assert "world" in reasons(box)
+    assert len(box.events("world")) == 1
+    assert box.told("status")[-1]["model"]["ood_score"] == round(above, 3)
+    assert "world" not in reasons(played(Telling({"ood": above}, {"ood": below})))
+    box = played(FakeSynthesizer(traits()))  # which cannot tell
+    header = box.of("win")[0].header
+    assert set(to_json(header)["quality"]) == {"nan_frames", "ood", "steps", "seed"}
+    assert "world" not in header.quality.ood
+    assert "ood_score" not in box.told("status")[-1]["model"]
 
 
 def test_a_motion_that_is_lost_is_told_when_it_begins_and_over_with_the_next_window() -> None:
     lost, known = {"lost": ("the odometry jumps by 100 m", "too few points")}, {"lost": ()}
-    box = run(Telling(lost, lost, known), "", frames=42)
-    events = [fields for topic, fields in box.notes if topic == "event" and fields["code"] == "MOTION_LOST"]
-    assert [(event["message"], event["frames"]) for event in events] == [("the odometry jumps by 100 m", 2)]
-    assert "MOTION_LOST" not in statuses(box)[-1]["reasons"]
-    assert "MOTION_LOST" in statuses(run(Telling(known, lost), ""))[-1]["reasons"]
+    box = played(Telling(lost, lost, known), frames=42)
+    events = [(event["message"], event["frames"]) for event in box.events("MOTION_LOST")]
+    assert events == [("the odometry jumps by 100 m", 2)]
+    assert "MOTION_LOST" not in reasons(box)
+    assert "MOTION_LOST" in reasons(played(Telling(known, lost)))
 
 
-def test_a_model_that_cannot_tell_says_nothing_of_it() -> None:
-    box = run(FakeSynthesizer(traits()), "")
-    header = box.of("win")[0].header
-    assert set(to_json(header)["quality"]) == {"nan_frames", "ood", "steps", "seed"}
-    assert "world" not in header.quality.ood
-    assert "ood_score" not in statuses(box)[-1]["model"]
+# Class maps, visibility, depth and a stated spread, from the view that holds them: what is published, and when.
+
+
+HELD = ("visibility", "inverse_depth")
+
+
+def published(*holds: str, frames: int = 28, encoding: str = "rgb8") -> Box:
+    model = FakeSynthesizer(painting_traits(), holds=holds)
+    return run(fake_config(f"publish.encoding={encoding}"), model, FakeSource(frames, fps=10.0))
+
+
+def test_every_window_of_a_view_that_holds_them_comes_with_its_own() -> None:
+    box, made = published(*HELD), painting_traits()
+    order = [message.topic.rpartition("/")[2] for message in box.views[:4]]
+    assert order == ["win", "cls", "vis", "depth"]
+    same = ("window_id", "t_capture_ns", "source_from_view", "view_rev", "intrinsics", "frame_role", "age_ms", "model")
+    for kind, proto in (("cls", "gcd/1.0"), ("vis", "gcd/1.1"), ("depth", "gcd/1.1")):
+        for message, window in zip(box.of(kind), box.of("win"), strict=True):
+            assert all(getattr(message.header, name) == getattr(window.header, name) for name in same)
+            assert (message.header.proto, window.header.proto) == (proto, "gcd/1.0")
+    assert np.array_equal(images(box.of("vis")[1])[..., 0], fake_maps()["visibility"].numpy())
+    drawn, told = fake_classes(made, 1), box.of("cls")[0].header.classes
+    assert np.array_equal(images(box.of("cls")[0])[..., 0], drawn[0].numpy())
+    assert told == ontology(made)
+    assert box.told("meta")[0]["classes"] == [
+        {"id": each.id, "name": each.name, "colour": each.colour} for each in told
+    ]
+
+
+def test_depth_loses_less_than_a_thousandth_and_what_is_none_stays_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent, wanted = inverse_depth(published(*HELD, frames=14).of("depth")[0]), fake_maps()["inverse_depth"].numpy()
+    known = wanted > 0
+    assert (wanted[known].min() < 1 / 199, wanted[known].max() > 1 / 0.31) == (True, True)
+    assert np.array_equal(sent > 0, known)
+    assert (np.abs(sent[known] / wanted[known] - 1) < 0.0005).all()
+    bad = {**fake_maps(), "inverse_depth": torch.full((14, 64, 96), 0.5)}
+    bad["inverse_depth"][:, :, :4] = torch.tensor([torch.nan, torch.inf, -torch.inf, -1.0])
+    monkeypatch.setattr("fakes.fake_maps", lambda: bad)
+    metres = depth_m(published(*HELD, frames=14).of("depth")[0])
+    assert np.isnan(metres[..., :4]).all()
+    assert (metres[..., 4:] == 2.0).all()
+
+
+def test_what_a_view_does_not_hold_is_neither_published_nor_ended_and_what_it_held_ends_once() -> None:
+    for holds in ((), ("visibility",), ("inverse_depth",), HELD):
+        box = published(*holds)
+        kinds = {
+            "win",
+            "frm",
+            "cls",
+            *(kind for kind, name in zip(("vis", "depth"), HELD, strict=True) if name in holds),
+        }
+        assert {message.topic for message in box.views} == {f"view/main/{kind}" for kind in kinds}
+        assert sorted(message.topic for message in box.ends) == sorted(f"view/main/{kind}" for kind in kinds)
+        assert {end.header.proto for end in box.ends if end.topic.endswith(("/vis", "/depth"))} <= {"gcd/1.1"}
+    windows = iter((HELD, ("visibility",), ("visibility",)))
+    model = FakeSynthesizer(traits(), lambda _: setattr(model, "holds", next(windows)))
+    box = run(fake_config(), model, FakeSource(42))
+    assert [message.header.window_id for message in box.of("depth")] == [0]
+    ends = sorted((message.topic[10:], message.header.window_id) for message in box.ends)
+    assert ends == [("depth", 1), ("frm", 2), ("vis", 2), ("win", 2)]
+
+
+def test_maps_are_never_made_lossy_and_one_sample_of_a_model_that_states_its_spread_has_a_deviation() -> None:
+    raw, packed = (published(*HELD, "log_variance", frames=14, encoding=encoding) for encoding in ("rgb8", "jpeg"))
+    assert packed.of("win")[0].header.encoding == "jpeg"
+    for kind in ("vis", "depth"):
+        assert bytes(packed.of(kind)[0].payload) == bytes(raw.of(kind)[0].payload)
+    (message,) = raw.of("std")
+    assert message.header.scale is not None
+    assert np.allclose(images(message) * message.header.scale, 25.5, atol=0.1)  # a tenth, in grey levels
+    plain = published(*HELD, frames=14)
+    assert plain.of("std") == []
+    assert len(raw.ends) == len(plain.ends) + 1
+    for family in ("kubric90", "driving", "svd"):  # without a class head
+        box = run(fake_config(), FakeSynthesizer(traits(family)), FakeSource(28, fps=10.0))
+        assert "view/main/cls" not in {message.topic for message in (*box.views, *box.ends)}
+        assert box.told("meta")[0]["classes"] == []

@@ -18,14 +18,15 @@ import msgspec
 import pytest
 from typer.main import get_command
 
+from gcd_client.control import Code, decode_reply
 from gcd_node.cli.main import COMMANDS, new_app
 from gcd_node.config import NodeConfig, ViewConfig, parse_config
 from gcd_node.errors import ConfigError
+from gcd_node.health import Health
 from gcd_node.sources import SourceConfig, SourcePose
-from gcd_node.verbs import VERBS
+from gcd_node.verbs import VERBS, RequestError, parse_command
 from gcd_train.cli.generate import app as train_app
 
-pytestmark = pytest.mark.timeout(120)
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "launch/README", "tools/README", "client/README")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
@@ -199,14 +200,13 @@ def test_a_toml_block_loads(block: Block) -> None:
 
 
 @marked("python")
-def test_a_python_block_is_python(block: Block) -> None:
-    assert compile(block.text, block.place, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT) is not None
-
-
-@marked("python", "run")
-def test_a_python_block_marked_run_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # no node of this machine hears of it
-    exec(compile(block.text, block.place, "exec"), {})
+def test_a_python_block_is_python_and_runs_if_it_is_so_marked(
+    block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = compile(block.text, block.place, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+    if block.mark == "run":
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # no node of this machine hears of it
+        exec(code, {})
 
 
 @pytest.mark.slow
@@ -231,3 +231,79 @@ def test_a_shell_block_marked_run_runs(block: Block, tmp_path: Path) -> None:
         ["bash", "-e", "-c", text], cwd=tmp_path, env=os.environ | paths, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+# docs/protocol.md against the code: a client is to be written from that page alone.
+
+
+PAGE = (ROOT / "docs" / "protocol.md").read_text()
+
+
+def section(title: str) -> str:
+    """Below a heading, to the next one of its rank."""
+    mark = title.split()[0]
+    body = PAGE.split(f"\n{title}", 1)[1]
+    return re.split(rf"\n{mark} ", body, maxsplit=1)[0]
+
+
+def examples() -> list[bytes]:
+    (block,) = re.findall(r"```json\n(.*?)```", section("## 5 Control"), re.DOTALL)
+    return [line.encode() for line in block.splitlines()]
+
+
+def test_the_requests_and_replies_shown_are_such_as_they_are_written() -> None:
+    lines = examples()
+    assert len(lines) == 4
+    for request, reply in zip(lines[0::2], lines[1::2], strict=True):
+        if b'"steps":2000' in request:  # the page shows one refusal
+            with pytest.raises(RequestError):
+                parse_command(request)
+        else:
+            command = parse_command(request)
+            assert command.if_view_rev == (1 if command.verb == "set_view" else None)
+        assert msgspec.json.encode(decode_reply(reply)) == reply
+
+
+def test_every_verb_is_there_with_its_role_and_arguments_and_every_code() -> None:
+    page, told = section("## 5 Control"), dict[str, str]()
+    for line in page.splitlines():
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) > 3 and cells[2] in ("viewer", "operator"):
+            verbs = re.findall(r"`([^`]+)`", cells[1])
+            told |= dict.fromkeys(verbs, cells[2])
+            arguments = {argument for name in verbs for argument in VERBS[name].arguments.__struct_encode_fields__}
+            assert [argument for argument in arguments if f"`{argument}`" not in line] == []
+    assert told == {name: verb.role for name, verb in VERBS.items()}
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    assert set(Code) <= {word for row in rows for word in re.findall(r"`([^`]+)`", row)}
+
+
+def test_every_key_of_a_status_is_there() -> None:
+    health = Health()
+    health.gpu_mem_mb = 1.0
+    health.stage("render", 0.1)
+    for i in range(3):
+        health.frame(i * 100_000_000, i * 100_000_000)
+    page = section("### 4.7 Notes on the status socket")
+    for key, value in health.report().items():
+        assert f"`{key}`" in page, key
+        for inner in value if isinstance(value, dict) and key in ("source", "window", "model", "publish") else ():
+            assert f"`{inner}`" in page, (key, inner)
+
+
+def test_every_row_of_the_failure_table_and_every_event_that_is_named_in_the_code_is_explained() -> None:
+    page = (ROOT / "docs" / "node.md").read_text()
+    assert re.findall(r"^\| (F\d+) \|", page, re.MULTILINE) == [f"F{number}" for number in range(1, 26)]
+    calls = re.compile(
+        r'(?:\.event|on_event|self\._tell|self\._say|_after_change|_report)\(\s*(?:self\._on_event, )?"([A-Z_]{4,})"'
+    )
+    told = {code for path in (ROOT / "gcd_node").rglob("*.py") for code in calls.findall(path.read_text())}
+    assert {
+        "STATE",
+        "VIEW_SET",
+        "AUTH_DENIED",
+        "ALLOW_CHANGED",
+        "GPU_OOM",
+        "TOO_LARGE",
+    } <= told  # the search finds them
+    assert [code for code in sorted(told) if f"`{code}`" not in page] == []

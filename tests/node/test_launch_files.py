@@ -12,25 +12,27 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
+from cameras import write_video
+from fakes import write_tiny
 from msgspec.structs import replace
 from typer.main import get_command
 
 from gcd_node.check import check_launch
-from gcd_node.cli.main import COMMANDS, new_app
-from gcd_node.config import NodeConfig, load_config
+from gcd_node.cli.main import COMMANDS, new_app, run_app
+from gcd_node.config import NodeConfig, PublishConfig, load_config, parse_config
 from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
+from gcd_node.publisher import Publisher
 from gcd_node.sources import RecordedSource, SyntheticSource
 
+Capture = pytest.CaptureFixture[str]
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "launch"
 TOMLS = sorted(LAUNCH.glob("*.toml"))
 UNIT = LAUNCH / "systemd" / "gcd-node@.service"
 INSTALLED = "/opt/gcd-node/bin/gcd-node"
 PATIENCE_S = 60
-
-
-# Launch files.
 
 
 def rehearsed(config: NodeConfig, folder: Path) -> NodeConfig:
@@ -56,9 +58,6 @@ def test_a_launch_file_passes_every_check_that_needs_no_hardware(path: Path, tmp
     errors = {topic: str(each.error) for topic, each in findings.items() if each.error is not None}
     assert errors == {}
     assert findings["weights"].verdict == "warning"
-
-
-# systemd and udev.
 
 
 def unit() -> dict[str, list[str]]:
@@ -90,34 +89,29 @@ def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
     assert INSTALLED in text
     assert verified(tmp_path, text) == ""
     assert "RestartSecs" in verified(tmp_path, text.replace("RestartSec=", "RestartSecs="))
+    shutil.copytree(LAUNCH / "systemd", tmp_path / "etc" / "sysusers.d")
+    done = systemd("sysusers", f"--root={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    assert all("gcd:" in (tmp_path / "etc" / name).read_text() for name in ("passwd", "group"))
 
 
-def test_the_unit_is_confined() -> None:
+def test_the_unit_is_confined_and_a_restart_is_for_what_a_restart_can_mend() -> None:
     done = systemd("analyze", "security", "--offline=true", "--threshold=25", str(UNIT))
     assert done.returncode == 0, done.stdout
     said = unit()
-    wanted = {"NoNewPrivileges": ["yes"], "ProtectSystem": ["strict"], "DevicePolicy": ["closed"]}
-    wanted["DeviceAllow"] = ["char-usb_device rw", "char-video4linux rw"]
-    assert {key: said[key] for key in wanted} == wanted
+    assert said["DeviceAllow"] == ["char-usb_device rw", "char-video4linux rw"]
     assert "PrivateDevices" not in said  # it would hide the cameras
-
-
-def test_a_restart_is_for_what_a_restart_can_mend() -> None:
-    said = unit()
-    wanted = {"Type": "notify", "Restart": "on-failure", "RestartSec": "2"}
-    wanted |= {"StartLimitIntervalSec": "60", "StartLimitBurst": "5", "User": "gcd", "Group": "gcd"}
+    wanted = {
+        "Type": "notify",
+        "Restart": "on-failure",
+        "StartLimitBurst": "5",
+        "User": "gcd",
+        "DevicePolicy": "closed",
+    }
     assert {key: said[key] for key in wanted} == {key: [value] for key, value in wanted.items()}
     (codes,) = said["RestartPreventExitStatus"]
     hopeless = {each.exit_code for each in (UsageError, TooShortError, SourceError, ConfigError)}
     assert set(map(int, codes.split())) == hopeless == {64, 65, 66, 78}
-
-
-def test_the_user_is_made_by_sysusers(tmp_path: Path) -> None:
-    shutil.copytree(LAUNCH / "systemd", tmp_path / "etc" / "sysusers.d")
-    done = systemd("sysusers", f"--root={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    assert "gcd:" in (tmp_path / "etc" / "passwd").read_text()
-    assert "gcd:" in (tmp_path / "etc" / "group").read_text()
 
 
 def test_the_node_does_under_the_units_settings_what_the_unit_says(tmp_path: Path) -> None:
@@ -151,9 +145,6 @@ def test_the_node_does_under_the_units_settings_what_the_unit_says(tmp_path: Pat
     assert (runtime.exists(), list(runtime.iterdir())) == (True, [])
 
 
-# Containers.
-
-
 def instructions() -> list[tuple[str, str]]:
     text = re.sub(r"^#.*\n", "", (LAUNCH / "docker" / "Dockerfile").read_text(), flags=re.MULTILINE)
     lines = text.replace("\\\n", " ").splitlines()
@@ -164,25 +155,104 @@ def all_of(name: str) -> list[str]:
     return [rest for each, rest in instructions() if each == name]
 
 
-def test_what_the_container_copies_is_there_and_not_left_out_of_the_build() -> None:
+def test_the_container_copies_what_is_there_runs_as_nobody_special_and_calls_commands_that_exist() -> None:
     ignore = (LAUNCH / "docker" / "Dockerfile.dockerignore").read_text().splitlines()
-    assert ignore[1] == "*"
-    let_in = {line[1:] for line in ignore if line.startswith("!")}
     copied = {source for rest in all_of("COPY") for source in rest.split()[:-1]}
-    assert copied == let_in
+    assert ignore[1] == "*"
+    assert copied == {line[1:] for line in ignore if line.startswith("!")}  # not left out of the build
     assert [source for source in copied if not (ROOT / source).exists()] == []
     assert not any(fnmatch(source, pattern) for source in copied for pattern in ignore[2:] if pattern[0] not in "!#")
-
-
-def test_the_container_runs_as_nobody_special_and_calls_commands_that_exist() -> None:
     commands = get_command(new_app(COMMANDS)).commands  # type: ignore[attr-defined]
-    (health,), (start,), (entry,) = all_of("HEALTHCHECK"), all_of("CMD"), all_of("ENTRYPOINT")
-    tested = msgspec.json.decode(health.partition("CMD ")[2], type=list[str])
-    assert tested == ["gcd-node", "status", "--once"]
+    (health,), (start,) = all_of("HEALTHCHECK"), all_of("CMD")
+    assert msgspec.json.decode(health.partition("CMD ")[2]) == ["gcd-node", "status", "--once"]
     assert "--once" in {option for each in commands["status"].params for option in each.opts}
     first, config = msgspec.json.decode(start, type=list[str])
     assert first in commands
     assert f"launch/{Path(config).name}" in " ".join(all_of("COPY"))
-    assert msgspec.json.decode(entry, type=list[str]) == ["tini", "--", "gcd-node"]
-    assert all_of("USER") == ["10001:10001"]
-    assert all_of("STOPSIGNAL") == ["SIGTERM"]
+    assert (all_of("USER"), all_of("STOPSIGNAL")) == (["10001:10001"], ["SIGTERM"])
+
+
+# `gcd-node check`, and launch files with changes, as text again.
+
+
+@pytest.fixture
+def launch(tmp_path: Path) -> Path:
+    """Of a video that is smaller than any model takes unless it may be enlarged."""
+    write_video(tmp_path / "v.mkv", [np.full((128, 192, 3), 5 * i, np.uint8) for i in range(16)], 10.0)
+    path = tmp_path / "launch.toml"
+    path.write_text(f"""
+        [source]
+        path = "{tmp_path}/v.mkv"
+        allow_upscale = true
+        [model]
+        weights = "random:driving"
+        [view.main]
+        [publish]
+        data = "ipc://{tmp_path}/data"
+        status = "ipc://{tmp_path}/status"
+        [control]
+        endpoint = "ipc://{tmp_path}/control"
+    """)
+    return path
+
+
+def found(launch: Path, *changes: str, memory: int | None = None) -> dict[str, tuple[str, str]]:
+    return {each.topic: (each.verdict, each.detail) for each in check_launch(load_config(launch, changes), memory)}
+
+
+def test_a_good_launch_file_is_looked_at_from_end_to_end(launch: Path) -> None:
+    findings = found(launch)
+    assert list(findings) == ["endpoints", "source", "weights", "views"]
+    assert [verdict for verdict, _ in findings.values()] == ["ok", "ok", "warning", "ok"]  # random weights are noise
+    assert "192 x 128 at 10 FPS" in findings["source"][1]
+    assert "14 frames at 10 FPS" in findings["views"][1]
+    assert not (launch.parent / "data").exists()  # nothing stays bound
+
+
+@pytest.mark.parametrize(
+    ("change", "topic", "code"),
+    [
+        ("source.path=/no/such.mp4", "source", 66),
+        ("model.weights=/no/such.ckpt", "weights", 65),
+        ("model.weights=package:unheard", "weights", 65),
+        ("view.main.azimuth_deg=5", "views", 64),
+        ("publish.data=tcp://0.0.0.0:5580", "endpoints", 78),
+    ],
+)
+def test_what_fails_is_the_exit_code(change: str, topic: str, code: int, launch: Path, capsys: Capture) -> None:
+    assert found(launch, change)[topic][0] == "failed"
+    assert run_app(["check", str(launch), "--set", change]) == code
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
+
+
+def test_one_failure_does_not_hide_the_next_and_weights_must_fit_into_memory(launch: Path, tmp_path: Path) -> None:
+    endpoints = PublishConfig(data=f"ipc://{launch.parent}/data", status=f"ipc://{launch.parent}/status")
+    with Publisher(endpoints, linger_ms=0):
+        findings = found(launch, "source.path=/no/such.mp4", "model.weights=/no/such.ckpt")
+    assert [findings[topic][0] for topic in ("endpoints", "source", "weights")] == ["failed"] * 3
+    assert "in use" in findings["endpoints"][1]
+    tiny = f"model.weights={write_tiny(tmp_path)}"
+    assert [found(launch, tiny, memory=memory)["weights"][0] for memory in (10_000, 2**40)] == ["failed", "ok"]
+
+
+def test_where_recordings_would_go_is_looked_at(launch: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "recordings"
+    verdict, detail = found(launch, f"record.folder={folder}", "record.keep_free_mb=0")["record"]
+    assert verdict == "ok"
+    assert "inputs, views" in detail
+    assert list(folder.iterdir()) == []
+    assert found(launch, f"record.folder={folder}", "record.keep_free_mb=1e12")["record"][0] == "warning"
+    (tmp_path / "file").write_text("")
+    verdict, detail = found(launch, f"record.folder={tmp_path}/file/x")["record"]
+    assert verdict == "failed"
+    assert "check folder in [record]" in detail
+
+
+# The configuration as text.
+
+
+def test_what_is_printed_is_the_same_launch_file_again(launch: Path, capsys: Capture) -> None:
+    assert run_app(["run", str(launch), "--set", "model.steps=7", "--print-config"]) == 0
+    again = parse_config(capsys.readouterr().out.encode(), "printed")
+    assert again == load_config(launch, ["model.steps=7"])
+    assert again.model.steps == 7

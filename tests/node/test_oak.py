@@ -11,14 +11,13 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from itertools import islice
-from unittest.mock import create_autospec
+from unittest.mock import MagicMock, create_autospec
 
 import numpy as np
 import pytest
-from cameras import until
-from media import HEIGHT, WIDTH, environment, flat
+from cameras import HEIGHT, WIDTH, environment, flat, until
+from fakes import fake_config
 
-from gcd_node.config import parse_config
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, LensModel
 from gcd_node.sources import OakSource
@@ -45,9 +44,6 @@ def opened(script: pipelines.Script, lens: Callable[[int, int], LensModel] | Non
 
 def take(camera: LiveCamera, count: int) -> list[Frame]:
     return list(islice(camera.frames(), count))
-
-
-# Pictures.
 
 
 @pytest.mark.parametrize("layout", [Layout.BGR888i, Layout.RGB888i, Layout.BGR888p, Layout.NV12, Layout.GRAY8])
@@ -87,32 +83,22 @@ def test_damaged_and_foreign_messages_are_counted_and_not_yielded() -> None:
         assert [frame.seq for frame in take(camera, 1)] == [4]
 
 
-# Losses and openings.
-
-
-@pytest.mark.parametrize("state", ["DISCONNECTED", "FAILED"])
-def test_a_device_that_goes_away_is_a_loss_that_names_its_state(state: str) -> None:
+@pytest.mark.parametrize("state", ["DISCONNECTED", "FAILED", None])
+def test_a_device_that_goes_is_a_loss_and_its_state_named(state: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = MagicMock()
+    broken.get.side_effect = broken.tryGetAll.side_effect = RuntimeError("X_LINK_ERROR")
     factory = pipelines.Scripted(pipelines.steady())
     with closing(open_pipeline(factory, open_timeout_s=PATIENT_S)) as camera:
         frames = camera.frames()
         next(frames)
-        factory.device_turns(dai.DeviceState.__members__[state])
-        with pytest.raises(SourceLostError, match=f"device {state.lower()}") as caught:
+        if state is None:  # the link breaks while it is read
+            monkeypatch.setattr(camera._driver, "_queue", broken)
+        else:
+            factory.device_turns(dai.DeviceState.__members__[state])
+        words = "X_LINK_ERROR" if state is None else f"device {state.lower()}"
+        with pytest.raises(SourceLostError, match=words) as caught:
             list(frames)
     assert caught.value.exit_code == 75
-
-
-def test_a_link_that_breaks_while_it_is_read_is_a_loss(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Broken:
-        def get(self, patience: object = None) -> None:
-            raise RuntimeError("X_LINK_ERROR")
-
-        tryGetAll = get  # noqa: N815
-
-    with closing(opened(pipelines.steady())) as camera:
-        monkeypatch.setattr(camera._driver, "_queue", Broken())
-        with pytest.raises(SourceLostError, match="X_LINK_ERROR"):
-            list(camera.frames())
 
 
 def test_opening_again_and_again_leaves_no_thread_and_no_file_behind() -> None:
@@ -165,29 +151,25 @@ def device(serial: str, name: str = "1.2") -> dai.DeviceInfo:
 ONE, TWO = device("18443010A1B2C3D4E5", "1.2"), device("19443010AABBCCDDEE", "192.168.1.20")
 
 
-@pytest.mark.parametrize("found", [[], [ONE, TWO]], ids=["none", "several"])
-def test_without_a_name_there_must_be_one_device_and_all_are_listed(
-    found: list[dai.DeviceInfo], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    devices = create_autospec(dai.Device)
-    devices.getAllAvailableDevices.return_value, devices.getAllConnectedDevices.return_value = found, [ONE, TWO]
-    monkeypatch.setattr(dai, "Device", devices)
-    with pytest.raises(SourceAbsentError) as caught:
-        camera_pipeline(OakSource())
-    assert all(each.deviceId in str(caught.value) for each in (ONE, TWO))
-
-
-def test_an_address_where_nobody_answers_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_name_there_must_be_one_device_and_a_named_one_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEPTHAI_SEARCH_TIMEOUT", "300")
     with pytest.raises(SourceAbsentError) as caught:
         _ = open_oak(OakSource(device="127.0.0.1", open_timeout_s=PATIENT_S)).info
     assert caught.value.exit_code == 69
-
-
-def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "depthai", None)
+    devices = create_autospec(dai.Device)
+    monkeypatch.setattr(dai, "Device", devices)
+    devices.getAllConnectedDevices.return_value = [ONE, TWO]
+    for found in ([], [ONE, TWO]):
+        devices.getAllAvailableDevices.return_value = found
+        with pytest.raises(SourceAbsentError) as caught:
+            camera_pipeline(OakSource())
+        assert all(each.deviceId in str(caught.value) for each in (ONE, TWO))
+    monkeypatch.setitem(sys.modules, "depthai", None)  # the extra is missing
     with pytest.raises(SourceError):
         open_oak(OakSource())
+    for wrong in ("exposure_us=8000", "socket=left", "focus=300", "anti_banding=100hz"):
+        with pytest.raises(ConfigError, match=wrong.partition("=")[0]):
+            fake_config(f"source.{wrong}", source='kind = "oak"')
 
 
 def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,16 +197,6 @@ def test_a_real_camera_is_wired_by_depthais_own_names(monkeypatch: pytest.Monkey
     camera.initialControl.setAntiBandingMode.assert_called_once_with(dai.CameraControl.AntiBandingMode.MAINS_50_HZ)
     assert (stream.id, stream.fps, stream.pipeline) == (ONE.deviceId, 15.0, pipeline)
     assert stream.lens(1280, 720).fx == pytest.approx(3100 * 1280 / 4056, rel=1e-5)
-
-
-@pytest.mark.parametrize("wrong", ["exposure_us = 8000", 'socket = "left"', "focus = 300", 'anti_banding = "100hz"'])
-def test_a_setting_that_no_oak_has_is_refused(wrong: str) -> None:
-    text = f'[source]\nkind = "oak"\n{wrong}\n[model]\nweights = "w"\n[view.a]\n'
-    with pytest.raises(ConfigError, match=wrong.split()[0]):
-        parse_config(text.encode(), "test")
-
-
-# The lens.
 
 
 RATIONAL = [0.5, -0.25, 0.125, 0.0625, 2.0, 0.75, -0.5, 1.5]
@@ -263,7 +235,7 @@ def test_the_lens_in_memory_is_scaled_and_cut_to_the_picture_and_has_our_names(
     assert (lens.distortion, lens.coefficients) == wanted
 
 
-def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
+def test_a_lens_that_makes_no_sense_is_no_lens_and_that_of_the_picture_itself_comes_before_the_memory() -> None:
     for stored in (
         dai.CalibrationHandler(dai.EepromData()),
         memory(RATIONAL, width=1000),
@@ -273,16 +245,11 @@ def test_a_lens_that_makes_no_sense_is_no_lens() -> None:
     ):
         with closing(opened(pipelines.steady(), partial(lens_in_memory, stored, SOCKET))) as camera:
             assert camera.info.lens is None
-
-
-def test_the_lens_of_the_picture_itself_comes_before_the_memory() -> None:
     first = pipelines.picture(0)
     matrix = [[80.0, 0.0, 32.0], [0.0, 81.0, 24.0], [0.0, 0.0, 1.0]]
     first.transformation = dai.ImgTransformation(WIDTH, HEIGHT, matrix, dai.CameraModel.Perspective, RATIONAL)
-    stored = LensModel(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
-    with closing(opened(pipelines.Handed(first), lambda *_: stored)) as camera:
+    with closing(opened(pipelines.Handed(first), partial(lens_in_memory, memory(RATIONAL), SOCKET))) as camera:
         lens = camera.info.lens
-    assert lens is not None
     assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.coefficients) == (80.0, 81.0, 32.0, 24.0, tuple(RATIONAL))
 
 
@@ -331,7 +298,6 @@ def test_hardware_gives_the_size_and_rate_it_was_asked_for_fresh_and_with_its_le
     assert float(np.median(ages_ms)) < 200
     assert (frames[0].size, oak.corrupt, oak.info.stamp_uncertainty_us) == ((1280, 720), 0, 500)
     lens = oak.info.lens
-    assert lens is not None
     assert 40 < 2 * math.degrees(math.atan(lens.width / 2 / lens.fx)) < 150
     assert (lens.cx, lens.cy) == pytest.approx((lens.width / 2, lens.height / 2), rel=0.1)
     begin = time.monotonic()

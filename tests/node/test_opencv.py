@@ -6,21 +6,26 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from itertools import islice, pairwise
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from itertools import islice, pairwise, takewhile
 from pathlib import Path
+from typing import Any, NoReturn
+from unittest.mock import create_autospec
 
 import cv2
 import msgspec
 import pytest
-from fake_camera import FakeVideoCapture
-from media import HEIGHT, WIDTH, environment, flat
+from cameras import FPS, HEIGHT, WIDTH, Bench, Camera, FakeVideoCapture, environment, flat, until
 from rtsp_server import RtspServer, serving, write_transport_stream
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
+from gcd_node.frame import Frame, FrameSource, SourceInfo
+from gcd_node.health import SourceState
 from gcd_node.sources import RtspSource, V4l2Source, open_source, opencv
-from gcd_node.sources.live import LiveCamera
+from gcd_node.sources.live import LiveCamera, SourceWatch, WatchListener, backoff_s, patience_s
 from gcd_node.sources.opencv import Backlog, list_v4l2, open_stream, open_v4l2, shown_address
+from gcd_node.window import Reason
 
 RED = flat(250, 10, 20)
 GUARD_S = 20.0
@@ -55,52 +60,37 @@ def test_the_pixel_format_is_set_before_the_size_and_what_differs_is_logged(capl
 @pytest.mark.parametrize(("stamps", "uncertainty_us"), [("driver", 20_000), ("zero", 80_000), ("wall", 80_000)])
 def test_stamps_of_the_driver_are_used_unless_they_are_of_another_clock(stamps: str, uncertainty_us: int) -> None:
     fake, begin_ns = FakeVideoCapture(RED, stamps=stamps), time.monotonic_ns()
-    source = camera(fake)
-    frame = next(source.frames())
-    source.close()
+    with closing(camera(fake)) as source:
+        frame = next(source.frames())
     assert begin_ns < frame.stamp_ns <= time.monotonic_ns()
     assert (frame.stamp_ns in [round(stated * 1e6) for stated in fake.stated_ms]) == (stamps == "driver")
     assert source.info.stamp_uncertainty_us == uncertainty_us
+    rate = {"driver": 0.0, "zero": 90_000.0, "wall": float("nan")}[stamps]  # which cannot be, and is measured
+    with closing(camera(FakeVideoCapture(RED, fps=20.0, fixed={cv2.CAP_PROP_FPS: rate}))) as source:
+        assert 5.0 < source.info.fps_nominal < 22.0
 
 
 def test_a_damaged_picture_is_counted_and_leaves_a_gap() -> None:
     fake = FakeVideoCapture(RED, fps=50.0)
     fake.damaged = {0, 4, 5}
-    source = camera(fake)
-    seqs: list[int] = []
-    for frame in source.frames():
-        seqs.append(frame.seq)
-        if frame.seq > 8:
-            break
-    source.close()
+    with closing(camera(fake)) as source:
+        seqs = [frame.seq for frame in takewhile(lambda frame: frame.seq < 9, source.frames())]
     assert source.corrupt == 3
     assert not fake.damaged & set(seqs)
 
 
-@pytest.mark.parametrize("stated", [0.0, 90_000.0, float("nan")])
-def test_a_rate_that_cannot_be_is_measured_instead(stated: float) -> None:
-    source = camera(FakeVideoCapture(RED, fps=20.0, fixed={cv2.CAP_PROP_FPS: stated}))
-    source.close()
-    assert 5.0 < source.info.fps_nominal < 22.0
-
-
-@pytest.mark.parametrize("trouble", ["gone", "breaks"])
-def test_an_unplugged_camera_and_a_driver_that_raises_are_lost_every_time_they_are_asked(trouble: str) -> None:
+@pytest.mark.parametrize("trouble", ["gone", "breaks", "silent", "in use"])
+def test_a_camera_that_gives_no_picture_any_more_is_lost_every_time_it_is_asked_and_absent_then(trouble: str) -> None:
     fake = FakeVideoCapture(RED)
-    source = camera(fake)
-    setattr(fake, trouble, True)
-    for _ in range(2):
-        with pytest.raises(SourceLostError):
-            list(source.frames())
-    assert fake.released.wait(GUARD_S)
-    with pytest.raises(SourceAbsentError):
-        camera(fake)
-
-
-@pytest.mark.parametrize("trouble", ["silent", "gone", "in use"])
-def test_a_camera_that_gives_no_picture_is_absent(trouble: str) -> None:
-    fake = FakeVideoCapture(RED)
-    fake.gone, fake.there = trouble == "gone", trouble != "in use"
+    if trouble in ("gone", "breaks"):
+        source = camera(fake)
+        setattr(fake, trouble, True)
+        for _ in range(2):
+            with pytest.raises(SourceLostError):
+                list(source.frames())
+        assert fake.released.wait(GUARD_S)
+        fake.released.clear()
+    fake.there = trouble != "in use"
     if trouble == "silent":
         fake.awake.clear()
     with pytest.raises(SourceAbsentError):
@@ -150,17 +140,17 @@ def test_an_address_is_shown_without_what_may_be_secret(url: str, shown: str) ->
     assert shown_address(url) == shown
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
+def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated_and_one_too_large_to_decode() -> None:
+    for url in (
         *(f"file:///etc/{SECRET}", f"concat://{SECRET}", "", f"rtsp:{SECRET}", f"rtsp://u:{SECRET}/x@host/y"),
         *(f"rtsp://u:{SECRET}@x@host/y", f"rtsp://u:{SECRET}@host:port/", f"rtsp://u:{SECRET}@/y", "rtsp://"),
-    ],
-)
-def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated(url: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        open_source(RtspSource(url=url))
-    assert SECRET not in str(caught.value)
+    ):
+        with pytest.raises(ConfigError) as caught:
+            open_source(RtspSource(url=url))
+        assert SECRET not in str(caught.value)
+    huge = {cv2.CAP_PROP_FRAME_WIDTH: 60_000.0, cv2.CAP_PROP_FRAME_HEIGHT: 60_000.0}
+    with pytest.raises(SourceError):
+        _ = open_stream(RtspSource(url="rtsp://host/x"), open_capture=FakeVideoCapture(RED, fixed=huge).open).info
 
 
 @pytest.mark.parametrize(
@@ -190,31 +180,24 @@ def server(recording: Path) -> Iterator[RtspServer]:
         yield running
 
 
-def test_a_silent_stream_blocks_until_its_read_timeout_and_is_lost_then(server: RtspServer) -> None:
-    source = open_stream(RtspSource(url=server.url, open_timeout_s=GUARD_S), read_timeout_s=1.0)
-    frames = source.frames()
-    next(frames)
-    server.stall()
-    begin = time.monotonic()
-    with pytest.raises(SourceLostError):
-        list(frames)
-    assert 0.5 < time.monotonic() - begin < GUARD_S
-
-
-def test_after_a_short_silence_what_piled_up_is_not_taken_for_new(server: RtspServer) -> None:
-    source = open_stream(RtspSource(url=server.url, open_timeout_s=GUARD_S), read_timeout_s=GUARD_S)
+def test_what_piled_up_in_a_silence_is_not_new_and_after_a_long_one_it_is_lost(server: RtspServer) -> None:
+    source = open_stream(RtspSource(url=server.url, open_timeout_s=GUARD_S), read_timeout_s=4.0)
     frames = source.frames()
     before = next(frames)
     server.stall()
     time.sleep(1.5)
     server.resume()
     after = next(frame for frame in frames if frame.stamp_ns - before.stamp_ns > 1_400_000_000)
-    source.close()
     shown_s = (int(after.image[20, 20, 0]) - int(before.image[20, 20, 0])) * 3 / 25
     assert shown_s >= (after.stamp_ns - before.stamp_ns) / 1e9 - 1.0  # what piled up is 1.5 s older than its arrival
+    server.stall()
+    begin = time.monotonic()
+    with pytest.raises(SourceLostError):
+        list(frames)
+    assert 2.0 < time.monotonic() - begin < GUARD_S
 
 
-def test_a_password_opens_the_stream_and_no_password_is_ever_repeated(
+def test_a_password_opens_a_stream_and_is_never_repeated(
     recording: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
@@ -242,7 +225,6 @@ def test_a_process_ends_although_a_read_never_returns(server: RtspServer) -> Non
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "open\n"
         server.stall()
         time.sleep(0.3)
@@ -252,7 +234,185 @@ def test_a_process_ends_although_a_read_never_returns(server: RtspServer) -> Non
     assert errors.count("\n") == 1
 
 
-def test_a_stream_too_large_to_decode_is_refused() -> None:
-    huge = {cv2.CAP_PROP_FRAME_WIDTH: 60_000.0, cv2.CAP_PROP_FRAME_HEIGHT: 60_000.0}
-    with pytest.raises(SourceError):
-        _ = open_stream(RtspSource(url="rtsp://host/x"), open_capture=FakeVideoCapture(RED, fixed=huge).open).info
+# A live source over all its openings: stalled, lost, opened again, given up, closed.
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is tried again soon."""
+    monkeypatch.setattr("gcd_node.sources.live.backoff_s", lambda *_: 0.02)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera is lost sooner than two seconds after its last frame."""
+    monkeypatch.setattr("gcd_node.sources.live._LOST_S", 0.3)
+
+
+class Reader:
+    """Iterates a watch in a thread, as the node does, and writes down what it is told."""
+
+    def __init__(self, first: FrameSource, reopen: Callable[[SourceInfo], FrameSource], **patience: Any) -> None:
+        self.told: list[str] = []
+        self.details: list[str] = []
+        self.infos: list[SourceInfo] = []
+        self.frames: list[Frame] = []
+        self.failure: Exception | None = None
+        self.watch = SourceWatch(first, reopen, self, V4l2Source(**patience))
+        self.thread = threading.Thread(target=self._read, daemon=True)
+        self.thread.start()
+
+    def _read(self) -> None:
+        try:
+            for frame in self.watch.frames():
+                self.frames.append(frame)
+        except Exception as error:
+            self.failure = error
+
+    def source_state(self, state: SourceState, detail: str) -> None:
+        self.details.append(detail)
+        self.told.append(state)
+
+    def source_frame(self, frame: Frame) -> None:
+        """It is one of `frames` then."""
+
+    def source_broken(self, reason: Reason) -> None:
+        self.told.append(reason)
+
+    def source_opened(self, info: SourceInfo) -> bool:
+        self.told.append("opened")
+        self.infos.append(info)
+        return True
+
+    def finish(self) -> None:
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+
+
+@contextmanager
+def watching(
+    first: FrameSource, bench: Bench | Callable[[SourceInfo], FrameSource] | None = None, **patience: Any
+) -> Iterator[Reader]:
+    """A reader, until the block is left; bench: what it is opened from again."""
+    plugged = bench or Bench()
+    reopen = (lambda _: plugged.open()) if isinstance(plugged, Bench) else plugged
+    reader = Reader(first, reopen, **patience)
+    yield reader
+    reader.watch.close()
+    reader.finish()
+
+
+@pytest.mark.parametrize("ending", [SourceLostError("USB said goodbye"), SourceError("torn"), None])
+def test_a_silent_camera_stalls_and_one_that_says_it_is_gone_is_believed(ending: Exception | None) -> None:
+    camera, second = Camera(), Camera()
+    with watching(camera, Bench(second), stall_ms=100.0) as reader:
+        camera.shoot()
+        until(lambda: "stalled" in reader.told)
+        camera.shoot()
+        until(lambda: len(reader.frames) == 2)
+        camera.feed(ending)
+        until(lambda: "lost" in reader.told)
+        second.shoot()
+        until(lambda: len(reader.frames) == 3)
+    assert reader.told[:6] == ["connecting", "opened", "streaming", "stalled", "streaming", "lost"]
+    assert reader.told[6:9] == ["SRC_LOST", "opened", "streaming"]
+    assert str(ending or "the stream ended") in reader.details
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_device_that_never_answers_again_is_left_behind() -> None:
+    deaf, second = FakeVideoCapture(flat(9, 9, 9)), Camera()
+    with watching(open_v4l2(V4l2Source(device="/dev/null"), deaf.open), Bench(second), stall_ms=50.0) as reader:
+        until(lambda: reader.frames != [])
+        deaf.awake.clear()
+        until(lambda: len(reader.infos) == 2)
+        second.shoot()
+        until(lambda: reader.frames[-1].size == (96, 64))
+        deaf.awake.set()  # too late: nobody reads it any more
+        assert deaf.released.wait(20)
+    assert reader.frames[-1].size == (96, 64)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_after_so_many_failed_attempts_in_a_row_it_is_given_up_but_a_fault_of_ours_is_none() -> None:
+    camera, bench = Camera(), Bench()
+    with watching(camera, bench, max_reconnects=3) as reader:
+        camera.shoot()
+        camera.feed(SourceLostError("gone"))
+        reader.finish()
+    assert isinstance(reader.failure, SourceLostError)
+    assert all(words in str(reader.failure) for words in ("3 attempts", "there is no camera"))
+    assert bench.tries == 3
+    camera, bench = Camera(), Bench(Camera(), Camera(), Camera())  # which open and give nothing
+    with watching(camera, bench, max_reconnects=2, open_timeout_s=0.05, stall_ms=10.0) as reader:
+        camera.shoot()
+        reader.finish()
+    assert isinstance(reader.failure, SourceLostError)
+    assert len(bench.opened) == 2
+    camera = Camera()
+    with watching(camera, Bench(Camera())) as reader:
+        camera.feed(ZeroDivisionError("a bug"))
+        reader.finish()
+    assert isinstance(reader.failure, ZeroDivisionError)
+
+
+def test_a_slow_reader_gets_the_newest_frames_and_the_rest_is_counted() -> None:
+    fake = FakeVideoCapture(flat(9, 9, 9), fps=200.0)
+    camera = open_v4l2(V4l2Source(device="/dev/null"), fake.open)
+    watch = SourceWatch(camera, lambda _: camera, create_autospec(WatchListener), V4l2Source())
+    frames = watch.frames()
+    seqs = [next(frames).seq]
+    until(lambda: fake.grabbed > 50)
+    fake.awake.clear()
+    time.sleep(0.1)
+    seqs += [next(frames).seq for _ in range(4)]
+    watch.close()
+    fake.awake.set()
+    assert list(frames) == []
+    assert seqs[1:] == list(range(fake.grabbed - 3, fake.grabbed + 1))
+    assert watch.skipped + len(seqs) == fake.grabbed + 1 - seqs[0]  # nobody misses those before the first
+
+
+def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
+    camera, late = Camera(), Camera()
+    answer, asked_for = threading.Event(), list[SourceInfo]()
+
+    def open_slowly() -> Camera:
+        answer.wait(60)
+        return late
+
+    def reopen(before: SourceInfo) -> LiveCamera:
+        asked_for.append(before)
+        return LiveCamera("slow", open_slowly, open_timeout_s=60.0, hint="wait")
+
+    with watching(camera, reopen):
+        camera.feed(None)
+        until(lambda: asked_for == [camera.info])
+    assert not late.closed.is_set()
+    answer.set()
+    until(late.closed.is_set)  # nobody wants it any more
+
+
+def test_patience_follows_the_rate_and_waiting_doubles_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert patience_s(V4l2Source(), FPS) == (0.2, 1.8)
+    assert patience_s(V4l2Source(), 5.0) == pytest.approx((0.6, 1.8))
+    assert patience_s(V4l2Source(), 1.0) == pytest.approx((3.0, 6.0))
+    assert patience_s(V4l2Source(stall_ms=500.0), FPS) == (0.5, 1.8)
+    for part in (0.8, 1.0, 1.2):
+        monkeypatch.setattr("random.uniform", lambda *_, part=part: part)
+        even = [part * wait for wait in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)]
+        assert [backoff_s("v4l2", i) for i in range(7)] == pytest.approx([min(10.0, wait) for wait in even])
+        assert [backoff_s("push", i) for i in range(3)] == pytest.approx([min(0.5, wait) for wait in even[:3]])
+
+
+def test_an_opening_that_waits_for_the_one_before_has_its_own_time_afterwards() -> None:
+    alone = threading.Lock()
+
+    def absent() -> NoReturn:
+        time.sleep(0.6)
+        raise SourceAbsentError("it opened too late to be there")
+
+    assert alone.acquire()
+    threading.Timer(0.7, alone.release).start()
+    with pytest.raises(SourceAbsentError, match="too late"):
+        assert LiveCamera("slow", absent, open_timeout_s=1.0, hint="wait", alone=alone).info

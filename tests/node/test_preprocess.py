@@ -2,54 +2,37 @@
 against formulas and against the slow, exact way."""
 
 import math
+from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from fakes import HEIGHT, WIDTH, traits
+from cameras import calibration
+from fakes import HEIGHT, WIDTH, fake_config, traits
 from numpy.typing import NDArray
 
 from gcd_model import Intrinsics, center_crop_box
-from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
-from gcd_node.frame import Image, LensModel, SourceInfo
+from gcd_node.frame import Image, LensModel, SourceInfo, depthai_lens, lens_of_message, load_lens
 from gcd_node.preprocess import Fit, Rectifier, project, to_clip_tensor, widest_camera
-from gcd_node.stream_context import prepare_stream
+from gcd_node.stream_context import StreamContext, prepare_stream
 
-BARREL = LensModel(
-    width=1280,
-    height=720,
-    fx=820.0,
-    fy=818.0,
-    cx=652.3,
-    cy=349.1,
-    distortion="plumb_bob",
-    coefficients=(-0.31, 0.11, 0.0007, -0.0004, -0.018),
-)
-RATIONAL = LensModel(
-    width=1280,
-    height=800,
-    fx=800.0,
-    fy=800.0,
-    cx=640.0,
-    cy=405.0,
-    distortion="rational_polynomial",
-    coefficients=(2.1, -1.3, 0.0004, -0.0002, 0.6, 2.4, -1.0, 0.3),
-)
-FISH_EYE = LensModel(
-    width=1280,
-    height=960,
-    fx=560.0,
-    fy=560.0,
-    cx=640.0,
-    cy=480.0,
-    distortion="equidistant",
-    coefficients=(0.01, -0.004, 0.001, -0.0002),
-)
-IDEAL = LensModel(width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5)
+
+def lens_of(width: int, height: int, kind: Any = "none", *coefficients: float, **matrix: float) -> LensModel:
+    centre = {"fx": 300.0, "fy": 300.0, "cx": width / 2, "cy": height / 2}
+    return LensModel(width=width, height=height, distortion=kind, coefficients=coefficients, **centre | matrix)
+
+
+PLUMB = (-0.31, 0.11, 0.0007, -0.0004, -0.018)
+BARREL = lens_of(1280, 720, "plumb_bob", *PLUMB, fx=820.0, fy=818.0, cx=652.3, cy=349.1)
+WIDE = (2.1, -1.3, 0.0004, -0.0002, 0.6, 2.4, -1.0, 0.3)
+RATIONAL = lens_of(1280, 800, "rational_polynomial", *WIDE, fx=800.0, fy=800.0, cy=405.0)
+FISH_EYE = lens_of(1280, 960, "equidistant", 0.01, -0.004, 0.001, -0.0002, fx=560.0, fy=560.0)
+IDEAL = lens_of(1280, 720, fx=900.0, fy=900.0, cx=639.5, cy=359.5)
 ALL_LENSES = pytest.mark.parametrize("lens", [BARREL, RATIONAL, FISH_EYE, IDEAL], ids=lambda lens: lens.distortion)
 
 
@@ -142,24 +125,13 @@ def test_a_narrow_lens_gives_the_widest_view_it_fills_to_the_last_pixel(lens: Le
     assert out.min() == 255
 
 
-def test_a_polynomial_that_turns_back_beyond_the_picture_is_not_followed() -> None:
-    lens = LensModel(
-        width=640, height=480, fx=300.0, fy=300.0, cx=320.0, cy=240.0, distortion="plumb_bob",
-        coefficients=(-0.5, 0.0, 0.0, 0.0, 0.0),
-    )  # fmt: skip
-    camera = widest_camera(lens, 384, 256, 120.0)
+def test_a_polynomial_that_turns_back_is_not_followed_and_a_calibration_that_sees_nothing_refused() -> None:
+    camera = widest_camera(lens_of(640, 480, "plumb_bob", -0.5, 0.0, 0.0, 0.0, 0.0), 384, 256, 120.0)
     turning_point = math.sqrt(1 / (3 * 0.5))  # where r (1 - r^2 / 2) is largest
     corner = math.hypot(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)
     assert 0.9 * turning_point < corner < 1.02 * turning_point
-
-
-def test_a_calibration_that_sees_nothing_is_refused() -> None:
-    lens = LensModel(
-        width=640, height=480, fx=300.0, fy=300.0, cx=0.0, cy=0.0, distortion="plumb_bob",
-        coefficients=(-9e9, 0.0, 0.0, 0.0, 0.0),
-    )  # fmt: skip
     with pytest.raises(ConfigError):
-        widest_camera(lens, 384, 256, 53.0)
+        widest_camera(lens_of(640, 480, "plumb_bob", -9e9, 0.0, 0.0, 0.0, 0.0, cx=0.0, cy=0.0), 384, 256, 53.0)
 
 
 def detailed_texture(width: int, height: int) -> Image:
@@ -191,102 +163,72 @@ def test_twice_the_size_is_near_full_resolution_and_far_better_than_straight() -
     ours = psnr(rectifier.image(image), full)
     assert ours > 34.0
     assert psnr(straight, full) < ours - 6.0
-
-
-def test_pictures_of_another_size_of_the_same_shape_are_taken() -> None:
-    rectifier = rectifier_of(BARREL, width=192, height=128, hfov_deg=53.13)
+    rectifier = rectifier_of(BARREL, width=192, height=128, hfov_deg=53.13)  # another size of the same shape is taken
     small = photograph(BARREL.resized(640, 360))
     large = np.asarray(cv2.resize(small, (1280, 720), interpolation=cv2.INTER_CUBIC), np.uint8)
-    large, small = rectifier.image(large), rectifier.image(small)
-    assert psnr(small, large) > 30.0
+    assert psnr(rectifier.image(small), rectifier.image(large)) > 30.0
 
 
-CALIBRATION = """
-image_width: 1280
-image_height: 720
-camera_name: front
-camera_matrix: {{rows: 3, cols: 3, data: [{fx}, 0, 640.0, 0, {fx}, 360.0, 0, 0, 1]}}
-distortion_model: plumb_bob
-distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.01, 1e-05, 0, 0]}}
-"""
+def camera_file(folder: Path, fx: float = 800.0) -> str:
+    return f"source.calibration={calibration(folder, (1280, 720), fx)}"
 
 
-def config(source: str = "", top: str = "") -> NodeConfig:
-    text = f'{top}\n[model]\nweights = "x"\n[view.main]\n[source]\nkind = "synthetic"\n{source}'
-    return parse_config(text.encode(), "test")
+def prepared(
+    *changes: str, width: int = 1280, height: int = 720, lens: LensModel | None = None, before: Any = None
+) -> StreamContext:
+    size = {"width": width, "height": height}
+    info = SourceInfo(kind="synthetic", id="x", fps_nominal=24.0, clock="replay", lens=lens, **size)
+    return prepare_stream(fake_config(*changes), traits(), info, before=before)
 
 
-def camera_file(folder: Path, fx: float) -> str:
-    path = folder / "front.yaml"
-    path.write_text(CALIBRATION.format(fx=fx))
-    return f'calibration = "{path}"'
+def hfov_deg(context: StreamContext) -> float:
+    return context.intrinsics.hfov_deg
 
 
-def info(lens: LensModel | None = None, width: int = 1280, height: int = 720) -> SourceInfo:
-    return SourceInfo(kind="synthetic", id="x", width=width, height=height, fps_nominal=24.0, clock="replay", lens=lens)
-
-
-def test_a_calibration_file_cuts_to_the_trained_field_of_view_and_publishes_it(tmp_path: Path) -> None:
-    run = prepare_stream(config(camera_file(tmp_path, fx=800.0)), traits(), info())
-    assert run.intrinsics is not None
-    assert run.intrinsics.hfov_deg == pytest.approx(53.13)
+def test_a_calibration_cuts_to_the_trained_field_of_view_and_a_narrow_one_is_flagged(tmp_path: Path) -> None:
+    stated = camera_file(tmp_path)
+    run = prepared(stated)
+    assert hfov_deg(run) == pytest.approx(53.13)
     assert (run.fit.resize, run.ood) == ("remap2x_area", ())
+    with pytest.raises(ConfigError):  # they contradict each other
+        prepared(stated, "source.hfov_deg=60.0")
+    camera_file(tmp_path, fx=2400.0)
+    after = prepared(stated, width=640, height=360, before=run)  # a running node does not follow an edited file
+    assert (after.lens, after.intrinsics) == (run.lens, run.intrinsics)
+    run = prepared(stated)
+    assert (run.ood, run.fit.resize) == (("hfov",), "remap2x_area")
+    assert hfov_deg(run) < 30.0
+    with pytest.raises(ConfigError):
+        prepared(stated, "strict=true")
 
 
-def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one() -> None:
-    run = prepare_stream(config("hfov_deg = 90.0"), traits(), info())
-    assert run.intrinsics is not None
-    assert run.intrinsics.hfov_deg == pytest.approx(53.13, abs=0.05)
+def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one_where_pixels_are_left() -> None:
+    run = prepared("source.hfov_deg=90.0")
+    assert hfov_deg(run) == pytest.approx(53.13, abs=0.05)
     assert run.ood == ()
-    fit = run.fit
-    assert isinstance(fit, Fit)
-    left, top, wide, high = fit.crop_box(1280, 720)
-    assert (left, top) == ((1280 - wide) // 2, (720 - high) // 2)
-    assert (wide, high) == (640, 426)
-
-
-@pytest.mark.parametrize("allowed", [False, True])
-def test_a_cut_that_would_leave_too_few_pixels_is_not_made_unless_they_may_be_enlarged(allowed: bool) -> None:
-    stated = f"hfov_deg = 90.0\nallow_upscale = {str(allowed).lower()}"
-    run = prepare_stream(config(stated), traits(), info(width=WIDTH, height=HEIGHT))
-    assert run.ood == (() if allowed else ("hfov",))
-    assert run.intrinsics is not None
-    assert run.intrinsics.hfov_deg == pytest.approx(53.13 if allowed else 90.0, abs=1.0)
+    assert run.fit.crop_box(1280, 720) == ((1280 - 640) // 2, (720 - 426) // 2, 640, 426)
+    for allowed in (False, True):
+        upscale = f"source.allow_upscale={str(allowed).lower()}"
+        run = prepared("source.hfov_deg=90.0", upscale, width=WIDTH, height=HEIGHT)
+        assert run.ood == (() if allowed else ("hfov",))
+        assert hfov_deg(run) == pytest.approx(53.13 if allowed else 90.0, abs=1.0)
 
 
 def test_a_calibration_for_another_shape_is_refused_at_the_start_and_left_out_in_mid_stream(tmp_path: Path) -> None:
-    stated = config(camera_file(tmp_path, fx=800.0))
+    stated, square = camera_file(tmp_path), {"width": 640, "height": 480}
     with pytest.raises(ConfigError):
-        prepare_stream(stated, traits(), info(width=640, height=480))
-    before = prepare_stream(stated, traits(), info())
-    run = prepare_stream(stated, traits(), info(width=640, height=480), before=before)
+        prepared(stated, **square)
+    before = prepared(stated)
+    run = prepared(stated, before=before, **square)
     assert (run.fit.resize, run.ood) == ("released", ("hfov",))
-    kept = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
+    kept = prepared(stated, width=640, height=360, before=before)
     assert (kept.fit.resize, kept.ood) == ("remap2x_area", ())
-    own = info(lens=BARREL, width=640, height=480)
-    assert prepare_stream(
-        config(), traits(), own, before=prepare_stream(config(), traits(), info(lens=BARREL))
-    ).ood == ("hfov",)
-
-
-def test_a_lens_too_narrow_for_the_model_is_flagged_and_refused_if_strict(tmp_path: Path) -> None:
-    stated = camera_file(tmp_path, fx=2400.0)
-    run = prepare_stream(config(stated), traits(), info())
-    assert run.intrinsics is not None
-    assert (run.ood, run.fit.resize) == (("hfov",), "remap2x_area")
-    assert run.intrinsics.hfov_deg < 30.0
-    with pytest.raises(ConfigError):
-        prepare_stream(config(stated, top="strict = true"), traits(), info())
-
-
-def test_a_calibration_and_a_field_of_view_contradict_each_other(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        prepare_stream(config(camera_file(tmp_path, 800.0) + "\nhfov_deg = 60.0"), traits(), info())
+    assert prepared(lens=BARREL, before=prepared(lens=BARREL), **square).ood == ("hfov",)
 
 
 def test_a_stated_rate_that_is_a_trained_one_but_for_rounding_is_not_flagged() -> None:
     for fps, flags in ((23.976, ()), (20.0, ("fps",))):
-        run = prepare_stream(config(top=f"window = {{fps = {fps}}}"), traits(), info())
+        run = prepared(f"window.fps={fps}")
         assert (run.fps, run.ood) == (fps, flags)
 
 
@@ -302,15 +244,6 @@ def test_depth_goes_where_its_picture_goes_and_nothing_between_is_made_up(lens: 
     assert np.mean(depth[clear] == np.where(image[clear] > 128, 2.0, 7.0)) > 0.995
 
 
-def test_a_running_node_does_not_follow_a_calibration_file_that_is_edited(tmp_path: Path) -> None:
-    stated = config(camera_file(tmp_path, fx=800.0))
-    before = prepare_stream(stated, traits(), info())
-    camera_file(tmp_path, fx=2400.0)
-    after = prepare_stream(stated, traits(), info(width=640, height=360), before=before)
-    assert after.lens == before.lens
-    assert after.intrinsics == before.intrinsics
-
-
 # Without a lens.
 
 
@@ -318,25 +251,28 @@ def noise(width: int, height: int) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
 
 
-def test_the_released_fit_is_a_centre_crop_and_a_bilinear_resize() -> None:
+def test_the_released_fit_is_a_centre_crop_and_a_bilinear_resize_and_area_averages() -> None:
     image = noise(640, 480)
     left, top, wide, high = center_crop_box(640, 480, 384 / 256)
     wanted = cv2.resize(image[top : top + high, left : left + wide], (384, 256), interpolation=cv2.INTER_LINEAR)
     np.testing.assert_array_equal(Fit(width=384, height=256).image(image), wanted)
-
-
-def test_area_averages_where_bilinear_aliases() -> None:
-    checks = (np.indices((512, 768)).sum(axis=0) % 2 * 255).astype(np.uint8)
-    image = np.repeat(checks[:, :, None], 3, axis=2)
-    area = Fit(width=192, height=128, resize="area").image(image)
+    checks = np.repeat((np.indices((512, 768)).sum(axis=0) % 2 * 255).astype(np.uint8)[:, :, None], 3, axis=2)
+    area = Fit(width=192, height=128, resize="area").image(checks)
     assert np.abs(area.astype(float) - 127.5).max() <= 1
 
 
-@pytest.mark.parametrize(("width", "height"), [(320, 240), (1000, 200), (383, 256)])
-def test_too_small_a_picture_is_refused_unless_it_may_be_enlarged(width: int, height: int) -> None:
-    with pytest.raises(ConfigError):
-        Fit(width=384, height=256).image(noise(width, height))
-    assert Fit(width=384, height=256, allow_upscale=True).image(noise(width, height)).shape == (256, 384, 3)
+def test_too_small_a_picture_is_refused_unless_it_may_be_enlarged_and_a_clip_spans_minus_one_to_one() -> None:
+    for width, height in ((320, 240), (1000, 200), (383, 256)):
+        with pytest.raises(ConfigError):
+            Fit(width=384, height=256).image(noise(width, height))
+        enlarged = Fit(width=384, height=256, allow_upscale=True).image(noise(width, height))
+        assert enlarged.shape == (256, 384, 3)
+    images = np.zeros((2, 4, 5, 3), np.uint8)
+    images[1, 2, 3] = (255, 51, 0)
+    clip = to_clip_tensor(images)
+    assert (clip.shape, clip.dtype, clip.flags.c_contiguous) == ((2, 3, 4, 5), np.float32, True)
+    np.testing.assert_allclose(clip[1, :, 2, 3], [1.0, -0.6, -1.0], atol=1e-6)
+    assert clip[0].max() == -1.0
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (1280, 720), (576, 384)])
@@ -353,10 +289,135 @@ def test_a_marked_point_lands_where_the_fitted_intrinsics_project_it(width: int,
     assert seen == pytest.approx((fitted.fx * x + fitted.cx, fitted.fy * y + fitted.cy), abs=0.75)
 
 
-def test_the_clip_spans_minus_one_to_one() -> None:
-    images = np.zeros((2, 4, 5, 3), np.uint8)
-    images[1, 2, 3] = (255, 51, 0)
-    clip = to_clip_tensor(images)
-    assert (clip.shape, clip.dtype, clip.flags.c_contiguous) == ((2, 3, 4, 5), np.float32, True)
-    np.testing.assert_allclose(clip[1, :, 2, 3], [1.0, -0.6, -1.0], atol=1e-6)
-    assert clip[0].max() == -1.0
+# What a calibration states, from ROS files and messages, and what no camera has.
+
+
+FILE = b"""# as cameracalibrator writes it
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [433.5, 0.0, 322.25, 0.0, 432.75, 241.5, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.35, 0.12, 1e-05, -2.5e-04, 0]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [400, 0, 320, 0, 0, 400, 240, 0, 0, 0, 1, 0]
+"""
+D = (-0.35, 0.12, 1e-5, -2.5e-4, 0.0)
+K = (433.5, 0.0, 322.25, 0.0, 432.75, 241.5, 0.0, 0.0, 1.0)
+P = (400.0, 0.0, 320.0, 0.0, 0.0, 401.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+INFO: dict[str, Any] = {"width": 640, "height": 480, "model": "plumb_bob", "d": D, "k": K, "p": P}
+SIZE: dict[str, Any] = {"width": 640, "height": 480}
+LENS = LensModel(fx=433.5, fy=432.75, cx=322.25, cy=241.5, distortion="plumb_bob", coefficients=D, **SIZE)
+LAUGHS = b"a: &a [x, x, x, x, x, x, x, x]\n" + b"".join(
+    f"{here}: &{here} [{', '.join(['*' + there] * 8)}]\n".encode()
+    for here, there in zip("bcdefghijkl", "abcdefghijk", strict=True)
+)
+
+
+def stated_lens(**stated: Any) -> LensModel | None:
+    """What a message states."""
+    roi, binning = stated.pop("roi", (0, 0, 0, 0)), stated.pop("binning", (1, 1))
+    part = SimpleNamespace(**dict(zip(("x_offset", "y_offset", "width", "height"), roi, strict=True)))
+    rectified, model = stated.pop("rectified", False), stated.pop("model")
+    sent = SimpleNamespace(distortion_model=model, binning_x=binning[0], binning_y=binning[1], roi=part, **stated)
+    return lens_of_message(sent, rectified=rectified)
+
+
+def read(folder: Path, content: bytes) -> LensModel:
+    (folder / "camera.yaml").write_bytes(content)
+    return load_lens(folder / "camera.yaml")
+
+
+def test_a_ros_file_and_the_message_of_the_same_camera_say_the_same(tmp_path: Path) -> None:
+    assert read(tmp_path, FILE) == stated_lens(**INFO) == LENS
+    for model in (b"camera_model: pinhole\n", b""):
+        assert read(tmp_path, FILE.replace(b"distortion_model: plumb_bob\n", model)) == LENS
+
+
+@pytest.mark.parametrize(
+    ("find", "put"),
+    [
+        (b"image_width: 640\n", b""),
+        (b"image_width: 640", b"image_width: wide"),
+        (b"image_width: 640", b"image_width: -640"),
+        (b"plumb_bob", b"magic"),
+        (b"-0.35, 0.12, ", b""),
+        (b"433.5", b"0.0"),
+        (b"433.5", b".nan"),
+        (b"433.5, ", b""),
+        (b"322.25", b"900"),
+        (b"433.5, 0.0, 322.25, 0.0, 432.75, 241.5, 0.0, 0.0, 1.0", b"0,0,0,0,0,0,0,0,0"),
+        (b"camera_matrix:", b"camera_matrix: ["),
+        (b"# as", b"!!python/object/apply:os.system ['true']\n# as"),
+        (FILE, FILE + b"#" * 70_000),
+        *((FILE, text) for text in (LAUGHS, LAUGHS + b"image_width: *l\n", b"[" * 1500, b"- " * 1500)),
+        *((FILE, text) for text in (b"image_width: &x [*x]\n", b"\xff\xfe\0")),
+    ],
+    ids=range(19),
+)
+def test_a_bad_file_is_refused_in_one_line(find: bytes, put: bytes, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path, FILE.replace(find, put, 1))
+    assert "\n" not in str(caught.value)
+    for path in (tmp_path / "none.yaml", tmp_path):
+        with pytest.raises(ConfigError):
+            load_lens(path)
+
+
+def test_rectified_pictures_are_described_by_the_projection_matrix_and_who_was_not_calibrated_by_nothing() -> None:
+    assert stated_lens(**INFO, rectified=True) == LensModel(fx=400.0, fy=401.0, cx=320.0, cy=240.0, **SIZE)
+    assert stated_lens(**INFO | {"k": (0.0,) * 9}) is None
+    lens = depthai_lens([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], [], "Fisheye", (640, 480))
+    assert (lens.distortion, lens.coefficients) == ("none", ())  # DepthAI has undistorted it
+
+
+@pytest.mark.parametrize(
+    ("model", "d", "wanted"),
+    [
+        ("plumb_bob", (), ("none", 0)),
+        ("plumb_bob", (0.0,) * 5, ("none", 0)),
+        ("", (), ("none", 0)),
+        ("plumb_bob", (0.1,) * 4, ("plumb_bob", 4)),
+        ("plumb_bob", (0.1,) * 8, ("rational_polynomial", 8)),
+        ("rational_polynomial", (0.1,) * 8, ("rational_polynomial", 8)),
+        ("rational_polynomial", (0.1,) * 14, ("rational_polynomial", 14)),
+        ("equidistant", (0.1,) * 4, ("equidistant", 4)),
+        ("fisheye", (0.1,) * 4, ("equidistant", 4)),
+        ("fisheye", (0.0,) * 4, ("none", 0)),  # undistorted already
+        ("equidistant", (), ("none", 0)),
+        # a wrong number of coefficients
+        ("plumb_bob", (0.1,) * 3, None),
+        ("rational_polynomial", (0.1,) * 5, None),
+        ("equidistant", (0.1,) * 5, None),
+        ("equidistant", (0.1,) * 3, None),
+    ],
+)
+def test_names_of_distortion_become_ours(model: str, d: tuple[float, ...], wanted: tuple[str, int] | None) -> None:
+    with nullcontext() if wanted else pytest.raises(ConfigError):
+        lens = stated_lens(**INFO | {"model": model, "d": d})
+        assert (lens.distortion, len(lens.coefficients)) == wanted
+
+
+def test_resizing_parts_and_joined_pixels_move_every_point_with_the_picture() -> None:
+    small = LENS.resized(320, 240)
+    point = np.array([0.2, -0.1, 1.0])
+    u, v = (LENS.matrix @ point)[:2] + 0.5  # from the corner of the first pixel
+    assert (small.matrix @ point)[:2] + 0.5 == pytest.approx([u / 2, v / 2])
+    assert small.resized(640, 480) == LENS
+    with pytest.raises(ConfigError):
+        LENS.resized(640, 360)
+    lens = stated_lens(**INFO | {"roi": (100, 40, 400, 300), "binning": (2, 2)})
+    assert (lens.width, lens.height, lens.fx, lens.fy) == (200, 150, 433.5 / 2, 432.75 / 2)
+    assert (lens.cx, lens.cy) == ((322.25 - 100 + 0.5) / 2 - 0.5, (241.5 - 40 + 0.5) / 2 - 0.5)

@@ -5,22 +5,26 @@ import stat
 import threading
 import time
 import zlib
-from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zmq
-from cameras import until
+from cameras import Bench, Camera, until
+from fakes import Box, FakeSource, fake_config, traits
+from rig import Rig
 from wire_messages import end, lines_of, origin, pixels, start_reader, window
-from zmtp import GREETING, message, ready
 
-from gcd_client.protocol import EndMessage, StatusMessage, decode, topic_key
+from gcd_client.images import images
+from gcd_client.protocol import PREVIEW_TOPIC, EndMessage, StatusMessage, ViewMessage, decode, topic_key
 from gcd_client.subscriber import StatusSubscriber, ViewSubscriber
 from gcd_node.config import PublishConfig
 from gcd_node.errors import ConfigError, EndpointError, NodeError
+from gcd_node.frame import Frame
+from gcd_node.messages import PREVIEW_WIDTH, PublisherStats, preview_message
 from gcd_node.publisher import Publisher
-
-pytestmark = pytest.mark.timeout(60)
+from gcd_node.stream_context import StreamContext, prepare_stream
+from gcd_node.views import InputPreview
 
 
 def opened(folder: Path, *, readers: int = 0, data: str = "", status: str = "", **more) -> Publisher:
@@ -45,27 +49,17 @@ def context():
         made.destroy(linger=0)
 
 
-# A second process
-
-
-@pytest.mark.parametrize("transport", ["ipc", "tcp"])
-def test_a_second_process_receives_every_window_bit_for_bit(tmp_path, transport) -> None:
-    data = f"ipc://{tmp_path}/data" if transport == "ipc" else "tcp://127.0.0.1:0"
-    with opened(tmp_path, data=data, readers=1, lockstep=True) as publisher:
-        reader = start_reader(publisher.endpoint, "top", "--all")
-        for i in range(5):
-            assert publisher.send(window(i))
-        publisher.end(end(window_id=4), delay_ms=0)
-    expected = [f"{i} {i} 0 False {zlib.crc32(pixels(i))}" for i in range(5)]
-    assert lines_of(reader) == [*expected, "end"]
-
-
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
 def test_only_what_leaves_the_machine_s_memory_carries_a_checksum(tmp_path, context, transport) -> None:
     data = f"ipc://{tmp_path}/data" if transport == "ipc" else "tcp://127.0.0.1:0"
     with opened(tmp_path, data=data) as publisher:
         views = plain_reader(context, publisher.endpoint, topic_key("view/top/win"))
         notes = plain_reader(context, publisher.status_endpoint, topic_key("status"))
+        welcomed = plain_reader(context, publisher.endpoint, bytes(32))
+        assert (welcomed.poll(5000), welcomed.recv()) == (
+            zmq.POLLIN,
+            bytes(64),
+        )  # who wants no views
         until(lambda: publisher.stats.subscribers == 1)
         publisher.send(window())
         publisher.note("status", origin(), {"state": "active"})
@@ -74,15 +68,16 @@ def test_only_what_leaves_the_machine_s_memory_carries_a_checksum(tmp_path, cont
     assert found == [0 if transport == "ipc" else zlib.crc32(parts[0][64:]), zlib.crc32(parts[1][64:])]
 
 
-def test_lockstep_never_skips_for_a_slow_reader(tmp_path) -> None:
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+def test_lockstep_never_skips_for_a_slow_process(tmp_path, transport) -> None:
+    data = "" if transport == "ipc" else "tcp://127.0.0.1:0"
     big = pixels(1, frames=14, height=128, width=192)  # 1 MB: more than the kernel's buffers hold
-    with opened(tmp_path, lockstep=True, readers=1) as publisher:
+    with opened(tmp_path, data=data, lockstep=True, readers=1) as publisher:
         reader = start_reader(publisher.endpoint, "top", "--all", "--slow", "0.05")
         for i in range(30):
             publisher.send(window(i, images=big))
         publisher.end(end(window_id=29))
-    rows = [line.split()[:3] for line in lines_of(reader)]
-    assert rows == [[str(i), str(i), "0"] for i in range(30)] + [["end"]]
+    assert lines_of(reader) == [*(f"{i} {i} 0 False {zlib.crc32(big)}" for i in range(30)), "end"]  # bit for bit
 
 
 def test_a_conflated_slow_reader_gets_the_newest_window_and_then_the_end(tmp_path) -> None:
@@ -99,38 +94,18 @@ def test_a_conflated_slow_reader_gets_the_newest_window_and_then_the_end(tmp_pat
     assert len(seen) < 30
 
 
-# Sockets as the protocol has them
-
-
-def test_a_new_subscriber_is_welcomed_with_zeros(tmp_path, context) -> None:
-    with opened(tmp_path) as publisher:
-        reader = plain_reader(context, publisher.endpoint, bytes(32))
-        assert reader.poll(5000)
-        assert reader.recv() == bytes(64)
-        assert publisher.stats.subscribers == 0  # who waits for the welcome alone wants no views
-
-
-def test_sequences_count_each_topic_on_its_own(tmp_path, context) -> None:
+def test_sequences_count_each_topic_on_its_own_and_the_end_follows_by_its_delay(tmp_path, context) -> None:
     with opened(tmp_path, lockstep=True, readers=1) as publisher:
         reader = plain_reader(context, publisher.endpoint, b"view/")
         for view_id in ("a", "b", "a", "a", "b"):
             publisher.send(window(view_id=view_id))
-        publisher.end(end(view_id="a"))
-        found = [decode(reader.recv()) for _ in range(6)]
-        reader.close()
-    assert [message.sequence for message in found] == [0, 0, 1, 2, 1, 3]
-
-
-def test_the_end_follows_the_last_window_by_its_delay(tmp_path, context) -> None:
-    with opened(tmp_path, lockstep=True, readers=1) as publisher:
-        reader = plain_reader(context, publisher.endpoint, b"view/")
-        publisher.send(window())
-        publisher.end(end(), delay_ms=300)
-        reader.recv()
+        publisher.end(end(view_id="a"), delay_ms=300)
+        found = [decode(reader.recv()) for _ in range(5)]
         start = time.monotonic()
-        reader.recv()
+        found.append(decode(reader.recv()))
         assert time.monotonic() - start > 0.25
         reader.close()
+    assert [message.sequence for message in found] == [0, 0, 1, 2, 1, 3]
 
 
 @pytest.mark.parametrize("topic", ["status", "meta"])
@@ -153,17 +128,6 @@ def until_level(notes: StatusSubscriber, level: int) -> StatusMessage:
         if note.fields["level"] == level:
             return note
     raise AssertionError(f"no note of level {level} came")
-
-
-# Hand-over
-
-
-def test_lockstep_that_no_reader_takes_is_an_error_at_the_end(tmp_path) -> None:
-    publisher = opened(tmp_path, readers=1, lockstep=True, drain_ms=100)
-    publisher.send(window())
-    publisher.send(window())
-    with pytest.raises(EndpointError):
-        publisher.close()
 
 
 def test_a_slow_reader_cannot_stretch_the_end_of_a_node_that_was_told_to_stop(tmp_path, monkeypatch) -> None:
@@ -226,10 +190,10 @@ def test_what_stops_the_thread_reaches_the_caller(tmp_path, monkeypatch) -> None
             call()
 
 
-# Endpoints
-
-
 def test_a_live_ipc_endpoint_is_refused_and_stays_alive_and_the_file_of_a_dead_process_is_replaced(tmp_path) -> None:
+    for endpoint in ("tcp://0.0.0.0:5580", "tcp://*:5580", "tcp://192.168.1.4:1", "tcp://robot:1"):
+        with pytest.raises(ConfigError):  # beyond this machine, without keys
+            opened(tmp_path, data=endpoint)
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(f"{tmp_path}/data")
     with opened(tmp_path, lockstep=True, readers=1) as first:
@@ -238,13 +202,6 @@ def test_a_live_ipc_endpoint_is_refused_and_stays_alive_and_the_file_of_a_dead_p
         with ViewSubscriber(first.endpoint, "top", conflate=False) as views:
             first.send(window())
             assert views.receive(5000) is not None
-
-
-@pytest.mark.parametrize("endpoint", ["tcp://0.0.0.0:5580", "tcp://*:5580", "tcp://192.168.1.4:1", "tcp://robot:1"])
-def test_tcp_beyond_this_machine_is_refused(tmp_path, endpoint) -> None:
-    with pytest.raises(ConfigError) as caught:
-        opened(tmp_path, data=endpoint)
-    assert caught.value.exit_code == 78
 
 
 def test_the_runtime_folder_is_private_and_shared_by_both_sides(tmp_path, monkeypatch) -> None:
@@ -256,9 +213,6 @@ def test_the_runtime_folder_is_private_and_shared_by_both_sides(tmp_path, monkey
         with ViewSubscriber("ipc", "top", conflate=False) as views:
             publisher.send(window(7))
             assert views.receive(5000).header.window_id == 7
-
-
-def test_a_runtime_folder_anyone_may_write_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "open"))
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
@@ -267,6 +221,11 @@ def test_a_runtime_folder_anyone_may_write_is_refused(tmp_path, monkeypatch) -> 
 
 
 def test_a_close_that_waits_for_readers_can_be_cut_short(tmp_path) -> None:
+    publisher = opened(tmp_path, readers=1, lockstep=True, drain_ms=100)
+    publisher.send(window())
+    publisher.send(window())
+    with pytest.raises(EndpointError):  # no reader takes them
+        publisher.close()
     publisher = opened(tmp_path, lockstep=True, readers=1)
     publisher.send(window())
     closing = threading.Thread(target=publisher.close, daemon=True)
@@ -279,8 +238,7 @@ def test_a_close_that_waits_for_readers_can_be_cut_short(tmp_path) -> None:
 
 
 def test_many_topics_are_counted_by_what_they_let_through(tmp_path: Path) -> None:
-    config = PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")
-    with Publisher(config, linger_ms=0) as publisher, zmq.Context() as context, context.socket(zmq.SUB) as reader:
+    with opened(tmp_path, linger_ms=0) as publisher, zmq.Context() as context, context.socket(zmq.SUB) as reader:
         reader.linger = 0
         reader.set_hwm(0)  # of what it asks for, too
         reader.connect(publisher.endpoint)
@@ -297,17 +255,122 @@ def test_many_topics_are_counted_by_what_they_let_through(tmp_path: Path) -> Non
         until(lambda: publisher.stats.previews == 2)
 
 
-def test_who_takes_back_what_nobody_asked_for_makes_no_reader_disappear(tmp_path: Path) -> None:
-    opened = partial(
-        Publisher, PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status"), linger_ms=0
-    )
-    with opened() as publisher, ViewSubscriber(publisher.endpoint, "top"):
+def test_who_takes_back_what_nobody_asked_for_makes_no_reader_disappear(tmp_path) -> None:
+    greeting = b"\xff" + bytes(8) + b"\x7f" + b"\3\0" + b"NULL".ljust(20, b"\0") + bytes(32)  # ZeroMQ RFC 23, ZMTP 3.0
+    ready = b"\x05READY" + b"\x0bSocket-Type" + b"\0\0\0\3SUB"
+    asked = (b"\0never", b"\0never", b"\0never", b"\1once", b"\1then")
+    with opened(tmp_path, linger_ms=0) as publisher, ViewSubscriber(publisher.endpoint, "top"):
         until(lambda: publisher.stats.subscribers == 1)
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
             link.connect(f"{tmp_path}/data")
-            link.sendall(GREETING)
-            link.recv(len(GREETING), socket.MSG_WAITALL)
-            link.sendall(ready("SUB"))
-            link.sendall(3 * message(b"\0never") + message(b"\1once") + message(b"\1then"))
+            link.sendall(greeting)
+            link.recv(len(greeting), socket.MSG_WAITALL)
+            link.sendall(bytes([4, len(ready)]) + ready + b"".join(bytes([0, len(each)]) + each for each in asked))
             until(lambda: publisher.stats.subscribers == 3)
         until(lambda: publisher.stats.subscribers == 1)
+
+
+# The preview of the input on src/frm: who gets it, what it says, and that nobody else pays for it.
+
+
+def context_of(source: FakeSource, *changes: str) -> StreamContext:
+    return prepare_stream(fake_config("source.pace=realtime", *changes), traits(), source.info)
+
+
+def frame_of(width: int, height: int, seq: int = 7) -> Frame:
+    return Frame(image=np.full((height, width, 3), (200, 100, 50), np.uint8), stamp_ns=5_000_000_000, seq=seq)
+
+
+def preview(width: int, height: int, *changes: str) -> ViewMessage:
+    shown = context_of(FakeSource(1, size=(width, height)), *changes)
+    return preview_message(shown, frame_of(width, height), time.monotonic_ns(), 3)
+
+
+@pytest.mark.parametrize(("width", "height"), [(96, 64), (640, 480), (641, 480), (1920, 1080), (3000, 100)])
+def test_a_preview_is_the_whole_picture_and_never_wider_than_said(width: int, height: int) -> None:
+    message = preview(width, height)
+    _, shown_height, shown_width, _ = message.header.shape
+    assert shown_width == min(width, PREVIEW_WIDTH)
+    assert shown_height == pytest.approx(shown_width * height / width, abs=0.51)
+    assert message.header.src.resize == ("none" if width <= PREVIEW_WIDTH else "area")
+    assert np.abs(images(message)[0].astype(int) - (200, 100, 50)).max() <= 4  # JPEG
+
+
+def test_a_preview_says_that_it_is_no_generated_view_and_what_frame_it_is() -> None:
+    header = preview(1280, 720, "source.hfov_deg=90.0").header
+    assert (header.view_id, header.synthetic, header.encoding, header.window_id) == ("src", False, "jpeg", -1)
+    assert header.t_capture_ns == (5_000_000_000,)  # of a recording, its own clock
+    assert (header.src.seq, header.src.epoch, header.model.name) == ((7,), 3, "none")
+    assert 0 <= header.age_ms < 30_000
+    assert header.pose[0].az_deg == 0.0
+    assert header.intrinsics[0] == pytest.approx(320.0)  # half of 640 over tan 45 degrees
+    assert (header.intrinsics[2], header.intrinsics[5]) == (319.5, 179.5)
+    assert preview(1280, 720).header.intrinsics is None
+
+
+def test_nothing_is_made_while_nobody_looks_and_at_most_five_a_second_then() -> None:
+    class Watched(Box):
+        previews = 0
+
+        @property
+        def stats(self) -> PublisherStats:
+            return PublisherStats(subscribers=self.previews, previews=self.previews)
+
+    box, now = Watched(), [0.0]
+    shown = InputPreview(box, lambda: context_of(FakeSource(1)), lambda: now[0])
+    for seq in range(48 + 240):  # 12 s
+        if seq == 48:
+            assert box.views == []
+            box.previews = 1
+        now[0] = seq / 24
+        shown.offer(frame_of(96, 64, seq), time.monotonic_ns(), 3)
+    shown.announce_end(delay_ms=None)
+    seqs = [message.header.src.seq[0] for message in box.views]
+    assert 0 < len(seqs) <= 50
+    assert seqs == sorted(set(seqs))
+    assert [message.topic for message in box.ends] == [PREVIEW_TOPIC]
+
+
+def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> None:
+    camera = Camera()
+    with Rig(tmp_path, Bench(camera), config='kind = "v4l2"\nhfov_deg = 60.0', watched=False) as rig:
+        with ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as views:
+            rig.await_state("active")
+            until(lambda: rig.publisher.stats.previews == 1)
+            camera.run(30)
+            first = views.receive(60_000)
+            assert (first.images.shape, first.header.synthetic) == ((1, 64, 96, 3), False)
+            assert first.header.intrinsics is not None
+            assert np.abs(first.images.astype(int) - 20 - first.header.src.seq[0]).max() <= 3
+            assert 0 <= first.age_ms < 60_000
+            rig.ask("deactivate")
+            until(lambda: views.receive(100) is None and views.ended)
+        rig.await_state("inactive")
+
+
+def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    shown = context_of(FakeSource(1, size=(640, 480)))
+    picture = preview_message(shown, Frame(image=noise, stamp_ns=0, seq=0), time.monotonic_ns(), 0)
+    with (
+        opened(tmp_path, readers=1, lockstep=True) as publisher,
+        ViewSubscriber(publisher.endpoint, "src", "frm", conflate=False),
+        ViewSubscriber(publisher.endpoint, "top", conflate=False) as views,
+    ):
+        until(lambda: publisher.stats.subscribers == 2)
+        fill(publisher, picture)
+        for number in range(20):
+            publisher.send(window(number))
+        assert [views.receive(60_000).header.window_id for _ in range(20)] == list(range(20))
+        publisher.stop_waiting()
+
+
+def fill(publisher: Publisher, picture: ViewMessage) -> None:
+    """Send until nothing leaves any more: every buffer on the way is full."""
+    refused = 0
+    while refused < 5:
+        before, until_s = publisher.stats.sent, time.monotonic() + 0.1
+        publisher.preview(lambda: picture)
+        while publisher.stats.sent == before and time.monotonic() < until_s:
+            time.sleep(0.001)
+        refused += publisher.stats.sent == before

@@ -1,5 +1,6 @@
 """What the process tells its machine: systemd over a real notify socket, and log lines that break nothing."""
 
+import gc
 import io
 import itertools
 import json
@@ -12,22 +13,35 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
+import torch
+from fakes import fake_config, write_tiny
 from rig import service_manager
 
+from gcd_model.errors import CheckpointError
+from gcd_model.weights.adapter import Adapter, base_digest
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import load_weights
+from gcd_model.weights.save import write_adapter
+from gcd_node.cli.main import run_app
+from gcd_node.cli.run import apply_scheduling
+from gcd_node.config import LifeConfig, ModelSection, NodeConfig
+from gcd_node.errors import ConfigError
 from gcd_node.service import JsonLines, ServiceManager
+from gcd_node.session import load_model, model_threads
+from gcd_node.stream_context import config_digest
 
 
-@pytest.mark.parametrize("is_abstract", [False, True])
-def test_a_life_as_systemd_hears_it(tmp_path: Path, is_abstract: bool) -> None:
+def test_a_life_as_systemd_hears_it(tmp_path: Path) -> None:
     name = f"gcd-test-{os.getpid()}-{tmp_path.name}"
-    bound, told = (f"\0{name}", f"@{name}") if is_abstract else (str(tmp_path / "notify"),) * 2
-    with service_manager(bound) as receive:
-        service = ServiceManager({"NOTIFY_SOCKET": told})
-        service.ready()
-        service.alive()  # it watches nobody
-        service.stopping()
-        assert receive() == ["READY=1", "STOPPING=1"]
+    for bound, told in ((f"\0{name}", f"@{name}"), (str(tmp_path / "notify"),) * 2):
+        with service_manager(bound) as receive:
+            service = ServiceManager({"NOTIFY_SOCKET": told})
+            service.ready()
+            service.alive()  # it watches nobody
+            service.stopping()
+            assert receive() == ["READY=1", "STOPPING=1"]
 
 
 def test_the_watchdog_is_fed_four_times_a_period_however_often_it_is_called(tmp_path: Path) -> None:
@@ -42,16 +56,11 @@ def test_the_watchdog_is_fed_four_times_a_period_however_often_it_is_called(tmp_
 
 
 @pytest.mark.parametrize("address", ["/nonexistent/notify", "vsock:2:1234", "@" + "x" * 200])
-def test_a_socket_that_cannot_be_reached_is_logged_once_and_the_node_goes_on(
-    address: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_socket_that_is_not_there_is_logged_once_and_no_more(address: str, caplog: pytest.LogCaptureFixture) -> None:
     service = ServiceManager({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "30000000"})
     for tell in (service.ready, service.alive, service.alive, service.stopping):
         tell()
     assert len(caplog.records) == 1
-
-
-# Log lines
 
 
 def lines(text: str) -> list[dict[str, Any]]:
@@ -130,10 +139,109 @@ with background_logging(as_json=False):
 import os; os._exit(0)
 """
     stuck = in_a_process(code, stdout=subprocess.PIPE)
-    assert stuck.stdout is not None
     try:
         assert stuck.wait(timeout=30) == 0  # nobody read its 5 MB
         assert float(stuck.stdout.readline()) < 10.0
     finally:
         stuck.kill()
         stuck.communicate()
+
+
+# How `gcd-node run` behaves beside others on its machine, and how the process ends.
+
+
+def test_a_network_takes_half_the_cores_or_the_stated_threads_and_opencv_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for cores, threads in ((1, 1), (2, 1), (8, 4)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+        assert model_threads(ModelSection(weights="fake")) == threads
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    wanted = max(before) + 1
+    try:
+        load_model(ModelSection(weights="random:driving", device="cpu", threads=wanted))
+        assert (torch.get_num_threads(), cv2.getNumThreads()) == (wanted, wanted)
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
+
+
+def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    nice, before = list[int](), sys.getswitchinterval()
+    monkeypatch.setattr(os, "nice", nice.append)
+    try:
+        apply_scheduling(LifeConfig(nice=7))
+        assert (nice, sys.getswitchinterval()) == ([7], pytest.approx(0.001))
+        assert gc.get_freeze_count() > 0
+    finally:
+        sys.setswitchinterval(before)
+        gc.unfreeze()
+
+
+def test_a_thread_that_hangs_changes_neither_the_exit_code_nor_what_was_said() -> None:
+    code = """
+import sys, threading, time
+from gcd_node.cli.main import main
+threading.Thread(target=time.sleep, args=(3600,), daemon=True).start()
+sys.argv = ["gcd-node", "ctl", "state", "--endpoint", "ipc:///nowhere/at/all", "--timeout", "0.1"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 69
+    assert done.stderr.startswith("error: ipc:///nowhere/at/all did not answer state")
+
+
+def test_f23_a_node_that_has_not_even_begun_ends_with_0() -> None:
+    code = """
+import sys, time
+from gcd_node.cli import main
+sys.argv = ["gcd-node", "-v", "run", "launch.toml"]
+main.run_app = lambda _: (print("importing torch", flush=True), [time.sleep(0.01) for _ in range(360_000)])
+main.main()
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as node:
+        assert node.stdout.readline() == "importing torch\n"
+        node.terminate()
+        assert node.wait(60) == 0
+
+
+# Adapters beside their weights, exports and engines: what is taken, and what is refused before anything runs.
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Weights, an adapter of them, and one of others."""
+    folder = tmp_path_factory.mktemp("adapters")
+    loaded = load_weights(write_tiny(folder))
+    state = loaded.networks.state_dict()
+    names = (name for name in sorted(state) if name.endswith("query.weight") and state[name].ndim == 2)
+    layer = next(names).removesuffix(".weight")
+    width = state[f"{layer}.weight"].shape[0]
+    factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
+    card = Card(name="adapted", config=loaded.networks.config, family=loaded.family.name, move_time=loaded.move_time)
+    for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
+        adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)
+        write_adapter(folder / f"{name}.safetensors", adapter, overwrite=False)
+    return {name: folder / f"{name}.safetensors" for name in ("tiny", "own", "other")}
+
+
+def launch(weights: object, *changes: str) -> NodeConfig:
+    return fake_config(f"model.weights={weights}", "model.device=cpu", *changes)
+
+
+def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(files: dict[str, Path]) -> None:
+    plain, adapted = launch(files["tiny"]), launch(files["tiny"], f"model.adapter={files['own']}")
+    before, traits = load_model(plain.model).traits, load_model(adapted.model).traits
+    assert traits.name == "adapted"
+    assert traits.sha256_12 != before.sha256_12
+    assert config_digest(plain, before) != config_digest(adapted, before)
+    with pytest.raises(CheckpointError):
+        load_model(launch(files["tiny"], f"model.adapter={files['other']}").model)
+
+
+def test_onnxruntime_is_refused_for_what_is_no_export_and_an_export_over_a_folder_of_mine(tmp_path: Path) -> None:
+    for change in ("model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'):
+        with pytest.raises(ConfigError, match="onnxruntime runs exports, and random:driving is none"):
+            load_model(launch("random:driving", change).model)
+    pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
+    assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64

@@ -1,6 +1,7 @@
 """Depth of a stereo pair: against ray-cast scenes, and of a real one."""
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ import pytest
 from fakes import HEIGHT, WIDTH, live_traits
 from numpy.typing import NDArray
 
-from gcd_model import Intrinsics
+from gcd_model import CameraMount, Intrinsics
 from gcd_node.errors import ConfigError, DepthError
 from gcd_node.frame import Image, LensModel
 from gcd_node.image_io import write_video
 from gcd_node.offline import ClipRequest, read_clip
 from gcd_node.preprocess import project
+from gcd_node.sources.depth import OnnxDepth, clean_depth
 from gcd_node.sources.stereo import StereoDepth
 
 BASELINE_M, DISPARITY = 0.09, 10
@@ -142,7 +144,7 @@ def pair() -> tuple[Image, Image]:
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
-def test_an_unrectified_pair_gives_its_depth_through_its_calibration(
+def test_an_unrectified_pair_gives_depth_by_its_calibration(
     tmp_path: Path, pair: tuple[Image, Image], shrink: int
 ) -> None:
     path = written(tmp_path / "calib.json", board())
@@ -158,18 +160,8 @@ def test_an_unrectified_pair_gives_its_depth_through_its_calibration(
     assert np.mean(errors < 1.0) > 0.95
 
 
-def change(content: Any, *keys: Any, to: Any) -> Any:
-    inner = content
-    for key in keys[:-1]:
-        inner = inner[key]
-    inner[keys[-1]] = to
-    return content
-
-
 @pytest.mark.parametrize("axis", [0, 2], ids=["tilted", "rolled"])
-def test_the_calibration_of_another_device_is_noticed_in_the_pictures(
-    tmp_path: Path, pair: tuple[Image, Image], axis: int
-) -> None:
+def test_the_calibration_of_another_device_is_noticed(tmp_path: Path, pair: tuple[Image, Image], axis: int) -> None:
     off = moved(turn=[2.0 * (axis == each) for each in range(3)])
     content = board()
     step = off @ np.linalg.inv(WORLD_FROM_RIGHT) @ WORLD_FROM_LEFT
@@ -180,29 +172,22 @@ def test_the_calibration_of_another_device_is_noticed_in_the_pictures(
             stereo(*pair)
 
 
-def test_swapped_pictures_are_noticed() -> None:
-    left, right = (taken_by(IDEAL, moved(x)) for x in (0.0, 0.05))
-    with pytest.raises(DepthError):
-        StereoDepth((IDEAL, IDEAL), moved(-0.05), size=SIZE)(right, left)
+WRONG: dict[str, Any] = {
+    "toCameraSocket": -1,
+    "rotationMatrix": [[0.0] * 3] * 3,
+    "translation": {"x": 9.0, "y": 0.0, "z": 0.0},
+    "intrinsicMatrix": [[405.0, 0, 9999.0], [0, 405, 200], [0, 0, 1]],
+    "cameraType": 7,
+    "width": "wide",
+}
 
 
-LEFT = ("cameraData", 1, 1)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        change(board(), *LEFT, "extrinsics", "toCameraSocket", to=-1),
-        change(board(), *LEFT, "extrinsics", "rotationMatrix", to=[[0.0] * 3] * 3),
-        change(board(), *LEFT, "extrinsics", "translation", to={"x": 9.0, "y": 0.0, "z": 0.0}),
-        change(board(), *LEFT, "intrinsicMatrix", to=[[405.0, 0, 9999.0], [0, 405, 200], [0, 0, 1]]),
-        change(board(), *LEFT, "cameraType", to=7),
-        change(board(), *LEFT, "width", to="wide"),
-        {"cameraData": []},
-    ],
-    ids=lambda _: "",
-)
-def test_a_calibration_of_no_such_pair_is_refused_with_one_line(tmp_path: Path, content: object) -> None:
+@pytest.mark.parametrize("key", [*WRONG, "none"])
+def test_a_calibration_of_no_such_pair_is_refused_with_one_line(tmp_path: Path, key: str) -> None:
+    content = board() if key in WRONG else {"cameraData": []}
+    if key in WRONG:
+        left = content["cameraData"][1][1]
+        (left if key in left else left["extrinsics"])[key] = WRONG[key]
     path = written(tmp_path / "calib.json", content)
     with pytest.raises(ConfigError) as raised:
         StereoDepth.from_depthai(path, size=SIZE)
@@ -211,12 +196,12 @@ def test_a_calibration_of_no_such_pair_is_refused_with_one_line(tmp_path: Path, 
 
 
 def test_pictures_the_calibration_is_not_for_are_refused_and_the_next_ones_taken() -> None:
-    stereo = StereoDepth((IDEAL, IDEAL), moved(-0.1), size=SIZE)
-    good = np.zeros((192, 320, 3), np.uint8)
-    with pytest.raises(DepthError):
-        stereo(good, np.zeros((192, 256, 3), np.uint8))
-    _, depth = stereo(good, good)
-    assert depth.shape == (192, 320)
+    stereo = StereoDepth((IDEAL, IDEAL), moved(-0.05), size=SIZE)
+    left, right = (taken_by(IDEAL, moved(x)) for x in (0.0, 0.05))
+    for wrong in ((right, left), (left, right[:, :256])):  # swapped, and of another size
+        with pytest.raises(DepthError):
+            stereo(*wrong)
+    assert stereo(left, right)[1].shape == (192, 320)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs the OAK's pair in ../shared/real/oak-stereo")
@@ -255,9 +240,105 @@ def test_a_stereo_pair_gives_its_rectified_left_picture_with_lens_and_depth(film
     request = ClipRequest(depth=films / "right.mkv", calibration=films / "calib.json", rectified=rectified)
     clip = read_clip(films / "left.mkv", request, live_traits())
     depth, lens = clip.depth, clip.lens
-    assert depth is not None
-    assert lens is not None
     assert (lens.width, lens.height) == (WIDTH, HEIGHT)
     known = depth[depth > 0]
     assert len(known) > 0.6 * depth.numel()
     assert float(known.median()) == pytest.approx(FILMED.fx * BASELINE_M / DISPARITY, rel=0.06)
+
+
+# Depth from elsewhere: as somebody measured it, or of a network of the user's, against planes.
+
+
+MOUNT = CameraMount(height_m=1.4, tilt_deg=8.0, hfov_deg=80.0)
+
+
+def network(
+    path: Path,
+    takes: Sequence[Any] = (1, 3, "high", "wide"),
+    gives: Sequence[Any] = (1, "high", "wide"),
+    *,
+    channels: Sequence[int] = (1,),
+    outputs: int = 1,
+) -> Path:
+    """An ONNX file whose depth is the mean of the colours: whatever a picture says. channels: the axes that the mean
+    is of."""
+    onnx = pytest.importorskip("onnx", reason="needs the extra `onnx`")
+    pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    keep, axes = int(len(gives) == 4), onnx.numpy_helper.from_array(np.array(channels, np.int64), "axes")
+    names = [f"depth{i}" for i in range(outputs)]
+    graph = helper.make_graph(
+        [helper.make_node("ReduceMean", ["picture", "axes"], [name], keepdims=keep) for name in names],
+        "depth",
+        [helper.make_tensor_value_info("picture", kind, takes)],
+        [helper.make_tensor_value_info(name, kind, gives) for name in names],
+        [axes],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9), path)
+    return path
+
+
+def ground_inverse(width: int = 240, height: int = 160) -> NDArray[np.float64]:
+    """1 / m of the ground below `MOUNT`, [H, W]; 0 above the horizon."""
+    focal, tilt = width / 2 / math.tan(math.radians(40)), math.radians(8)
+    v = (np.arange(height) + 0.5 - height / 2) / focal
+    rows = (v * math.cos(tilt) + math.sin(tilt)) / 1.4
+    return np.repeat(np.maximum(rows, 0)[:, None], width, axis=1)
+
+
+def grey(values: NDArray[np.float64]) -> Image:
+    """A picture that `network` turns into these values, 0 to 1."""
+    return np.repeat(np.rint(values * 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def test_a_metric_network_is_taken_at_its_word(tmp_path: Path) -> None:
+    white = np.mean((1 - np.array([0.485, 0.456, 0.406])) / [0.229, 0.224, 0.225])
+    for gives, sides in (((1,), ("high", "wide")), ((1, 1), (70, 98))):
+        path = network(tmp_path / "net.onnx", (1, 3, *sides), (*gives, *sides))
+        depth = OnnxDepth(path, kind="metric")(np.full((160, 240, 3), 255, np.uint8))
+        assert depth.shape == (160, 240)
+        assert depth == pytest.approx(float(white), rel=1e-5)
+
+
+@pytest.mark.parametrize(("a", "b"), [(1.6, -0.1), (0.9, 0.0)])
+def test_the_ground_gives_relative_depth_its_scale_and_shift(tmp_path: Path, a: float, b: float) -> None:
+    inverse = ground_inverse()
+    inverse[60:150, 40:100] = 0.5  # somebody stands there
+    y = (inverse - b) / a
+    assert y.max() <= 1
+    assert y.min() >= 0
+    depth = OnnxDepth(network(tmp_path / "net.onnx"), kind="inverse", scale=MOUNT)(grey(y))
+    near = inverse > 0.1
+    assert np.mean(np.abs(depth[near] * inverse[near] - 1) < 0.03) > 0.97  # the rest are the edges of who stands there
+    for tilt_deg in (-60.0, 8.0, 89.0):  # no ground that gives a scale
+        mount = CameraMount(height_m=1.4, tilt_deg=tilt_deg, hfov_deg=20.0)
+        with pytest.raises(DepthError):
+            OnnxDepth(tmp_path / "net.onnx", kind="inverse", scale=mount)(grey(np.full((160, 240), 0.5)))
+
+
+def test_what_is_no_such_network_or_lacks_a_scale_is_refused_in_a_line(tmp_path: Path) -> None:
+    path = network(tmp_path / "net.onnx", (1, 3, 70, 98), (1, 70, 98))
+    (tmp_path / "damaged.onnx").write_bytes(path.read_bytes()[:40])
+    bad = [(tmp_path / name, "metric") for name in ("missing.onnx", "damaged.onnx")] + [(path, "inverse")]
+    for name, other in (
+        ("grey", {"takes": (1, 1, "high", "wide")}),
+        ("colours out", {"gives": (1, 3, 1, "wide"), "channels": (2,)}),
+        ("two outputs", {"outputs": 2}),
+    ):
+        bad.append((network(tmp_path / name, **other), "metric"))
+    for file, kind in bad:
+        with pytest.raises(ConfigError) as raised:
+            OnnxDepth(file, kind=kind)
+        assert "\n" not in str(raised.value)
+
+
+def test_millimetres_become_metres_and_what_is_no_distance_a_hole_in_the_pictures_size() -> None:
+    cleaned = clean_depth(np.array([[1250, 0, 65535]], np.uint16), (1, 3))
+    assert cleaned == pytest.approx(np.array([[1.25, 0.0, 0.0]]))
+    depth = np.array([[1.5, np.nan, np.inf], [-np.inf, -2.0, 5.0]], np.float16)
+    cleaned = clean_depth(depth, (4, 6))
+    assert (cleaned.dtype, cleaned.shape, set(np.unique(cleaned))) == (np.float32, (4, 6), {0.0, 1.5, 5.0})
+    for wrong in (np.ones((4, 8)), np.ones((4, 6, 3)), np.ones((0, 6)), np.ones((4, 6), np.uint8)):
+        with pytest.raises(DepthError) as raised:
+            clean_depth(wrong if wrong.dtype == np.uint8 else wrong.astype(np.float32), (4, 6))
+        assert ("\n" in str(raised.value), raised.value.exit_code) == (False, 65)

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,14 @@ from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
 from gcd_node.cli.watch import StatusBoard, ViewTable
 from gcd_node.config import PublishConfig
+from gcd_node.demo import moments
 from gcd_node.errors import OutputError
 from gcd_node.health import Health, Level
-from gcd_node.image_io import ViewSaver
+from gcd_node.image_io import ViewSaver, to_u8, write_arrays, write_png
 from gcd_node.publisher import Publisher
 from gcd_node.sources.files import read_picture
 
-pytestmark = pytest.mark.timeout(60)
+Capture = pytest.CaptureFixture[str]
 SEEN = np.random.default_rng(0).integers(0, 3, (2, 16, 16), np.uint8)
 WALL_NS = 1_800_000_000_000_000_000
 
@@ -82,35 +84,23 @@ def test_a_table_has_the_figures_of_each_topic() -> None:
     assert max(map(len, text_of(table.render("", ended=False), 80).splitlines())) <= 80
 
 
-def test_saved_pictures_and_video_are_the_published_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sent = [pixels(i, height=16, width=16) for i in range(2)]
-    messages = [window(i, images=sent[i]) for i in range(2)]
-    side = window(0, view_id="side", images=pixels(100, height=16, width=16))
-    out = tmp_path / "out"
-    assert watch(tmp_path, ["--save", str(out)], side, *messages, end(view_id="side"), end()) == 0
-    assert "3 messages, 8 files, 0 damaged; the stream ended" in capsys.readouterr().out
-    assert sorted(str(path.relative_to(out)) for path in out.rglob("*.*")) == [
-        *("side.mkv", "side/000000_00.png", "side/000000_01.png", "top.mkv"),
-        *("top/000000_00.png", "top/000000_01.png", "top/000001_00.png", "top/000001_01.png"),
-    ]
-    assert np.array_equal(read_video(out / "top.mkv"), np.concatenate(sent))
-    assert np.array_equal(read_picture(out / "top" / "000001_01.png"), sent[1][1])
-
-
-def test_windows_whose_own_visibility_came_are_saved_hatched_too(tmp_path: Path) -> None:
+def test_what_is_saved_are_the_published_pixels_and_hatched_ones(tmp_path: Path, capsys: Capture) -> None:
     shown = [pixels(i, height=16, width=16) for i in range(3)]
     seen = [visibility(0, seen=SEEN), visibility(5, seen=SEEN)]  # the second is of another window
     first, second, third = (window(i, images=images) for i, images in enumerate(shown))
     messages = (first, class_map(0), seen[0], second, seen[1], third, end(), end(kind="vis"))
-    options = ["--view", "top", "--hatch", "--save", str(tmp_path / "out")]
-    assert watch(tmp_path, options, *messages, readers=2) == 0
-    assert np.array_equal(read_video(tmp_path / "out" / "top.mkv"), np.concatenate(shown))
-    assert np.array_equal(read_video(tmp_path / "out" / "top" / "hatched.mkv"), hatched(shown[0], SEEN))
+    top = tmp_path / "out" / "top"
+    assert watch(tmp_path, ["--view", "top", "--hatch", "--save", str(top.parent)], *messages, readers=2) == 0
+    assert "0 damaged; the stream ended" in capsys.readouterr().out
+    assert {path.stem for path in top.glob("*.png")} == {f"{i:06}_0{j}" for i in range(3) for j in range(2)}
+    assert np.array_equal(read_picture(top / "000001_01.png"), shown[1][1])
+    assert np.array_equal(read_video(top.with_suffix(".mkv")), np.concatenate(shown))
+    assert np.array_equal(read_video(top / "hatched.mkv"), hatched(shown[0], SEEN))
 
 
 def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Path) -> None:
     drawn = [numbers(i, height=16, width=16) for i in range(2)]
-    with ViewSaver(tmp_path) as saver:
+    with closing(ViewSaver(tmp_path)) as saver:
         for i in range(2):
             saver.add(received(window(i, images=pixels(i, height=16, width=16))))
             saver.add(received(class_map(i, drawn=drawn[i])))
@@ -132,15 +122,32 @@ def test_maps_are_saved_in_colour_and_as_numbers_apart_from_windows(tmp_path: Pa
     assert np.allclose(metres, 10, rtol=1e-3)
 
 
-def test_a_view_that_changes_its_size_and_a_folder_that_cannot_be_written_are_errors(tmp_path: Path) -> None:
+def test_a_view_that_changes_its_size_and_what_cannot_be_written_are_errors(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     small, large = (received(window(images=pixels(height=16, width=width))) for width in (16, 32))
-    with ViewSaver(tmp_path) as saver:
+    with closing(ViewSaver(tmp_path)) as saver:
         saver.add(small)
         with pytest.raises(OutputError):
             saver.add(large)
-    with ViewSaver(tmp_path / "file") as saver, pytest.raises(OutputError):
+    with closing(ViewSaver(tmp_path / "file")) as saver, pytest.raises(OutputError):
         saver.add(small)
+
+
+def test_the_demo_shows_what_arrived_whole_in_order_and_hatches_the_unseen(tmp_path: Path) -> None:
+    video = np.zeros((2, 3, 4, 5), np.float32)
+    video[1, 0, 2, 3], video[1, 1, 2, 3] = 100.6 / 255, 1.1
+    assert to_u8(video)[1, 2, 3].tolist() == [101, 255, 0]
+    pictures = {number: [np.full((16, 16, 3), 10 * number + i, np.uint8) for i in range(2)] for number in (5, 2, 7)}
+    for number, frames in pictures.items():
+        write_arrays(tmp_path / "vis" / f"{number:06d}.npy", np.stack([2 + 0 * SEEN[0], 0 * SEEN[0]]))
+        for i, frame in enumerate(frames):
+            write_png(tmp_path / f"{number:06d}_{i:02d}.png", frame)
+            write_png(tmp_path / "cls" / f"{number:06d}_{i:02d}.png", frame)
+    (tmp_path / "vis" / "000007.npy").unlink()
+    shown = list(moments(pictures, tmp_path))
+    assert [int(view[0, 0, 0]) for _, view, _, _ in shown] == [20, 21, 50, 51]
+    assert np.array_equal(shown[0][2], pictures[2][0])
+    assert np.array_equal(shown[1][2], hatched(pictures[2][1], 0 * SEEN[0]))
 
 
 # Status.
@@ -162,31 +169,25 @@ def board_of(*notes: StatusMessage) -> StatusBoard:
 def working() -> dict[str, object]:
     """The status of a node at work."""
     health = Health()
-    health.state = "active"
+    health.state, health.model = "active", "busy"
     health.source("streaming")
-    health.model = "busy"
     health.expect(("topdown", "a_long_view_name"), 3600.0)
     for i in range(11):
         health.frame(i * 100_000_000, time.monotonic_ns())
     for view_id in ("topdown", "a_long_view_name"):
         health.published(view_id, 0.25)
-    health.stage("render", 0.125)
-    health.counts["built"], health.faults = 5, {"WIN_GAP": 2}
+    health.faults = {"WIN_GAP": 2}
     health.counts.update(slot=3, sent=5, subs=1, bytes=4130)
     return health.report()
 
 
-def test_a_status_holds_until_the_node_is_silent_for_three_seconds() -> None:
+def test_a_status_holds_until_the_node_is_silent_for_three_seconds_and_a_kept_one_is_as_old_as_it_says() -> None:
     board = StatusBoard()
     assert (board.level(0.0), board.record(0.0)) == (Level.STALE, {"level": 3, "stale": True})
     assert "no status yet" in text_of(board.render(0.0))
     board = board_of(note("status", {"level": 1, "reasons": ["fps"]}))
     assert [board.level(10.0 + ago) for ago in (0.0, 2.9, 3.1)] == [Level.WARN, Level.WARN, Level.STALE]
     assert (board.record(12.0)["age_ms"], board.record(20.0)["level"]) == (2000, 3)
-    assert "silent for 10 s" in text_of(board.render(20.0))
-
-
-def test_a_first_status_that_was_kept_for_late_readers_is_as_old_as_it_says() -> None:
     board = board_of(note("status", {"level": 0}, late_s=60.0))
     assert board.level(10.0) is Level.STALE
     board.add(note("status", {"level": 0}, late_s=60.0), 11.0, WALL_NS)  # another machine's clock
@@ -199,12 +200,7 @@ def test_a_working_node_is_shown_with_its_figures_in_80_columns() -> None:
     text = text_of(board_of(note("status", working()), *events).render(10.0), width=80)
     assert max(map(len, text.splitlines())) <= 80
     shown = " ".join(text.replace("│", " ").split())
-    assert "OK robot_7 node state active" in shown
-    for expected in (
-        *("ready True", "state streaming, fps 10.0", "built 5, rejected 2, skipped 3", "WIN_GAP 2"),
-        *("state busy, ms_p50 125.0, ms_p99 125.0", "sent 5, subs 1, bytes 4130", "a_long_view_name last_ms 0"),
-        *("slot 3", "render p50_ms 125.0", "code E19, level 2, epoch 19", "E12"),
-    ):
+    for expected in ("OK robot_7 node state active", "state streaming, fps 10.0", "WIN_GAP 2", "slot 3", "code E19"):
         assert expected in shown, expected
     assert "E11" not in shown  # only the latest
 
@@ -228,9 +224,7 @@ def test_whatever_a_node_says_is_drawn_without_harm(fields: dict[str, Any]) -> N
     assert json.loads(json.dumps(board.record(10.0)))["node_id"] == "robot_7"
 
 
-def test_status_prints_a_table_or_one_line_of_json_or_every_note_on_its_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_status_prints_a_table_or_notes_as_json(tmp_path: Path, capsys: Capture) -> None:
     endpoint = f"ipc://{tmp_path}/status"
     assert run_app(["status", endpoint, "--once", "--timeout", "0.2"]) == 69
     assert capsys.readouterr().err.startswith(f"error: no status from {endpoint} within 0.2 s: is the node running")
@@ -246,7 +240,6 @@ def test_status_prints_a_table_or_one_line_of_json_or_every_note_on_its_line(
         assert line["source"]["fps"] == 10.0
         command = [sys.executable, "-m", "gcd_node", "status", endpoint, "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
-            assert reader.stdout is not None
             told = [json.loads(reader.stdout.readline()) for _ in range(3)]
             reader.terminate()
     lines = {line["topic"]: line for line in told}
@@ -254,18 +247,14 @@ def test_status_prints_a_table_or_one_line_of_json_or_every_note_on_its_line(
     assert (lines["event"]["code"], lines["meta"]["node_id"]) == ("SRC_LOST", "gcd")
 
 
-@pytest.mark.parametrize(("known", "code"), [(True, 0), (False, 77)])
-def test_a_node_that_asks_for_keys_is_reached_with_them_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], known: bool, code: int
-) -> None:
-    node, ours, other = new_key_pair(), new_key_pair(), new_key_pair()
-    clients = {(ours if known else other).public: Client(name="planner", role="viewer")}
-    security = ServerSecurity(keys=node, find_client=clients.get)
+@pytest.mark.parametrize("known", [True, False])
+def test_a_node_that_asks_for_keys_is_reached_with_them_alone(tmp_path: Path, known: bool) -> None:
+    node, ours = new_key_pair(), new_key_pair()
+    clients = {ours.public if known else node.public: Client(name="planner", role="viewer")}
     write_key_pair(tmp_path / "keys", ours)
     endpoints = PublishConfig(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0")
-    with Publisher(endpoints, security=security) as publisher:
+    with Publisher(endpoints, security=ServerSecurity(keys=node, find_client=clients.get)) as publisher:
         publisher.note("status", origin(), working())
-        assert publisher.status_endpoint is not None
-        command = ["status", publisher.status_endpoint, "--once", "--timeout", "20"]
-        assert run_app([*command, "--keys", str(tmp_path / "keys"), "--node-key", node.public]) == code
-    assert ("state streaming, fps 10.0" in capsys.readouterr().out) == known
+        command = ["status", str(publisher.status_endpoint), "--once", "--timeout", "20"]
+        ended = run_app([*command, "--keys", str(tmp_path / "keys"), "--node-key", node.public])
+        assert ended == (0 if known else 77)

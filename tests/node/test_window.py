@@ -1,14 +1,18 @@
 """Frames become windows: the grid, its holes, restarts and the end of a stream."""
 
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
-from media import frames_at
+from cameras import frames_at, until
+from fakes import FakeSource, Steady
 
+from gcd_node.errors import ReaderError
 from gcd_node.frame import Frame
 from gcd_node.stream_context import choose_fps
-from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder
+from gcd_node.window import FrameWindow, PartialWindow, WindowBuilder, WindowSlot, read
 
 
 def run(
@@ -38,14 +42,10 @@ def test_every_frame_is_a_window_of_one_at_once(spread: float) -> None:
     for frame in jittered(60, 10.0, spread):
         (window,) = builder.push(frame, frame.stamp_ns + 5)
         assert window.stamps_ns == (frame.stamp_ns,)
-
-
-@pytest.mark.parametrize("source_fps", [24.0, 30.0, 60.0])
-def test_windows_of_one_frame_keep_a_lower_rate(source_fps: float) -> None:
-    windows = run(WindowBuilder(frames=1, fps=10.0, source_fps=source_fps), even(int(10 * source_fps), source_fps))
-    assert len(windows) == pytest.approx(100, abs=1)
-    steps_ms = np.diff([window.stamps_ns[0] for window in windows]) / 1e6
-    assert steps_ms.max() <= 100 + 1000 / source_fps
+    for source_fps in (24.0, 30.0, 60.0):  # they keep a lower rate
+        windows = run(WindowBuilder(frames=1, fps=10.0, source_fps=source_fps), even(int(10 * source_fps), source_fps))
+        assert len(windows) == pytest.approx(100, abs=1)
+        assert np.diff([window.stamps_ns[0] for window in windows]).max() / 1e6 <= 100 + 1000 / source_fps
 
 
 def test_a_camera_that_was_silent_is_no_clock_that_was_set() -> None:
@@ -58,16 +58,9 @@ def test_a_camera_that_was_silent_is_no_clock_that_was_set() -> None:
     assert builder.reasons["CLOCK_STEP"] == 2
 
 
-@pytest.mark.parametrize("fps", [5.0, 24.0, 30000 / 1001])
-def test_at_the_trained_rate_every_frame_is_used_once(fps: float) -> None:
-    windows = run(WindowBuilder(frames=14, fps=fps, source_fps=fps), even(42, fps))
-    assert seqs(windows) == list(range(42))
-    assert [window.window_id for window in windows] == [0, 1, 2]
-
-
-@pytest.mark.parametrize("source_fps", [24000 / 1001, 24.1, 23.9])
-def test_nearly_the_trained_rate_uses_every_frame_once_however_long_the_stream(source_fps: float) -> None:
-    builder = WindowBuilder(frames=14, fps=24.0, source_fps=source_fps)
+@pytest.mark.parametrize(("source_fps", "fps"), [(24000 / 1001, 24.0), (24.1, 24.0), (23.9, 24.0), (5.0, 5.0)])
+def test_at_the_trained_rate_or_nearly_every_frame_is_used_once(source_fps: float, fps: float) -> None:
+    builder = WindowBuilder(frames=14, fps=fps, source_fps=source_fps)
     windows = run(builder, even(14 * 300, source_fps))
     assert seqs(windows) == list(range(14 * 300))
     assert builder.reasons == {}
@@ -118,7 +111,7 @@ def test_what_a_window_holds_so_far_is_how_the_whole_one_will_begin(stride: int)
         seen.append(builder.filling)
 
 
-def test_a_window_carries_pictures_stamps_and_arrival() -> None:
+def test_a_window_carries_pictures_stamps_and_arrival_and_only_its_frames_are_fitted() -> None:
     frames = even(8, 10.0, first_ms=50.0)
     window = run(WindowBuilder(frames=4, fps=10.0), frames)[1]
     assert window.images.shape == (4, 2, 4, 3)
@@ -126,9 +119,6 @@ def test_a_window_carries_pictures_stamps_and_arrival() -> None:
     assert not window.frames[0].image.flags.writeable
     assert window.stamps_ns == tuple(frame.stamp_ns for frame in frames[4:])
     assert (window.arrival_ns, window.fps, window.epoch, window.dropped) == (frames[7].stamp_ns + 5, 10.0, 0, 0)
-
-
-def test_only_frames_of_a_window_are_fitted_and_each_once() -> None:
     fitted: list[int] = []
 
     def fit(image: np.ndarray) -> np.ndarray:
@@ -172,6 +162,14 @@ def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None
     assert [window.seqs for window in builder.flush()] == [(0, 1, 2, 3)]
     assert builder.flush() == []
 
+    class Hurried(FakeSource):
+        def frames(self) -> Iterator[Frame]:
+            yield from frames
+
+    slot = WindowSlot()
+    read(Hurried(4), WindowBuilder(frames=4, fps=10.0), slot)
+    assert slot.take() is not None  # the reader flushes
+
 
 @pytest.mark.parametrize(
     ("source_fps", "trained", "wanted"),
@@ -186,7 +184,101 @@ def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None
         (17.0, (), (17.0, False)),
     ],
 )
-def test_the_highest_trained_rate_the_source_can_give_is_chosen(
+def test_the_highest_rate_it_can_give_is_chosen(
     source_fps: float, trained: tuple[float, ...], wanted: tuple[float, bool]
 ) -> None:
     assert choose_fps(source_fps, trained) == wanted
+
+
+# The slot between reader and model thread, with real threads; numbers stand for windows where any will do.
+
+GUARD_S = 5.0
+
+
+def started(target: Callable[[], object]) -> threading.Thread:
+    thread = threading.Thread(target=target, daemon=True)
+    thread.start()
+    return thread
+
+
+def joined(thread: threading.Thread) -> None:
+    thread.join(GUARD_S)
+    assert not thread.is_alive(), "a thread hangs"
+
+
+def test_the_newest_item_wins_and_the_rest_is_counted_and_a_lossless_slot_hands_over_all_in_order() -> None:
+    slot = WindowSlot()
+    assert [slot.put(i) for i in range(5)] == [True] * 5
+    assert (slot.take(), slot.dropped) == (4, 4)
+    slot = WindowSlot(lossless=True)
+    giver = started(lambda: ([slot.put(i) for i in range(200)], slot.finish()))
+    assert list(iter(slot.take, None)) == list(range(200))
+    joined(giver)
+    assert slot.dropped == 0
+
+
+@pytest.mark.parametrize("ending", ["close", "finish"])
+def test_who_waits_to_take_or_to_give_is_let_go(ending: str) -> None:
+    empty, full = WindowSlot(), WindowSlot(lossless=True)
+    got: list[int | None] = []
+    answers: list[bool] = []
+    taker = started(lambda: got.append(empty.take()))
+    giver = started(lambda: answers.extend([full.put(1), full.put(2)]))
+    time.sleep(0.05)
+    getattr(empty, ending)()
+    full.close()
+    joined(taker)
+    joined(giver)
+    assert (got, answers) == ([None], [True, False])
+    assert full.closed
+    assert full.take() is None
+
+
+def test_who_waits_works_meanwhile_until_nothing_is_left_to_do_and_again_when_more_is_shown() -> None:
+    slot, left, done, got = WindowSlot(), [2], [], []
+
+    def work() -> bool:
+        if not left[0]:
+            return False
+        left[0] -= 1
+        done.append(left[0])
+        return True
+
+    taker = started(lambda: got.append(slot.take(work)))
+    until(lambda: done == [1, 0])
+    left[0] = 1
+    slot.show(None)
+    until(lambda: done == [1, 0, 0])
+    slot.put(7)
+    joined(taker)
+    assert got == [7]
+
+
+def test_what_is_shown_while_there_is_work_under_way_is_not_lost() -> None:
+    slot, calls = WindowSlot(), []
+
+    def work() -> bool:
+        calls.append(len(calls))
+        if len(calls) == 1:
+            slot.show(None)  # from another thread, just now
+        else:
+            slot.put(7)
+        return False
+
+    assert slot.take(work) == 7
+    assert calls == [0, 1]
+
+
+def test_a_fault_in_the_source_is_not_swallowed_and_closing_is_none() -> None:
+    slot, source = WindowSlot(), Steady()
+    reader = started(lambda: read(source, WindowBuilder(frames=4, fps=10.0, source_fps=10.0), slot))
+    time.sleep(0.05)
+    slot.close()
+    source.close()
+    joined(reader)
+    assert slot.take() is None
+    slot = WindowSlot()
+    read(FakeSource(0, fails=ZeroDivisionError("bug")), WindowBuilder(frames=4, fps=10.0), slot)
+    with pytest.raises(ReaderError) as caught:
+        slot.take()
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
