@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import msgspec
@@ -28,8 +28,8 @@ from gcd_train.data.pairs import PairedClip
 from gcd_train.data.sample import Sample
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.measure import predicted_and_measured as measured
-from gcd_train.evaluation.predictors import CameraPair, Predictor, pixel_rays
-from gcd_train.evaluation.statistics import Selection, Sums, class_counts, scene_sums
+from gcd_train.evaluation.predictors import CameraPair, Predictor, SourceClip, pixel_rays
+from gcd_train.evaluation.statistics import ClipTable, Sums
 from gcd_train.scenes.pair_world import DEPTH_UNIT_M, Orbit, World
 
 SKY, ROAD, TERRAIN = 0, 1, 4
@@ -199,8 +199,21 @@ def _strips(clip: PairedClip) -> dict[str, np.ndarray]:
     return {kind: np.ascontiguousarray(np.concatenate(frames)) for kind, frames in strips.items()}
 
 
-def evaluated(predictors: Sequence[Predictor], clips: PlaneClips, selection: Selection | None = None) -> list[Sums]:
+def seen_of(clip: PairedClip, cameras: CameraPair | None = None, **more: Any) -> SourceClip:
+    """What a predictor gets of a clip; by default from the usual vehicle. more: other fields."""
+    frames, height, width = clip.source.shape[:3]
+    usual = CameraPair.driving(CameraMount(), frames=frames, height=height, width=width)
+    given = {
+        "source": clip.source,
+        "source_depth": clip.source_depth,
+        "source_classes": clip.source_classes,
+        "fps": 10.0,
+    }
+    return SourceClip(cameras=cameras or usual, **(given | more))
+
+
+def evaluated(predictors: Sequence[Predictor], clips: PlaneClips) -> list[Sums]:
     """Figures of each on these pairs."""
     pairs = PairedSet.of(clips, "plane")
     of = [[measured(each, pairs.clip(key), classes=pairs.classes)[1] for key in pairs.keys] for each in predictors]
-    return [scene_sums(records, selection or Selection(), class_counts(records, len(pairs.classes))) for records in of]
+    return [ClipTable.of(records, len(pairs.classes)).scene_sums() for records in of]

@@ -1,7 +1,7 @@
 """Runs that are kept: records, resuming, failures, processes, frames that are read back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,10 +14,11 @@ from typer.testing import CliRunner
 from gcd_train.cli.main import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError, RunError
+from gcd_train.evaluation.baselines import CopySource
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
-from gcd_train.evaluation.galleries import KeptViews, png
+from gcd_train.evaluation.galleries import KeptViews, has_views, png, write_views
 from gcd_train.evaluation.measure import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
-from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
+from gcd_train.evaluation.predictors import Prediction, Predictor, SourceClip, to_pictures
 from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
 
 
@@ -58,8 +59,7 @@ def pairs(count: int = 3, kind: type[PairedSet] = PairedSet) -> PairedSet:
 
 def finished(folder: Path, clips: PairedSet, *methods: Predictor, views: KeptViews = "none") -> Account:
     """The account at the end of a run."""
-    makers = {each.name: lambda each=each: each for each in methods}
-    work = ClipWork(folder=folder, clips=clips, makers=makers, views=views)
+    work = ClipWork(folder=folder, clips=clips, methods={each.name: each for each in methods}, views=views)
     *_, last = measure_all(work)
     return last
 
@@ -203,7 +203,7 @@ def test_workers_take_gpus_in_turn_unless_one_is_named(monkeypatch: pytest.Monke
 def test_processes_find_what_one_finds(tmp_path: Path) -> None:
     clips = PairedSet.of(written(tmp_path / "data", 4))
     for workers in (1, 2):
-        work = ClipWork(folder=tmp_path / str(workers), clips=clips, makers={"copy_source": CopySource})
+        work = ClipWork(folder=tmp_path / str(workers), clips=clips, methods={"copy_source": CopySource()})
         *_, account = measure_all(work, workers=workers)
         assert (account.measured, account.failures) == (4, {})
     for path in records_in(tmp_path / "1"):
@@ -230,6 +230,15 @@ def test_a_clip_without_the_frames_that_are_to_be_kept_is_measured_again(tmp_pat
     next((tmp_path / "run" / "views").rglob("sample_0/0001.png")).unlink()
     account = finished(tmp_path / "run", pairs(2), CopySource(), views="all")
     assert (account.measured, pictures_in(tmp_path / "run")) == (1, pictures_in(tmp_path / "whole"))
+
+
+def test_kept_views_are_those_of_the_last_prediction_alone(tmp_path: Path) -> None:
+    clip = pairs(1).clip("plane-00000000")
+    (draw,) = CopySource().predict(clip.seen).draws
+    for draws in ((draw, draw), (draw,)):
+        write_views(tmp_path, clip, replace(draws[0], more=draws[1:]), "last", ())
+        assert has_views(tmp_path, "last", len(clip.target))
+        assert len(list(tmp_path.glob("sample_*"))) == len(draws)
 
 
 # --- the command ---------------------------------------------------------------------------------------------------

@@ -4,16 +4,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from driving_plane import PlaneClips
+from driving_plane import PlaneClips, seen_of
 
 from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
-from gcd_model.geometry import CameraMount
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
-from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, to_pictures
-from gcd_train.evaluation.statistics import Selection, class_counts, class_iou, scene_sums
+from gcd_train.evaluation.predictors import Prediction, SourceClip, to_pictures
+from gcd_train.evaluation.statistics import ClipTable
 from gcd_train.evaluation.store import ClipRecord
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
@@ -41,13 +40,7 @@ def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
     return HeldOutClip(
         key="plane-0",
         scene="plane",
-        seen=SourceClip(
-            source=clip.source,
-            source_depth=clip.source_depth,
-            source_classes=clip.source_classes,
-            cameras=CameraPair.driving(CameraMount(), frames=FRAMES, height=HEIGHT, width=WIDTH),
-            fps=10.0,
-        ),
+        seen=seen_of(clip),
         target=clip.target,
         target_classes=clip.target_classes if classes else None,
         visible=seen if visible else None,
@@ -110,9 +103,9 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
     wrong = [sum(count for _, label, count in frame if label == NO_CLASS) for frame in counted]
     assert wrong == [2 * WIDTH] * FRAMES
     assert road in {entry[0] for frame in counted for entry in frame if entry[1] == NO_CLASS}
-    found = scene_sums([record], Selection(), class_counts([record], CLASSES))
-    assert math.isnan(class_iou(found.classes[0])[void])
-    assert void not in class_counts([record], CLASSES).common
+    found = ClipTable.of([record], CLASSES).scene_sums()
+    assert math.isnan(found.class_iou()[void])
+    assert void not in found.common
     assert found.value("miou_full") < 1.0
 
 

@@ -48,7 +48,7 @@ def calibrate_command(
         clips, notes = open_clips(ClipOptions(data=data, split=split, limit=limit, seed=seed), model.traits)
         for line in notes:
             say(line)
-        views = SynthesizedViews.of(model, clips, RenderOptions(steps=steps, samples=samples, seed=seed))
+        views = SynthesizedViews.of(lambda: model, clips, RenderOptions(steps=steps, samples=samples, seed=seed))
         if views.paints_classes:
             raise RecipeError(f"{model.traits.name} paints classes, which have no intervals; calibrate one of colours")
         measured, unreadable = _measured(clips, views)

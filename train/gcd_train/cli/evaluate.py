@@ -14,7 +14,7 @@ from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
-from gcd_train.evaluation.plan import EvaluateOptions, planned, run_note
+from gcd_train.evaluation.methods import EvaluateOptions, planned, run_note
 from gcd_train.evaluation.report import make_report
 from gcd_train.evaluation.store import RunKeeper
 
@@ -121,7 +121,7 @@ def _evaluate(options: EvaluateOptions, out: Path, *, views: KeptViews, workers:
         work = ClipWork(
             folder=out.resolve(),
             clips=plan.clips,
-            makers={method.name: method.make for method in plan.methods},
+            methods={method.name: method for method in plan.methods},
             lpips=None if options.lpips is None else options.lpips.resolve(),
             views=views,
         )

@@ -18,7 +18,7 @@ from gcd_model.config import SemanticClass
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.predictors import Prediction, to_labels
-from gcd_train.evaluation.runs import EvaluatedSet, Method
+from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
 from gcd_train.evaluation.store import RunKeeper
 from gcd_train.files import write_whole
 
@@ -119,9 +119,9 @@ class Strip:
         return cls(name=name, frames=dict(enumerate(frames)))
 
 
-def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tuple[str, ...]:
+def shown_clips(of: EvaluatedSet, methods: Sequence[MethodRecords], count: int) -> tuple[str, ...]:
     """So many clips whose frames were kept, evenly among them; one of a scene before a second of another."""
-    kept = [key for key in of.keys if any(_folder(method, key).is_dir() for method in methods)]
+    kept = [key for key in of.clips if any(_folder(method, key).is_dir() for method in methods)]
     scenes = {record.key: record.scene for method in methods for record in method.records}
     first = list({scenes.get(key, key): key for key in reversed(kept)}.values())[::-1]
     chosen = first if len(first) >= count else kept
@@ -129,7 +129,7 @@ def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tupl
     return tuple(chosen[place] for place in places)
 
 
-def strips(methods: Sequence[Method], key: str) -> tuple[Strip, ...]:
+def strips(methods: Sequence[MethodRecords], key: str) -> tuple[Strip, ...]:
     """Source, each method that kept frames of this clip, target; class maps beside the pictures they belong to.
 
     Raises DataError for a damaged picture.
@@ -186,7 +186,7 @@ def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
     return True
 
 
-def _folder(method: Method, key: str) -> Path:
+def _folder(method: MethodRecords, key: str) -> Path:
     return RunKeeper(method.folder).views(method.name, key)
 
 

@@ -2,8 +2,8 @@
 
 import io
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gcd_train.errors import RenderError
-from gcd_train.evaluation.runs import EvaluatedSet, Method
-from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval, Selection
-from gcd_train.evaluation.store import ClipRecord, Region
-from gcd_train.evaluation.tables import Cell, csv_text
+from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
+from gcd_train.evaluation.statistics import FIRST_MEASURED, FigureName, Interval
+from gcd_train.evaluation.store import Region
+from gcd_train.evaluation.tables import csv_text, numbers
 from gcd_train.files import write_whole
 
 if TYPE_CHECKING:
@@ -67,31 +67,18 @@ class Point:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Curve:
-    """One line of a plot."""
-
-    name: str
-    points: tuple[Point, ...]
-
-    @classmethod
-    def of(cls, name: str, points: Iterable[Point]) -> "Curve":
-        """Of the points whose figure is known."""
-        return cls(name=name, points=tuple(point for point in points if point.y.known))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Plot:
-    """name: of its files. title, across, up: what it shows. levels: lines right across, of what has no x.
+    """name: of its files. title, across, up: what it shows. curves: points by the name of their line.
 
-    counted: x are whole numbers, of frames or views.
+    levels: lines right across, of what has no x. counted: x are whole numbers, of frames or views.
     """
 
     name: str
     title: str
     across: str
     up: str
-    curves: tuple[Curve, ...]
-    levels: tuple[Curve, ...] = ()
+    curves: dict[str, list[Point]]
+    levels: dict[str, Point] = field(default_factory=dict[str, Point])
     counted: bool = False
 
 
@@ -101,44 +88,53 @@ def all_plots(of: EvaluatedSet) -> tuple[Plot, ...]:
     return tuple(plot for plot in made if plot.curves)
 
 
+def _curves(curves: Mapping[str, Iterable[Point]], least: int = 1) -> dict[str, list[Point]]:
+    """Those of so many points or more whose figure is known, and these."""
+    known = {name: [point for point in points if point.y.known] for name, points in curves.items()}
+    return {name: points for name, points in known.items() if len(points) >= least}
+
+
 def error_by_angle(of: EvaluatedSet) -> Plot:
     """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; no curve on one path for all.
 
     Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
     """
-    curves, last = list[Curve](), Selection(frames="last")
+    curves: dict[str, list[Point]] = {}
     for method in of.methods:
-        turned = [(record, abs(record.change[0])) for record in method.records if record.change is not None]
-        groups: dict[float, list[ClipRecord]] = {}
-        for (record, _), place in zip(turned, angle_bins([angle for _, angle in turned]), strict=True):
-            groups.setdefault(place, []).append(record)
-        sums = {place: of.sums(method, last, groups[place]) for place in sorted(groups)}
-        points = [Point(x=x, y=each.interval("psnr_db"), clips=len(groups[x])) for x, each in sums.items()]
-        curves.append(Curve.of(method.name, points))
+        turned = {record.key: abs(record.change[0]) for record in method.records if record.change is not None}
+        groups: dict[float, list[str]] = {}
+        for key, place in zip(turned, angle_bins(list(turned.values())), strict=True):
+            groups.setdefault(place, []).append(key)
+        curves[method.name] = [
+            Point(x=x, y=method.sums("last", keys=groups[x]).interval("psnr_db"), clips=len(groups[x]))
+            for x in sorted(groups)
+        ]
     return Plot(
         name="psnr_by_angle",
         title="Last frame, all pixels",
         across="azimuth turned by, degrees",
         up="PSNR, dB",
-        curves=tuple(curve for curve in curves if len(curve.points) > 1),
+        curves=_curves(curves, least=2),
     )
 
 
 def psnr_by_frame(of: EvaluatedSet) -> Plot:
     """PSNR of each frame from the second on, all pixels; mIoU where there are only class maps."""
     pictures = [method for method in of.methods if method.makes_pictures]
-    name: FigureName = "psnr_db" if pictures else "miou_common"
+    figure: FigureName = "psnr_db" if pictures else "miou_common"
     frames = range(FIRST_MEASURED + 1, of.note.frames + 1)
-    curves = [
-        Curve.of(method.name, (_point(of, method, Selection(frames=frame), name, frame) for frame in frames))
+    curves = {
+        method.name: [
+            Point(x=frame, y=method.sums(frame).interval(figure), clips=len(method.records)) for frame in frames
+        ]
         for method in pictures or of.methods
-    ]
+    }
     return Plot(
         name="by_frame",
         title="Each frame, all pixels",
         across="frame",
         up="PSNR, dB" if pictures else "mIoU",
-        curves=tuple(curve for curve in curves if len(curve.points) > 1),
+        curves=_curves(curves, least=2),
         counted=True,
     )
 
@@ -148,43 +144,34 @@ def ssim_by_views(of: EvaluatedSet) -> Plot:
 
     Source: GCD, section 5: how many input views a reconstruction needs to come near.
     """
-    found = {method.name: _HEXPLANE.search(method.name) for method in of.methods}
-    views = sorted((int(match[1]), name) for name, match in found.items() if match)
+    views = {method.name: int(m[1]) for method in of.methods if (m := _HEXPLANE.search(method.name))}
+    given = sorted((method for method in of.methods if method.name in views), key=lambda m: (views[m.name], m.name))
+
+    def point(method: MethodRecords, region: Region) -> Point:
+        y = method.sums(region=region).interval("ssim")
+        return Point(x=views.get(method.name, 0), y=y, clips=len(method.records))
+
     regions: tuple[Region, ...] = ("all", "occluded")
-    curves = [
-        Curve.of(
-            f"HexPlane, {region}",
-            (_point(of, of.method(name), Selection(region=region), "ssim", x) for x, name in views),
-        )
-        for region in regions
-    ]
-    levels = [
-        Curve(name=f"{method.name}, all", points=(_point(of, method, Selection(), "ssim", 0.0),))
-        for method in of.methods
-        if not found[method.name] and method.makes_pictures
-    ]
     return Plot(
         name="ssim_by_views",
         title="HexPlane, frames 2 to the last",
         across="views given",
         up="SSIM",
-        curves=tuple(curve for curve in curves if curve.points),
-        levels=tuple(levels),
+        curves=_curves({f"HexPlane, {region}": [point(method, region) for method in given] for region in regions}),
+        levels={
+            f"{method.name}, all": point(method, "all")
+            for method in of.methods
+            if method.name not in views and method.makes_pictures
+        },
         counted=True,
     )
 
 
-def _point(of: EvaluatedSet, method: Method, selection: Selection, name: FigureName, x: float) -> Point:
-    return Point(x=x, y=of.sums(method, selection).interval(name), clips=len(method.records))
-
-
 def curves_csv(plot: Plot) -> str:
     """One point a line; levels have no x."""
-    lines = [
-        [curve.name, "" if curve in plot.levels else f"{point.x:g}", *Cell(figure=point.y).numbers(), str(point.clips)]
-        for curve in (*plot.curves, *plot.levels)
-        for point in curve.points
-    ]
+    points = [(name, f"{point.x:g}", point) for name, curve in plot.curves.items() for point in curve]
+    points += [(name, "", point) for name, point in plot.levels.items()]
+    lines = [[name, x, *numbers(point.y), str(point.clips)] for name, x, point in points]
     return csv_text(["method", plot.across, plot.up, "low", "high", "clips"], lines)
 
 
@@ -207,19 +194,19 @@ def draw(plot: Plot, out: Path) -> None:
     from matplotlib.ticker import FixedLocator, MaxNLocator
 
     axes = figure.add_subplot()
-    for number, curve in enumerate(plot.curves):
-        x, y = [point.x for point in curve.points], [point.y.value for point in curve.points]
-        bounds = np.array([(each.value - each.low, each.high - each.value) for each in (p.y for p in curve.points)])
+    for number, (name, curve) in enumerate(plot.curves.items()):
+        x, y = [point.x for point in curve], [point.y.value for point in curve]
+        bounds = np.array([(each.value - each.low, each.high - each.value) for each in (point.y for point in curve)])
         yerr, mark = np.nan_to_num(bounds).clip(0.0).T, _MARKS[number % len(_MARKS)]
         style: dict[str, Any] = {"marker": mark, "color": f"C{number % 10}", "markersize": 4, "linewidth": 1.2}
-        axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=curve.name, **style)
-    for number, level in enumerate(plot.levels, start=len(plot.curves)):
-        axes.axhline(level.points[0].y.value, linestyle="--", linewidth=1.0, color=f"C{number % 10}", label=level.name)
+        axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=name, **style)
+    for number, (name, level) in enumerate(plot.levels.items(), start=len(plot.curves)):
+        axes.axhline(level.y.value, linestyle="--", linewidth=1.0, color=f"C{number % 10}", label=name)
     axes.set_title(plot.title, fontsize=10, loc="left")
     axes.set_xlabel(plot.across)
     axes.set_ylabel(plot.up)
     if plot.counted:
-        places = sorted({point.x for curve in plot.curves for point in curve.points})
+        places = sorted({point.x for curve in plot.curves.values() for point in curve})
         few = len(places) <= _MOST_TICKS
         axes.xaxis.set_major_locator(FixedLocator(places) if few else MaxNLocator(integer=True))
         if len(places) == 1:

@@ -9,7 +9,7 @@ from gcd_train.errors import RecipeError, RunError
 from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
 from gcd_train.evaluation.paper import is_model, tables_for
 from gcd_train.evaluation.plots import all_plots, curves_csv, draw, require_matplotlib
-from gcd_train.evaluation.runs import EvaluatedSet, Method, Run, gather, on_the_same_goals
+from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
 from gcd_train.evaluation.statistics import FEW_SCENES, SEED, Span
 from gcd_train.evaluation.store import folder_name
 from gcd_train.evaluation.tables import (
@@ -64,20 +64,26 @@ def make_report(
     runs = tuple(Run.read(folder) for folder in folders)
     sets = gather(runs, rows)
     _require_choices(leads, rows or {}, sets)
-    pages = [_first_page(runs, command)]
-
-    def writer(of: EvaluatedSet, place: str) -> _Writer:
-        return _Writer(of=of, out=out, place=place, chosen=tuple(leads), clips=clips, drawn=drawn)
-
+    pages = ["# Report", *([f"```bash\n{command}\n```"] if command else [])]
+    pages.append(f"Intervals: 95 %, 10 000 draws of scenes, seed {SEED}.")
+    pages += map(_about, runs)
     for number, each in enumerate(sets, start=1):
-        place = "." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}"
-        pages.append("\n".join(writer(each, place).sections()))
+        place = Path("." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}")
+        writer = _Writer(of=each, out=out, place=place, chosen=tuple(leads))
+        spans: tuple[Span, ...] = ("all", *_SPANS) if each.note.protocol == "release" else _SPANS
+        pages += [f"## {each.title}", *writer.tables(spans), *writer.differences(spans)]
+        pages += [*writer.plots(drawn), *writer.gallery(clips)]
     joined, notes = on_the_same_goals(sets)
     for number, each in enumerate(joined, start=1):
-        pages.append("\n".join(writer(each, f"last-frame-{number}").last_frames()))
+        writer = _Writer(of=each, out=out, place=Path(f"last-frame-{number}"), chosen=tuple(leads))
+        pages.append(f"## The last frame together: {each.title}")
+        pages.append(
+            "Clips of the same names end at the same goals here, so their last frames are comparable and no others."
+        )
+        pages += [*map(writer.table, main_tables(each, ("last",))), *writer.differences(("last",))]
     if notes:
-        pages.append("\n".join(["## What is not compared\n", *(f"- {note}" for note in notes)]))
-    write_whole(out / "report.md", ("\n".join(pages).rstrip() + "\n").encode())
+        pages += ["## What is not compared", "\n".join(f"- {note}" for note in notes)]
+    write_whole(out / "report.md", ("\n\n".join(page.rstrip("\n") for page in pages) + "\n").encode())
     return out / "report.md"
 
 
@@ -99,20 +105,9 @@ def _require_choices(leads: Sequence[str], rows: Mapping[str, str], sets: Sequen
             raise RecipeError(f"--row {method}: no row is called {label!r}; there are {'; '.join(labels)}")
 
 
-def _first_page(runs: Sequence[Run], command: str) -> str:
-    """What the figures were made by: commands, seeds, digests."""
-    lines = ["# Report", ""]
-    if command:
-        lines += ["```bash", command, "```", ""]
-    lines += [f"Intervals: 95 %, 10 000 draws of scenes, seed {SEED}.", ""]
-    for run in runs:
-        lines += [f"## Run {run.folder.name}", "", "```bash", run.note.command, "```", "", *_note_lines(run), ""]
-    return "\n".join(lines)
-
-
-def _note_lines(run: Run) -> list[str]:
+def _about(run: Run) -> str:
+    """What the figures of a run were made by: command, seeds, digests."""
     note = run.note
-    versions = ", ".join(f"{name} {version}" for name, version in note.versions.items())
     seconds: dict[str, list[float]] = {name: [] for name in note.methods}
     for record in run.records:
         seconds.setdefault(record.method, []).append(record.seconds)
@@ -121,12 +116,13 @@ def _note_lines(run: Run) -> list[str]:
             name,
             str(len(seconds[name])),
             f"{fmean(seconds[name]):.2f}" if seconds[name] else NOTHING,
-            ", ".join(f"{key} {value}" for key, value in told.items()),
+            ", ".join(f"{key} {value}" for key, value in details.items()),
         ]
-        for name, told in note.methods.items()
+        for name, details in note.methods.items()
     ]
     lines = [
-        f"- made: {note.made}, {versions}",
+        f"## Run {run.folder.name}\n\n```bash\n{note.command}\n```\n",
+        f"- made: {note.made}, {', '.join(f'{name} {version}' for name, version in note.versions.items())}",
         f"- clips: {', '.join(note.data)}, digest {note.data_identity}",
         f"- protocol: {note.protocol}, seed {note.seed}",
         f"- size: {note.frames} frames of {note.width}x{note.height}",
@@ -136,119 +132,83 @@ def _note_lines(run: Run) -> list[str]:
     without = [name for name in note.methods if not seconds[name]]
     if without:
         why = "No clip was measured; the line of `gcd-train evaluate` says why."
-        lines += ["", f"**Failed: {', '.join(without)}. {why}**"]
-    return lines
+        lines.append(f"\n**Failed: {', '.join(without)}. {why}**")
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Writer:
-    """One set's part of the report. place: its folder within `out`. chosen, clips, drawn: see `make_report`."""
+    """One set's part of the report, as paragraphs; its files are written on the way.
+
+    place: its folder within `out`. chosen: see `make_report`.
+    """
 
     of: EvaluatedSet
     out: Path
-    place: str
+    place: Path
     chosen: tuple[str, ...]
-    clips: int
-    drawn: bool
 
-    @property
-    def leads(self) -> tuple[Method, ...]:
-        """The methods that are compared with all others; those of the choice that the set has."""
-        if self.chosen:
-            return tuple(method for name in self.chosen for method in self.of.methods if method.name == name)
-        models = tuple(method for method in self.of.methods if is_model(method.name, method.details))
-        return models or self.of.methods[:1]
+    def table(self, table: Table) -> str:
+        return f"{to_markdown(table)}\n{self._written(f'tables/{table.name}.csv', to_csv(table))}"
 
-    def sections(self) -> Iterator[str]:
-        spans: tuple[Span, ...] = ("all", *_SPANS) if self.of.note.protocol == "release" else _SPANS
-        yield f"## {self.of.title}\n"
-        yield from self._tables(spans)
-        yield from self._differences(spans)
-        yield from self._plots()
-        yield from self._gallery()
-
-    def last_frames(self) -> Iterator[str]:
-        """Only what the last frame tells, of methods that go there in different ways."""
-        yield f"## The last frame together: {self.of.title}\n"
-        yield "Clips of the same names end at the same goals here, so their last frames are comparable and no others.\n"
-        yield from map(self._table, main_tables(self.of, ("last",)))
-        yield from self._differences(("last",))
-
-    def _table(self, table: Table) -> str:
-        self._write(f"tables/{table.name}.csv", to_csv(table))
-        return f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
-
-    def _tables(self, spans: Sequence[Span]) -> Iterator[str]:
-        yield from map(self._table, main_tables(self.of, spans))
-        yield self._table(region_table(self.of, spans[0]))
+    def tables(self, spans: Sequence[Span]) -> Iterator[str]:
+        yield from map(self.table, main_tables(self.of, spans))
+        yield self.table(region_table(self.of, spans[0]))
         if any(method.makes_classes for method in self.of.methods):
-            yield self._table(class_table(self.of, spans[0]))
-        self._write("tables/figures.csv", all_figures(self.of))
-        self._write("tables/clips.csv", clips_csv(self.of))
-        yield (
-            f"All figures with their intervals: {self._link('tables/figures.csv')}; "
-            f"clip by clip: {self._link('tables/clips.csv')}.\n"
-        )
+            yield self.table(class_table(self.of, spans[0]))
+        figures = self._written("tables/figures.csv", all_figures(self.of))
+        by_clip = self._written("tables/clips.csv", clips_csv(self.of))
+        yield f"All figures with their intervals: {figures}; clip by clip: {by_clip}."
 
-    def _differences(self, spans: Sequence[Span]) -> Iterator[str]:
-        every: list[Difference] = []
+    def differences(self, spans: Sequence[Span]) -> Iterator[str]:
+        """Of the chosen methods that the set has, else of its models, else of its first, from all others."""
+        methods, every = self.of.methods, list[Difference]()
+        leads = tuple(method for name in self.chosen for method in methods if method.name == name)
+        if not self.chosen:
+            leads = tuple(method for method in methods if is_model(method.name, method.details)) or methods[:1]
         for frames in spans:
-            told = frames_told(self.of, frames)
-            for lead in self.leads:
-                found = differences(self.of, lead, frames)
+            for lead in leads:
+                others = (other for other in methods if other.name != lead.name)
+                found = [each for other in others for each in differences(lead, other, frames)]
                 every += found
                 if found:
-                    yield f"### {lead.starred} against the others, {told}\n"
+                    yield f"### {lead.starred} against the others, {frames_told(self.of, frames)}"
                     yield differences_markdown(found, self.of)
         if every:
-            self._write("tables/differences.csv", differences_csv(every))
             yield (
                 "How far it lies above the other on the same clips; bold where zero lies outside the 95 % interval, "
-                f"which is paired over scenes. {self._link('tables/differences.csv')}\n"
+                f"which is paired over scenes. {self._written('tables/differences.csv', differences_csv(every))}"
             )
         if any(each.starred for each in every):
-            yield f"{STAR_OF_FIGURE}\n"
+            yield STAR_OF_FIGURE
         if every and self.of.scenes < FEW_SCENES:
-            yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold.\n"
+            yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold."
 
-    def _plots(self) -> Iterator[str]:
+    def plots(self, drawn: bool) -> Iterator[str]:
         for plot in all_plots(self.of):
-            self._write(f"plots/{plot.name}.csv", curves_csv(plot))
-            if self.drawn:
-                told = f"{plot.up} by {plot.across}"
-                draw(plot, self._path(f"plots/{plot.name}.png"))
-                yield f"### {plot.title}: {told}\n\n![{told}]({self._name(f'plots/{plot.name}.png')})\n"
-            yield f"The numbers: {self._link(f'plots/{plot.name}.csv')}\n"
+            numbers = self._written(f"plots/{plot.name}.csv", curves_csv(plot))
+            if drawn:
+                shown, picture = f"{plot.up} by {plot.across}", self.place / f"plots/{plot.name}.png"
+                draw(plot, self.out / picture)
+                yield f"### {plot.title}: {shown}\n\n![{shown}]({picture})"
+            yield f"The numbers: {numbers}"
 
-    def _gallery(self) -> Iterator[str]:
-        if not self.clips:
-            return
-        keys = shown_clips(self.of, self.of.methods, self.clips)
+    def gallery(self, count: int) -> Iterator[str]:
+        """A sheet of so many clips, and a video of each."""
+        keys = shown_clips(self.of, self.of.methods, count) if count else ()
+        if count and not keys:
+            yield "No frames were kept, so there is no gallery: evaluate with `--views few`."
         if not keys:
-            yield "No frames were kept, so there is no gallery: evaluate with `--views few`.\n"
             return
-        yield "### Gallery\n"
-        yield from self._shown("gallery", keys)
+        clips, sheet = [(key, strips(self.of.methods, key)) for key in keys], self.place / "gallery/sheet.png"
+        write_sheet(clips, self.out / sheet)
+        yield f"### Gallery\n\n![{', '.join(keys)}]({sheet})"
+        files = {key: self.place / f"gallery/{folder_name(key)}.mp4" for key in keys}
+        made = [files[key] for key, rows in clips if write_video(rows, self.of.clips[key].fps, self.out / files[key])]
+        if made:
+            yield f"Videos: {', '.join(f'[{file.name}]({file})' for file in made)}"
 
-    def _shown(self, folder: str, keys: Sequence[str]) -> Iterator[str]:
-        """A sheet of clips, and a video of each."""
-        clips = [(key, strips(self.of.methods, key)) for key in keys]
-        write_sheet(clips, self._path(f"{folder}/sheet.png"))
-        yield f"![{', '.join(keys)}]({self._name(f'{folder}/sheet.png')})\n"
-        names = {key: f"{folder}/{folder_name(key)}.mp4" for key in keys}
-        made = {names[key]: write_video(rows, self.of.clips[key].fps, self._path(names[key])) for key, rows in clips}
-        videos = [self._link(name) for name, done in made.items() if done]
-        if videos:
-            yield f"Videos: {', '.join(videos)}\n"
-
-    def _name(self, name: str) -> str:
-        return name if self.place == "." else f"{self.place}/{name}"
-
-    def _path(self, name: str) -> Path:
-        return self.out / self._name(name)
-
-    def _link(self, name: str) -> str:
-        return f"[{Path(name).name}]({self._name(name)})"
-
-    def _write(self, name: str, text: str) -> None:
-        write_whole(self._path(name), text.encode())
+    def _written(self, name: str, text: str) -> str:
+        """Write a file; gives the link to it."""
+        write_whole(self.out / self.place / name, text.encode())
+        return f"[{Path(name).name}]({self.place / name})"
