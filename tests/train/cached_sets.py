@@ -64,7 +64,7 @@ def tiny_identity(**changes: object) -> CacheIdentity:
         "width": WIDTH,
         "scale": 0.18215,
     }
-    return CacheIdentity(**(told | changes))  # pyright: ignore[reportArgumentType]
+    return CacheIdentity(**(told | changes))
 
 
 # a child that kills itself at the n-th time something settles on the disk

@@ -179,8 +179,6 @@ class PlaneClips:
 
 def _told(path: Trajectory) -> bytes:
     start, goal = path.source, path.goal_delta
-    assert start is not None
-    assert goal is not None
     orbit = Orbit(
         start=(start.azimuth_deg, start.elevation_deg, start.radius_m),
         change=(goal.azimuth_deg, goal.elevation_deg, goal.radius_m),

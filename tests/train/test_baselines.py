@@ -56,8 +56,6 @@ def agreement(video: torch.Tensor, target: torch.Tensor, seen: torch.Tensor) -> 
 def test_the_ground_homography_gives_the_picture_of_a_plane_drawn_by_rays(mount: CameraMount) -> None:
     clip = plane_clip(cameras(mount))
     made = GroundHomography().predict(seen_of(clip, cameras(mount)))
-    assert made.video is not None
-    assert made.classes is not None
     there = ground_grid(cameras(mount))[1]
     assert not made.video[~there[:, None].expand_as(made.video)].any()
     assert (made.classes[~there] == NO_CLASS).all()
@@ -79,7 +77,6 @@ def test_on_a_plane_that_a_camera_orbits_the_ground_homography_gives_what_rays_d
     clip = plane_clip(pair)
     made = GroundHomography().predict(seen_of(clip, pair, source_classes=None))
     assert made.classes is None
-    assert made.video is not None
     seen = ground_grid(pair)[1] & near_ground(clip)
     share, error = agreement(made.video, to_pictures(clip.target), seen)
     assert share > 0.3
@@ -101,7 +98,6 @@ def picture() -> torch.Tensor:
 
 def picture_of(clip: SourceClip) -> torch.Tensor:
     made = ReprojectRgbd().predict(clip)
-    assert made.video is not None
     assert made.classes is None
     return made.video
 
@@ -109,7 +105,6 @@ def picture_of(clip: SourceClip) -> torch.Tensor:
 def classes(clip: SourceClip = SEEN) -> torch.Tensor:
     made = ReprojectSemd(classes=CLASSES).predict(clip)
     assert made.video is None
-    assert made.classes is not None
     return made.classes
 
 
@@ -189,8 +184,6 @@ class Told:
         self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
     ) -> SourceFeatures:
         self.clips.append(clip)
-        assert augmentation is not None
-        assert augmentation.noise is not None
         assert augmentation.noise.shape == clip.video.shape
         latents = clip.video.mean(dim=1, keepdim=True).expand(-1, 4, -1, -1)
         return SourceFeatures(tokens=None, latents=latents, extra=None, fps=clip.fps, augmentation=0.02)
@@ -201,7 +194,6 @@ class Told:
         trajectories: Sequence[Trajectory],
         options: RenderOptions | None = None,
     ) -> list[View]:
-        assert options is not None
         self.features.append(features)
         self.options.append(options)
         assert torch.equal(trajectories[0].source_from_target[-1], torch.eye(4, dtype=torch.float64))
@@ -216,9 +208,7 @@ def told(opened: VanillaSVD) -> Told:
 
 
 def video(baseline: VanillaSVD, clip: SourceClip) -> torch.Tensor:
-    made = baseline.predict(clip).video
-    assert made is not None
-    return made
+    return baseline.predict(clip).video
 
 
 def test_the_published_layout_gives_a_video_of_the_clips_size_and_length(opened: VanillaSVD) -> None:
@@ -270,7 +260,7 @@ def test_the_network_is_told_what_was_published(told: Told) -> None:
 def named(*names: str, of: PairedSet | None = None, **options: object) -> tuple[Predictor, ...]:
     """These baselines, by default of pairs with classes; the usual ones where none are named."""
     clips = of or PairedSet.of(PlaneClips.make(1), "plane")
-    return baselines(names or None, clips, EvaluateOptions(data=(), device="cpu", **options))  # pyright: ignore[reportArgumentType]
+    return baselines(names or None, clips, EvaluateOptions(data=(), device="cpu", **options))
 
 
 def test_the_usual_baselines_are_those_that_the_clips_have_enough_for() -> None:

@@ -16,10 +16,11 @@ from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.baselines import CopySource
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
-from gcd_train.evaluation.galleries import KeptViews, has_views, png, write_views
+from gcd_train.evaluation.galleries import KeptViews, has_views, write_views
 from gcd_train.evaluation.measure import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.predictors import Prediction, Predictor, SourceClip, to_pictures
 from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
+from gcd_train.pictures import png
 
 
 @dataclass

@@ -125,9 +125,7 @@ def test_the_cube_stands_where_cameras_of_an_orbit_look() -> None:
 
 def made(method: HexPlane) -> Tensor:
     """The held-out view, [T, 3, H, W]."""
-    prediction = method.predict(source_clip()).video
-    assert prediction is not None
-    return prediction
+    return method.predict(source_clip()).video
 
 
 @pytest.fixture(scope="module")

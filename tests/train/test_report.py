@@ -20,8 +20,7 @@ from gcd_model.weights.load import save_weights
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
-from gcd_train.evaluation.plots import all_plots
-from gcd_train.evaluation.report import make_report
+from gcd_train.evaluation.report import all_plots, make_report
 from gcd_train.evaluation.runs import EvaluatedSet, Run, gather, on_the_same_goals
 from gcd_train.evaluation.store import ClipRecord, RunKeeper, RunNote
 from gcd_train.evaluation.tables import (
@@ -48,7 +47,7 @@ def records(method: str, shift: float = 0.0) -> list[ClipRecord]:
             "occluded": region((None, *(15.0 + scene + shift,) * (FRAMES - 1))),
         }
         change = (15.0 * scene * (-1) ** sample, 5.0, 0.0)
-        made.append(record(method, f"scn{scene:05d}.sample_{sample:02d}", regions=regions, change=change))  # pyright: ignore[reportArgumentType]
+        made.append(record(method, f"scn{scene:05d}.sample_{sample:02d}", regions=regions, change=change))
     return made
 
 
@@ -59,7 +58,7 @@ def two(method: str, *, draws: int = 1, classes: bool = False) -> list[ClipRecor
         name: region((value,) * FRAMES, draws=draws, counts=counts)
         for name, value in {"all": 20.0, "visible": 30.0, "occluded": 10.0}.items()
     }
-    return [record(method, f"scn{n:05d}.sample_00", regions=regions, draws=draws) for n in range(2)]  # pyright: ignore[reportArgumentType]
+    return [record(method, f"scn{n:05d}.sample_00", regions=regions, draws=draws) for n in range(2)]
 
 
 def run(note_: RunNote, *methods: Sequence[ClipRecord], folder: str = "run") -> Run:
@@ -68,7 +67,7 @@ def run(note_: RunNote, *methods: Sequence[ClipRecord], folder: str = "run") -> 
 
 def measured(*methods: Sequence[ClipRecord], **more: object) -> EvaluatedSet:
     names = {each[0].method: COPIED if each[0].method == "copy_source" else WEIGHTS for each in methods}
-    (found,) = gather([run(note(methods=names, **more), *methods)])  # pyright: ignore[reportArgumentType]
+    (found,) = gather([run(note(methods=names, **more), *methods)])
     return found
 
 
@@ -76,7 +75,7 @@ def kept(folder: Path, *methods: Sequence[ClipRecord], **more: object) -> Path:
     """A run on the disk."""
     keeper = RunKeeper(folder)
     names = {each[0].method: COPIED if each[0].method == "copy_source" else WEIGHTS for each in methods}
-    keeper.begin(note(methods=names, **more))  # pyright: ignore[reportArgumentType]
+    keeper.begin(note(methods=names, **more))
     for each in (each for method in methods for each in method):
         keeper.keep(each)
     return folder
@@ -348,7 +347,6 @@ def test_a_report_is_written_from_records_and_kept_frames(tmp_path: Path) -> Non
     }
     assert figures["copy_source", "last", "occluded", "psnr_db"] == pytest.approx(14.0 + 2.5)
     sheet = cv2.imread(str(out / "gallery" / "sheet.png"))
-    assert sheet is not None
     height = 3 * 14 + 4  # of a row: its label's three lines, as these pictures are lower, and a gap
     assert sheet.shape == (2 * 4 * height, 140 + FRAMES * (47 + 4), 3)
     assert [int(sheet[row * height, 141, 0]) for row in range(4)] == [10, 60, 120, 200]

@@ -14,7 +14,6 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
-from gcd_model.geometry import CameraMount
 from gcd_model.weights.load import inspect_weights
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.errors import DataError
@@ -27,7 +26,7 @@ from gcd_train.evaluation.calibration import (
     miscoverage,
 )
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip
+from gcd_train.evaluation.predictors import Prediction
 
 T, H, W = 4, 48, 64
 
@@ -35,14 +34,7 @@ T, H, W = 4, 48, 64
 def held_out(target: Tensor, *, scene: str = "a", visible: np.ndarray | None = None) -> HeldOutClip:
     """target: [T, 3, H, W] in [0, 1]."""
     pictures = (target * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).numpy()
-    seen = SourceClip(
-        source=pictures,
-        source_depth=np.ones((T, H, W), np.float32),
-        source_classes=None,
-        cameras=CameraPair.driving(CameraMount(), frames=T, height=H, width=W),
-        fps=10.0,
-    )
-    return HeldOutClip(key=f"{scene}-0", scene=scene, seen=seen, target=pictures, visible=visible)
+    return HeldOutClip(key=f"{scene}-0", scene=scene, seen=None, target=pictures, visible=visible)
 
 
 def drawn(*videos: Tensor) -> Prediction:

@@ -36,7 +36,7 @@ def calibrate_command(
         from gcd_train.evaluation.calibration import CalibrationNote, calibrate, write_calibration
         from gcd_train.evaluation.methods import SynthesizedViews
         from gcd_train.evaluation.opening import ClipOptions, open_clips
-        from gcd_train.evaluation.plots import require_matplotlib
+        from gcd_train.pictures import require_matplotlib
 
         require_matplotlib()  # now, not after an hour
         path = None if store is None else _weights_file(weights, store, steps)

@@ -24,12 +24,12 @@ from torch import Tensor
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.metrics import pixel_deviation
-from gcd_train.evaluation.plots import new_figure, save
 from gcd_train.evaluation.predictors import Prediction, to_pictures
 from gcd_train.evaluation.statistics import FEW_SCENES, FIRST_MEASURED
 from gcd_train.evaluation.store import Region
 from gcd_train.evaluation.tables import counted, markdown_rows
 from gcd_train.files import write_whole
+from gcd_train.pictures import new_figure, save
 
 LEVELS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 """Shares of pixels that intervals are meant to hold, 5 % to 95 %."""

@@ -21,6 +21,7 @@ from gcd_train.evaluation.predictors import Prediction, to_labels
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
 from gcd_train.evaluation.store import RunKeeper
 from gcd_train.files import write_whole
+from gcd_train.pictures import png
 
 Pictures = NDArray[np.uint8]
 
@@ -90,13 +91,6 @@ def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:
 def to_bytes(video: Tensor) -> Pictures:
     """float32 [T, 3, H, W] in [0, 1] -> uint8 [T, H, W, 3]."""
     return (video.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
-
-
-def png(picture: Pictures) -> bytes:
-    """A PNG file of an RGB picture, uint8 [H, W, 3]."""
-    done, data = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2BGR))
-    assert done, "PNG takes any picture"
-    return data.tobytes()
 
 
 _GAP, _MARGIN, _INK = 4, 140, (40, 40, 40)
