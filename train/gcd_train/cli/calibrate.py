@@ -90,11 +90,11 @@ def _weights_file(weights: str, store: Path, steps: int | None) -> Path:
     return weights_path(weights)
 
 
-def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Distances], tuple[str, ...]]":
+def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[tuple[str, Distances]], tuple[str, ...]]":
     """Of every clip that can be read; of the others the reason. Raises DataError where none can."""
     from gcd_train.evaluation.calibration import distances
 
-    measured: list[Distances] = []
+    measured: list[tuple[str, Distances]] = []
     unreadable: list[str] = []
     with progress_bar("held-out clips", len(clips.keys)) as show:
         for number, key in enumerate(clips.keys, 1):
@@ -104,7 +104,7 @@ def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Dis
                 unreadable.append(f"{key}: {error}")
                 say(f"left out {key}: {error}")
             else:
-                measured.append(distances(clip, views.predict(clip.seen)))
+                measured.append((clip.scene, distances(clip, views.predict(clip.seen))))
             show(number)
     if not measured:
         raise DataError(f"none of the {len(clips.keys)} clips can be read: {unreadable[0]}")

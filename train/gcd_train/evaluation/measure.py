@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
@@ -153,25 +154,13 @@ GIVE_UP_AFTER = 5
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClipItem:
-    """One clip, and the methods that have no record of it yet, or not the frames that are to be kept."""
-
-    key: str
-    methods: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClipDone:
-    """What became of a clip's methods. measured: how many. failed: name to why there is nothing."""
-
-    measured: int
-    failed: dict[str, str]
+ClipItem: TypeAlias = tuple[str, tuple[str, ...]]
+"""A clip's key, and the methods that have no record of it yet, or not the frames that are to be kept."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipWork:
-    """Measures methods on one clip and keeps the records; goes to other processes whole.
+    """Measures methods on one clip, keeps the records, and says which failed and why; goes to other processes whole.
 
     folder: the run's. methods: all, by name. lpips: folder of the weights, or None. views: frames to keep.
     """
@@ -182,23 +171,24 @@ class ClipWork:
     lpips: Path | None = None
     views: KeptViews = "none"
 
-    def __call__(self, item: ClipItem) -> ClipDone:
+    def __call__(self, item: ClipItem) -> dict[str, str]:
         """Raises: DataError where the clip cannot be read, RunError where nothing can be written."""
-        clip, keeper, views = self.clips.clip(item.key), RunKeeper(self.folder), self._views(item.key)
+        key, methods = item
+        clip, keeper, views = self.clips.clip(key), RunKeeper(self.folder), self._views(key)
         classes, painted, failed = self.clips.classes, self.clips.painted, dict[str, str]()
         lpips = None if self.lpips is None else _opened_lpips(self.lpips)
-        for name in item.methods:
+        for name in methods:
             try:
                 prediction, record = predicted_and_measured(
                     self.methods[name], clip, classes=classes, painted=painted, lpips=lpips
                 )
-                write_views(keeper.views(name, clip.key), clip, prediction, views, classes)
+                write_views(keeper.views(name, key), clip, prediction, views, classes)
                 keeper.keep(record)  # written last: what has a record is whole
             except RunError:
                 raise
             except (TrainError, ModelError) as error:
                 failed[name] = str(error)
-        return ClipDone(measured=len(item.methods) - len(failed), failed=failed)
+        return failed
 
     def missing(self) -> list[ClipItem]:
         """Clips with the methods that have no record of them, or not the frames that are to be kept."""
@@ -210,7 +200,7 @@ class ClipWork:
                 for name in self.methods
                 if not (keeper.has(name, key) and has_views(keeper.views(name, key), views, frames))
             ]
-            items += [ClipItem(key=key, methods=tuple(lacking))] if lacking else []
+            items += [(key, tuple(lacking))] if lacking else []
         return items
 
     def _views(self, key: str) -> KeptViews:
@@ -248,20 +238,19 @@ class Account:
         """Whether too many clips in a row had no record."""
         return self._in_a_row >= GIVE_UP_AFTER
 
-    def add(self, outcome: Outcome[ClipItem, ClipDone]) -> None:
+    def add(self, outcome: Outcome[ClipItem, dict[str, str]]) -> None:
         """Count one clip. Raises RunError where nothing can be written."""
         self._tried += 1
-        key, useful, faults = outcome.item.key, False, dict[str, str]()
+        key, methods = outcome.item
         try:
-            found = outcome.unwrap()
+            failed = outcome.unwrap()
         except TrainError as error:
             if type(error) is RunError:  # and not an item's own
                 raise
-            faults = {key: str(error)}
+            faults, useful = {key: str(error)}, False
         else:
-            faults = {f"{key}, {name}": why for name, why in found.failed.items()}
-            useful = bool(found.measured)
-            self.measured += useful
+            faults, useful = {f"{key}, {name}": why for name, why in failed.items()}, len(failed) < len(methods)
+        self.measured += useful
         self.failures |= faults
         self._in_a_row = self._in_a_row + 1 if faults and not useful else 0
 
