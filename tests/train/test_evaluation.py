@@ -187,7 +187,7 @@ def test_a_model_that_paints_classes_is_compared_by_its_class_map_alone() -> Non
     assert np.isnan(read.value("psnr_db"))
     assert not np.isnan(read.value("miou_full"))
     with pytest.raises(DataError, match="names no classes"):
-        SynthesizedViews.of(lambda: synthesizer, replace(clips, classes=()))
+        SynthesizedViews.of(lambda: synthesizer, replace(PairedSet.of(clips, "plane"), classes=()))
 
 
 def test_a_model_of_another_size_ontology_or_camera_is_refused() -> None:
