@@ -1,5 +1,6 @@
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
-from gcd_train.evaluation.predictors import Prediction, SourceClip, to_pictures
+from gcd_train.evaluation.predictors import Prediction, to_pictures
 from gcd_train.evaluation.statistics import ClipTable
 from gcd_train.evaluation.store import ClipRecord
 
@@ -19,17 +20,9 @@ FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
 KINDS = tuple(SemanticClass(name=f"kind {number}", colour=(number, 0, 0)) for number in range(CLASSES))
 
 
-@dataclass
-class Fixed:
-    """The same of every clip."""
-
-    name: str
-    prediction: Prediction
-    privileged: bool = False
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        del clip
-        return self.prediction
+def fixed(prediction: Prediction) -> SimpleNamespace:
+    """A method that predicts the same of every clip."""
+    return SimpleNamespace(name="noisy", privileged=False, predict=lambda _: prediction)
 
 
 def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
@@ -62,7 +55,7 @@ def drawn(clip: HeldOutClip, draws: int) -> Prediction:
 
 
 def record_of(clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None) -> ClipRecord:
-    return predicted_and_measured(Fixed(name="noisy", prediction=prediction), clip, classes=KINDS, lpips=lpips)[1]
+    return predicted_and_measured(fixed(prediction), clip, classes=KINDS, lpips=lpips)[1]
 
 
 def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
@@ -96,7 +89,7 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
     said = true.clone()
     said[:, -2:] = void  # on the ground
     kinds = [SemanticClass(name="Void", colour=(0, 0, 0)) if i == void else kind for i, kind in enumerate(KINDS)]
-    named = Fixed(name="noisy", prediction=Prediction(classes=said))
+    named = fixed(Prediction(classes=said))
     record = predicted_and_measured(named, clip, classes=kinds)[1]
     counted = record.regions["all"].confusion
     assert void not in {label for frame in counted for entry in frame for label in entry[:2]}
@@ -127,7 +120,7 @@ def test_a_view_that_is_no_number_somewhere_is_an_error_not_a_missing_figure() -
 
 def test_where_targets_are_class_maps_only_class_maps_count() -> None:
     clip = held_out()
-    named = Fixed(name="noisy", prediction=drawn(clip, 2))
+    named = fixed(drawn(clip, 2))
     prediction, record = predicted_and_measured(named, clip, classes=KINDS, painted=True)
     assert (record.regions["all"].psnr_db, record.draws) == (None, 2)
     assert record.regions["all"].confusion is not None

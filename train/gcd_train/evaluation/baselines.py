@@ -51,7 +51,6 @@ class Baseline:
 
     @property
     def details(self) -> dict[str, str]:
-        """See Predictor."""
         return {"baseline": self.name} | ({"published rounding": "yes"} if self.published else {})
 
 
@@ -215,17 +214,14 @@ class HexPlane:
 
     @property
     def name(self) -> str:
-        """`hexplane_K`."""
         return f"hexplane_{self.views}"
 
     @property
     def privileged(self) -> bool:
-        """True from two views on."""
         return self.views > 1
 
     @property
     def details(self) -> dict[str, str]:
-        """See Predictor."""
         learnt = {key: str(value) for key, value in asdict(self.settings).items()}
         return {"baseline": self.name, "seed": str(self.seed), **learnt}
 

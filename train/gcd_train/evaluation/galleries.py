@@ -75,11 +75,6 @@ def _wanted(which: KeptViews, frames: int) -> range:
     return {"none": range(0), "last": range(frames - 1, frames)}.get(which, range(frames))
 
 
-def shown_frames(count: int) -> list[int]:
-    """Those of so many frames that a row of a sheet shows, evenly among them."""
-    return np.linspace(0, count - 1, min(SHOWN_FRAMES, count)).round().astype(int).tolist()
-
-
 def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:
     """Class ids uint8 [T, H, W] in colours, uint8 [T, H, W, 3]; what is of no class is black."""
     colours = torch.zeros(256, 3, dtype=torch.uint8)
@@ -197,7 +192,8 @@ def _read(folder: Path) -> dict[int, Pictures]:
 
 def _row(label: str, strip: Strip) -> Pictures:
     numbers = sorted(strip.frames)
-    pictures = [strip.frames[numbers[place]] for place in shown_frames(len(numbers))]
+    places = np.linspace(0, len(numbers) - 1, min(SHOWN_FRAMES, len(numbers))).round().astype(int)  # evenly
+    pictures = [strip.frames[numbers[place]] for place in places]
     lines = (*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS))
     height = max(pictures[0].shape[0], max(3, len(lines)) * _LINE)
     margin = np.full((height + _GAP, _MARGIN, 3), 255, np.uint8)

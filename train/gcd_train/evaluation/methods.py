@@ -110,7 +110,6 @@ class SynthesizedViews:
 
     @property
     def details(self) -> dict[str, str]:
-        """See Predictor."""
         traits, options = self.weights().traits, self.options
         used = sampler_of(traits.config.sampling, options)
         interval = used.guidance_interval
@@ -215,18 +214,10 @@ class EvaluateOptions(ClipOptions):
     dtype: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Plan:
-    """What is to be done. notes: what is odd about the clips, line by line. methods: the weights first."""
-
-    clips: EvaluationSet
-    notes: tuple[str, ...]
-    methods: tuple[Predictor, ...]
-
-
-def planned(options: EvaluateOptions) -> Plan:
+def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, ...], tuple[str, ...]]:
     """Open the data and the weights, and choose the methods: all that is quick, so that faults are told at once.
 
+    Returns: the clips, the methods with the weights first, and what is odd about the clips, line by line.
     Raises:
         DataError: data or frames are missing, or do not fit together. RecipeError: options contradict each other, or
             there is nothing to measure. CheckpointError: weights cannot be opened.
@@ -264,7 +255,7 @@ def planned(options: EvaluateOptions) -> Plan:
             raise RecipeError(
                 f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
             )
-    return Plan(clips=clips, notes=notes, methods=tuple(methods))
+    return clips, tuple(methods), notes
 
 
 def _resolved(weights: str) -> str:
@@ -293,9 +284,8 @@ def _saved_frames(options: EvaluateOptions, painted: tuple[SemanticClass, ...]) 
     return found
 
 
-def run_note(plan: Plan, options: EvaluateOptions, command: str) -> RunNote:
+def run_note(clips: EvaluationSet, methods: Sequence[Predictor], options: EvaluateOptions, command: str) -> RunNote:
     """What the run says of itself. command: the line that began it. Raises DataError for LPIPS weights."""
-    clips = plan.clips
     lpips = {} if options.lpips is None else {LPIPS: Lpips.open(options.lpips).identity}
     return RunNote(
         command=command,
@@ -315,7 +305,7 @@ def run_note(plan: Plan, options: EvaluateOptions, command: str) -> RunNote:
         width=clips.width,
         seed=options.seed,
         classes=tuple(each.name for each in clips.classes),
-        methods={method.name: {**method.details, **lpips} for method in plan.methods},
+        methods={method.name: {**method.details, **lpips} for method in methods},
     )
 
 

@@ -27,7 +27,6 @@ from gcd_train.evaluation.protocol import (
     controlled,
     released_controls,
     require_cameras,
-    require_orbits,
     scene_number,
 )
 from gcd_train.layouts import kubric4d, parallel_domain4d
@@ -209,13 +208,18 @@ def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tupl
             options.modality is None and model.family is not None and model.family.output == "semantic"
         )
         gradual = gradual and (options.path is not None or model.move_time > 0)
-    whole = _dataset(folder, options, orbits=orbits, painted=painted)
+    if orbits and painted:
+        raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
+    cameras = tuple(options.camera or (kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS))
+    whole = (
+        Kubric4D.open(folder, cameras=cameras, published=released)
+        if orbits
+        else ParallelDomain4D.open(folder, cameras=cameras, classes=painted)
+    )
     sampling = _sampling(options, size[0], orbits=orbits, gradual=gradual)
     controls = _controls(options, whole.scenes, sampling)
     scenes = wanted_scenes(folder, whole.scenes, options, notes)
     scenes = controlled(scenes, controls, options.controls, folder, notes)[: options.limit]
-    if orbits and options.controls is not None and controls.listed is not None:
-        require_orbits(controls.listed, scenes, options.controls)
     data = whole.only(scenes)
     require_cameras(data)
     pictures = PictureOptions(
@@ -241,16 +245,6 @@ def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tupl
         cameras=len(data.cameras),
     )
     return clips, tuple(notes.lines())
-
-
-def _dataset(folder: Path, options: ClipOptions, *, orbits: bool, painted: bool) -> Kubric4D | ParallelDomain4D:
-    names = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
-    cameras = tuple(options.camera or names)
-    if not orbits:
-        return ParallelDomain4D.open(folder, cameras=cameras, classes=painted)
-    if painted:
-        raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
-    return Kubric4D.open(folder, cameras=cameras, published=options.protocol == "release")
 
 
 def _controls(options: ClipOptions, scenes: Sequence[str], sampling: OrbitSampling | DrivingSampling) -> SceneControls:
