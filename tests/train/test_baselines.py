@@ -16,7 +16,6 @@ from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
 from gcd_train.data.pairs import PairedClip
-from gcd_train.data.sample import SceneView
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import (
     GroundHomography,
@@ -134,11 +133,8 @@ def test_points_of_the_data_sets_own_views_are_drawn_instead_where_there_are_som
     own, moved = plane_clip(large), np.eye(4)
     moved[:3, 3] = [40.0, -7.0, 3.0]  # another world: only the relative pose counts
 
-    def points() -> list[SceneView]:
-        seen = replace(SEEN, source=own.source, source_depth=own.source_depth, source_classes=own.source_classes)
-        return [replace(view, world_from_camera=moved) for view in source_views(replace(seen, cameras=large))]
-
-    finer = replace(SEEN, points=points)
+    seen = seen_of(own, large)
+    finer = replace(SEEN, points=[replace(view, world_from_camera=moved) for view in source_views(seen)])
     made, usual = picture_of(finer), picture()
     both = shown(made) & shown(usual)
     assert made.shape == (FRAMES, 3, HEIGHT, WIDTH)

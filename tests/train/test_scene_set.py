@@ -240,7 +240,7 @@ def test_a_clip_of_an_orbit_shows_what_its_cameras_see(kubric: Path) -> None:
     assert near.mean() > 0.3
     assert np.median(np.abs(clip.seen.source_depth[0] / true.depth - 1)[near]) < 0.05  # of points, few and coarse
     assert clip.visible.shape == (3, 32, 48)
-    assert clip.seen.points is None  # no camera of the scene stands at the source
+    assert clip.seen.points == ()  # no camera of the scene stands at the source
     assert clip.change == pytest.approx(
         (
             cameras.trajectory.goal_delta.azimuth_deg,
@@ -276,7 +276,7 @@ def test_a_driving_clip_has_the_forward_cameras_own_depth_and_classes(driving: P
     assert np.median(np.abs(ratio - 1)) < 0.1
     assert set(np.unique(clip.target_classes)) <= set(range(4))
     assert clip.visible[0].mean() > 0.95
-    assert [view.rgb.shape for view in clip.seen.points()] == [(36, 48, 3)] * 3
+    assert [view.rgb.shape for view in clip.seen.points] == [(36, 48, 3)] * 3
 
 
 @pytest.mark.slow

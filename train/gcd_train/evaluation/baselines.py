@@ -159,9 +159,7 @@ def source_views(clip: SourceClip) -> Sequence[SceneView]:
 
     The clip's own stand in the axes of the source camera, with its declared lens.
     """
-    if clip.points is not None:
-        return clip.points()
-    return own_views(clip.source, clip.source_depth, clip.source_classes, clip.cameras.source)
+    return clip.points or own_views(clip.source, clip.source_depth, clip.source_classes, clip.cameras.source)
 
 
 def _published(clip: SourceClip, views: Sequence[SceneView], values: Sequence[Bytes] | None, published: bool) -> Tensor:

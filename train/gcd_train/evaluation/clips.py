@@ -281,7 +281,7 @@ class SceneSet(EvaluationSet):
             fps=sample.fps,
             key=key,
             others=partial(self._others, sample.scene, sample.frame_numbers),
-            points=partial(tuple[SceneView, ...], views) if own else None,
+            points=views if own else (),
         )
 
     def _cameras(self, sample: Sample, first: SceneView) -> CameraPair:

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 from typing import Literal, TypeAlias
@@ -148,18 +149,16 @@ def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None
 
 
 def write_mp4(frames: Iterable[Pictures], fps: float, out: Path) -> None:
-    """Pictures of one even size, as MPEG-4 part 2. Raises RunError if it cannot be written."""
+    """One picture or more of one even size, as MPEG-4 part 2. Raises RunError if it cannot be written."""
     out.parent.mkdir(parents=True, exist_ok=True)
-    video: cv2.VideoWriter | None = None
-    for frame in frames:
-        if video is None:
-            size = (frame.shape[1], frame.shape[0])
-            video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
-            if not video.isOpened():
-                raise RunError(f"{out} cannot be written; give a folder that takes files with --out")
+    each = iter(frames)
+    first = next(each)
+    video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), fps, (first.shape[1], first.shape[0]))
+    if not video.isOpened():
+        raise RunError(f"{out} cannot be written; give a folder that takes files with --out")
+    for frame in chain([first], each):
         video.write(frame[..., ::-1])
-    if video is not None:
-        video.release()
+    video.release()
 
 
 def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:

@@ -98,7 +98,7 @@ class SourceClip:
     key: names the clip in its set; frames that others have made are found by it.
     others: the T views of each of so many further cameras of the scene, for predictors that are given them (raises
     DataError if it has fewer); None where there is one camera. points: the T source views at their full size, for
-    privileged predictors only, with ids as in `source_classes`; None where `source` is all there is.
+    privileged predictors only, with ids as in `source_classes`; empty where `source` is all there is.
     """
 
     source: Bytes
@@ -108,7 +108,7 @@ class SourceClip:
     fps: float
     key: str = ""
     others: Callable[[int], Sequence[Sequence[SceneView]]] | None = None
-    points: Callable[[], Sequence[SceneView]] | None = None
+    points: Sequence[SceneView] = ()
 
 
 FAR_M = 1e4
