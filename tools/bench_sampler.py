@@ -19,7 +19,7 @@ from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
 from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.predictors import Prediction
-from gcd_train.evaluation.statistics import Selection, class_counts, difference, scene_sums
+from gcd_train.evaluation.statistics import ClipTable, difference
 
 UNGUIDED = (1.0, 1.0)
 HEADS = ["steps", "solver", "guidance", "runs", "latents from Euler", "dB to Euler", "latents from fine", "dB to fine"]
@@ -43,7 +43,7 @@ def main():
     options = parser.parse_args()
     model = load_synthesizer(options.weights, device=options.device, dtype=options.dtype)
     clips = open_clips(ClipOptions(data=options.data, split=options.split, limit=options.limit), model.traits)[0]
-    views = SynthesizedViews.of(model, clips, RenderOptions(seed=options.seed))
+    views = SynthesizedViews.of(lambda: model, clips, RenderOptions(seed=options.seed))
     own = Sampler.of(model.traits.config.sampling, RenderOptions())
     references = [replace(own, steps=25), replace(own, steps=options.fine, solver="dpmpp_2m")]
     ways = list(dict.fromkeys(map(plainest, [own, *grid(own, options)])))
@@ -102,7 +102,7 @@ def measure(views, clips, ways, references):
             shown = Fixed(name=str(way), prediction=views.shown(drawn[way]))
             records[way].append(predicted_and_measured(shown, clip, classes=clips.classes)[1])
     count = len(clips.classes)
-    truth = {way: scene_sums(rows, Selection(), class_counts(rows, count)) for way, rows in records.items()}
+    truth = {way: ClipTable.of(rows, count).scene_sums() for way, rows in records.items()}
     return {way: ([mean(column) for column in zip(*apart[way], strict=True)], truth[way]) for way in ways}
 
 

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from gcd_train.evaluation.paper import PICTURE_COLUMNS
 from gcd_train.evaluation.runs import Run, gather, targets_apart
-from gcd_train.evaluation.statistics import Selection, common_clips, difference, scene_sums
-from gcd_train.evaluation.tables import Difference, differences_csv, markdown_rows
+from gcd_train.evaluation.tables import differences, differences_csv, markdown_rows
 
 CLAIMS = [
     ("gradual > direct", "study-gradual-pretrained", "study-direct-pretrained", "last"),
@@ -43,9 +42,9 @@ def main():
         if first not in methods or other not in methods:
             rows.append([*head, "-", "not run", "-", "-"])
             continue
-        ours, theirs, note = shared(methods[first], methods[other], frames)
+        keys, note = shared(methods[first], methods[other], frames)
         notes += [note] if note else []
-        apart = differences(first, other, ours, theirs, frames) if ours else []
+        apart = differences(methods[first], methods[other], frames, keys=keys, columns=PICTURE_COLUMNS)
         rows += [[*head, *figures(each)] for each in apart] or [[*head, "-", "no clips in common", "-", "-"]]
         found += apart
     table = "\n".join([*markdown_rows(HEADS, rows), *(f"\n{note}" for note in notes)]) + "\n"
@@ -65,31 +64,19 @@ def by_name(sets):
 
 
 def shared(first, other, frames):
-    """Records of both of the clips that show the same, and which are left out and why."""
-    pairs = list(zip(*common_clips(first.records, other.records), strict=True))
-    why = {one.key: targets_apart(one, two, frames) for one, two in pairs}
-    same = [pair for pair in pairs if not why[pair[0].key]]
-    left_out = [(key, reason) for key, reason in why.items() if reason]
-    note = ""
-    if left_out:
-        note = (
-            f"{first.name} and {other.name}, frames {frames}: of {len(pairs)} clips of the same names {len(left_out)} "
-        )
-        note += f"do not show the same, so they are not compared. In {left_out[0][0]} {left_out[0][1]}."
-    return [one for one, _ in same], [two for _, two in same], note
-
-
-def differences(first, other, ours, theirs, frames):
-    found = []
-    for column in PICTURE_COLUMNS:
-        selection = Selection(frames=frames, region=column.region)
-        sums = (scene_sums(records, selection) for records in (ours, theirs))
-        apart = difference(*sums, column.figure)
-        if apart.known:
-            found.append(
-                Difference(first=first, other=other, column=column, frames=frames, clips=len(ours), apart=apart)
-            )
-    return found
+    """The clips in which both show the same, and which are left out and why."""
+    pairs = {
+        key: (first.records[first.places[key]], other.records[other.places[key]]) for key in first.common_keys(other)
+    }
+    why = {key: targets_apart(*pair, frames) for key, pair in pairs.items()}
+    left_out = [key for key, reason in why.items() if reason]
+    if not left_out:
+        return list(why), ""
+    note = (
+        f"{first.name} and {other.name}, frames {frames}: of {len(why)} clips of the same names {len(left_out)} do not "
+        f"show the same, so they are not compared. In {left_out[0]} {why[left_out[0]]}."
+    )
+    return [key for key, reason in why.items() if not reason], note
 
 
 def figures(each):

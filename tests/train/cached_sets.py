@@ -64,7 +64,7 @@ def tiny_identity(**changes: object) -> CacheIdentity:
         "width": WIDTH,
         "scale": 0.18215,
     }
-    return CacheIdentity(**(told | changes))  # pyright: ignore[reportArgumentType]
+    return CacheIdentity(**(told | changes))
 
 
 def cached(folder: Path, pictures: FakePictures | None = None, **identity: object) -> list[Outcome[str, SceneShard]]:

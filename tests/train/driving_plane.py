@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import msgspec
@@ -15,21 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_model.config import DRIVING_CLASSES, CameraControl, SemanticClass
 from gcd_model.geometry import (
     CameraMount,
     Spherical,
     SphericalDelta,
     Trajectory,
-    driving_trajectory,
     spherical_trajectory,
 )
-from gcd_train.data.pairs import PairedClip
-from gcd_train.data.sample import Sample
+from gcd_train.data.pairs import PairedClip, PairedClips
 from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.measure import predicted_and_measured as measured
-from gcd_train.evaluation.predictors import CameraPair, Predictor, pixel_rays
-from gcd_train.evaluation.statistics import Selection, Sums, class_counts, scene_sums
+from gcd_train.evaluation.predictors import CameraPair, Predictor, SourceClip, pixel_rays
+from gcd_train.evaluation.statistics import ClipTable, Sums
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World
 
 SKY, ROAD, TERRAIN = 0, 1, 4
@@ -74,32 +71,35 @@ def _bytes(values: Tensor) -> np.ndarray:
     return values.double().round().to(torch.uint8).numpy()
 
 
-@dataclass(frozen=True)
-class PlaneClips:
-    """Clips of that world with different paint. paths: of the clips of an orbit; empty in driving."""
+@dataclass
+class PlaneClips(PairedClips):
+    """Clips of that world with different paint, each a scene. paths: of the clips of an orbit; empty in driving."""
 
-    clips: tuple[PairedClip, ...]
-    classes: tuple[SemanticClass, ...] = DRIVING_CLASSES
-    fps: float = 10.0
+    clips: tuple[PairedClip, ...] = ()
     paths: tuple[Trajectory, ...] = ()
-    clips_per_scene: int = 1
-    hfov_deg: float = 85.0
 
     @classmethod
     def make(cls, count: int, *, frames: int = 4, height: int = 32, width: int = 48) -> Self:
         cameras = CameraPair.driving(CameraMount(), frames=frames, height=height, width=width)
-        return cls(tuple(plane_clip(cameras, phase=float(i)) for i in range(count)))
+        return cls._of([cameras] * count, name="driving", fps=10.0, hfov_deg=85.0)
 
     @classmethod
     def orbits(cls, changes: Sequence[SphericalDelta], *, frames: int = 4, height: int = 32, width: int = 48) -> Self:
         """One clip for each change of azimuth, elevation and radius, without classes."""
+        lens = 53.13
         paths = tuple(
             spherical_trajectory(STAGE_SOURCE, change, frames=frames, move_time=frames - 1) for change in changes
         )
-        lens = 53.13
         cameras = [CameraPair.orbit(path, hfov_deg=lens, height=height, width=width) for path in paths]
-        clips = tuple(plane_clip(pair, phase=float(i)) for i, pair in enumerate(cameras))
-        return cls(clips, classes=(), fps=12.0, paths=paths, hfov_deg=lens)
+        return cls._of(cameras, paths, name="drop", camera="orbit", fps=12.0, hfov_deg=lens, classes=())
+
+    @classmethod
+    def _of(cls, cameras: Sequence[CameraPair], paths: tuple[Trajectory, ...] = (), **options: Any) -> Self:
+        clips = tuple(plane_clip(pair, phase=float(number)) for number, pair in enumerate(cameras))
+        frames, height, width = clips[0].source.shape[:3]
+        size = {"frames": frames, "height": height, "width": width, "oversample": 1, "clips_per_shard": len(clips)}
+        places = tuple((Path("plane.zip"), f"{number:08d}") for number in range(len(clips)))
+        return cls(worlds=(World(**options, **size),), places=places, clips=clips, paths=paths)
 
     def write(self, folder: Path, first_seed: int = 0) -> Path:
         """A data folder with these clips in one shard, under seeds from `first_seed` on."""
@@ -113,74 +113,21 @@ class PlaneClips:
                     archive.writestr(f"{number:08d}/{kind}.png", cv2.imencode(".png", strip)[1].tobytes())
         return folder
 
-    @property
-    def world(self) -> World:
-        return World(
-            name="drop" if self.paths else "driving",
-            width=self.width,
-            height=self.height,
-            frames=self.frames,
-            fps=self.fps,
-            hfov_deg=self.hfov_deg,
-            oversample=1,
-            clips_per_shard=len(self),
-            classes=self.classes,
-            camera="orbit" if self.paths else "fixed",
-            clips_per_scene=self.clips_per_scene,
-        )
-
     def __len__(self) -> int:
         return len(self.clips)
 
-    @property
-    def camera(self) -> CameraControl:
-        return "spherical" if self.paths else "none"
+    def __getitem__(self, index: int) -> PairedClip:
+        return self.clips[index]
 
-    @property
-    def mount(self) -> CameraMount | None:
-        return None if self.paths else CameraMount()
+    def scene(self, index: int) -> tuple[str, int]:
+        return "plane", index
 
-    def name(self, number: int) -> str:
-        return f"{number:08d}"
-
-    def scene(self, number: int) -> tuple[str, int]:
-        return "plane", number // self.clips_per_scene
-
-    def trajectory(self, number: int) -> Trajectory:
-        return self.paths[number] if self.paths else driving_trajectory(frames=self.frames, move_time=self.frames - 1)
-
-    def __getitem__(self, number: int) -> PairedClip:
-        return self.clips[number]
-
-    def sample(self, number: int) -> Sample:
-        clip = self.clips[number]
-        return Sample(
-            source=clip.source,
-            target=clip.target,
-            target_classes=clip.target_classes,
-            source_from_target=self.trajectory(number).source_from_target.numpy(),
-            fps=self.fps,
-            scene="plane",
-            frame_numbers=tuple(range(self.frames)),
-        )
-
-    @property
-    def frames(self) -> int:
-        return len(self.clips[0].source)
-
-    @property
-    def height(self) -> int:
-        return self.clips[0].source.shape[1]
-
-    @property
-    def width(self) -> int:
-        return self.clips[0].source.shape[2]
+    def trajectory(self, index: int, /) -> Trajectory:
+        return self.paths[index] if self.paths else super().trajectory(index)
 
 
 def _told(path: Trajectory) -> bytes:
     start, goal = path.source, path.goal_delta
-    assert start is not None
-    assert goal is not None
     orbit = Orbit(
         start=(start.azimuth_deg, start.elevation_deg, start.radius_m),
         change=(goal.azimuth_deg, goal.elevation_deg, goal.radius_m),
@@ -199,8 +146,21 @@ def _strips(clip: PairedClip) -> dict[str, np.ndarray]:
     return {kind: np.ascontiguousarray(np.concatenate(frames)) for kind, frames in strips.items()}
 
 
-def evaluated(predictors: Sequence[Predictor], clips: PlaneClips, selection: Selection | None = None) -> list[Sums]:
+def seen_of(clip: PairedClip, cameras: CameraPair | None = None, **more: Any) -> SourceClip:
+    """What a predictor gets of a clip; by default from the usual vehicle. more: other fields."""
+    frames, height, width = clip.source.shape[:3]
+    usual = CameraPair.driving(CameraMount(), frames=frames, height=height, width=width)
+    given = {
+        "source": clip.source,
+        "source_depth": clip.source_depth,
+        "source_classes": clip.source_classes,
+        "fps": 10.0,
+    }
+    return SourceClip(cameras=cameras or usual, **(given | more))
+
+
+def evaluated(predictors: Sequence[Predictor], clips: PlaneClips) -> list[Sums]:
     """Figures of each on these pairs."""
     pairs = PairedSet.of(clips, "plane")
     of = [[measured(each, pairs.clip(key), classes=pairs.classes)[1] for key in pairs.keys] for each in predictors]
-    return [scene_sums(records, selection or Selection(), class_counts(records, len(pairs.classes))) for records in of]
+    return [ClipTable.of(records, len(pairs.classes)).scene_sums() for records in of]

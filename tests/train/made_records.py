@@ -87,9 +87,9 @@ def note(
         versions={"gcd-node": "0.1.0", "torch": "2", "python": "3.11"},
         data=("held-out",),
         data_identity=data_identity,
-        kind=kind,  # pyright: ignore[reportArgumentType]
-        modality=modality,  # pyright: ignore[reportArgumentType]
-        protocol=protocol,  # pyright: ignore[reportArgumentType]
+        kind=kind,
+        modality=modality,
+        protocol=protocol,
         frames=FRAMES,
         height=32,
         width=48,

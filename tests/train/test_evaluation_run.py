@@ -1,9 +1,8 @@
 """Runs that are kept: records, resuming, failures, processes, frames that are read back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import ClassVar
 
 import msgspec
 import pytest
@@ -14,11 +13,13 @@ from typer.testing import CliRunner
 from gcd_train.cli.generate import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError, RunError
+from gcd_train.evaluation.baselines import CopySource
 from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_of
-from gcd_train.evaluation.galleries import KeptViews, png
+from gcd_train.evaluation.galleries import KeptViews, has_views, write_views
 from gcd_train.evaluation.measure import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
-from gcd_train.evaluation.predictors import CopySource, Prediction, Predictor, SourceClip, to_pictures
+from gcd_train.evaluation.predictors import Prediction, Predictor, SourceClip, to_pictures
 from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
+from gcd_train.pictures import png
 
 
 @dataclass
@@ -37,29 +38,26 @@ class Counting:
         return Prediction(video=to_pictures(clip.source))
 
 
-class SomeDamaged(PairedSet):
-    """Pairs of which some cannot be read."""
+@dataclass(frozen=True, kw_only=True)
+class Damaged(PairedSet):
+    """Pairs of which those of these numbers cannot be read."""
 
-    damaged: ClassVar[Sequence[str]] = ("plane-00000001",)
+    numbers_damaged: Sequence[int]
 
     def clip(self, key: str, /) -> HeldOutClip:
-        if key in self.damaged:
+        if self.numbers[key] in self.numbers_damaged:
             raise DataError(f"shard of {key} is damaged")
         return super().clip(key)
 
 
-class AllDamaged(SomeDamaged):
-    damaged = tuple(f"plane-{number:08d}" for number in range(20))
-
-
-def pairs(count: int = 3, kind: type[PairedSet] = PairedSet) -> PairedSet:
-    return kind.of(PlaneClips.make(count), "plane")
+def pairs(count: int = 3, *, damaged: Sequence[int] = ()) -> PairedSet:
+    whole = PairedSet.of(PlaneClips.make(count), "plane")
+    return Damaged(**{each.name: getattr(whole, each.name) for each in fields(whole)}, numbers_damaged=damaged)
 
 
 def finished(folder: Path, clips: PairedSet, *methods: Predictor, views: KeptViews = "none") -> Account:
     """The account at the end of a run."""
-    makers = {each.name: lambda each=each: each for each in methods}
-    work = ClipWork(folder=folder, clips=clips, makers=makers, views=views)
+    work = ClipWork(folder=folder, clips=clips, methods={each.name: each for each in methods}, views=views)
     *_, last = measure_all(work)
     return last
 
@@ -159,7 +157,7 @@ def test_what_has_a_record_is_not_done_again(tmp_path: Path) -> None:
 
 
 def test_a_clip_that_cannot_be_read_is_named_and_the_others_are_measured(tmp_path: Path) -> None:
-    account = finished(tmp_path, pairs(3, SomeDamaged), Counting())
+    account = finished(tmp_path, pairs(3, damaged=[1]), Counting())
     assert account.failures == {"plane-00000001": "shard of plane-00000001 is damaged"}
     assert records_in(tmp_path) == ["counting/plane-00000000.json", "counting/plane-00000002.json"]
     assert account.lines()[1] == "  plane-00000001: shard of plane-00000001 is damaged"
@@ -173,7 +171,7 @@ def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> No
 
 
 def test_a_run_in_which_nothing_goes_right_gives_up(tmp_path: Path) -> None:
-    account = finished(tmp_path, pairs(7, AllDamaged), Counting())
+    account = finished(tmp_path, pairs(7, damaged=range(7)), Counting())
     assert (account.measured, account.done, account.gave_up) == (0, GIVE_UP_AFTER, True)
     assert account.lines()[0] == f"clips: 0 measured, 0 there already; {GIVE_UP_AFTER} failures"
     assert "gave up" in account.lines()[-1]
@@ -203,7 +201,7 @@ def test_workers_take_gpus_in_turn_unless_one_is_named(monkeypatch: pytest.Monke
 def test_processes_find_what_one_finds(tmp_path: Path) -> None:
     clips = PairedSet.of(written(tmp_path / "data", 4))
     for workers in (1, 2):
-        work = ClipWork(folder=tmp_path / str(workers), clips=clips, makers={"copy_source": CopySource})
+        work = ClipWork(folder=tmp_path / str(workers), clips=clips, methods={"copy_source": CopySource()})
         *_, account = measure_all(work, workers=workers)
         assert (account.measured, account.failures) == (4, {})
     for path in records_in(tmp_path / "1"):
@@ -230,6 +228,15 @@ def test_a_clip_without_the_frames_that_are_to_be_kept_is_measured_again(tmp_pat
     next((tmp_path / "run" / "views").rglob("sample_0/0001.png")).unlink()
     account = finished(tmp_path / "run", pairs(2), CopySource(), views="all")
     assert (account.measured, pictures_in(tmp_path / "run")) == (1, pictures_in(tmp_path / "whole"))
+
+
+def test_kept_views_are_those_of_the_last_prediction_alone(tmp_path: Path) -> None:
+    clip = pairs(1).clip("plane-00000000")
+    (draw,) = CopySource().predict(clip.seen).draws
+    for draws in ((draw, draw), (draw,)):
+        write_views(tmp_path, clip, replace(draws[0], more=draws[1:]), "last", ())
+        assert has_views(tmp_path, "last", len(clip.target))
+        assert len(list(tmp_path.glob("sample_*"))) == len(draws)
 
 
 # --- the command ---------------------------------------------------------------------------------------------------

@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 from made_records import record, region
 
-from gcd_train.evaluation.statistics import (
-    FigureName,
-    Selection,
-    class_counts,
-    class_iou,
-    difference,
-    scene_sums,
-)
-from gcd_train.evaluation.store import ClipRecord
-
-OCCLUDED = Selection(region="occluded")
+from gcd_train.evaluation.statistics import ClipTable, FigureName, Span, Sums, difference
+from gcd_train.evaluation.store import ClipRecord, Region
 
 
 def scenes(method: str = "model", shift: float = 0.0) -> list[ClipRecord]:
@@ -29,15 +20,20 @@ def scenes(method: str = "model", shift: float = 0.0) -> list[ClipRecord]:
     ]
 
 
-def figure(records: Sequence[ClipRecord], name: FigureName, selection: Selection | None = None) -> float:
-    return scene_sums(records, selection or Selection()).value(name)
+def summed(records: Sequence[ClipRecord], *, classes: int = 0) -> Sums:
+    """Frames 2 to the last, all pixels."""
+    return ClipTable.of(records, classes).scene_sums()
+
+
+def figure(record: ClipRecord, name: FigureName, frames: Span | int = "2-last", region: Region = "all") -> float:
+    return ClipTable.of([record]).scene_sums(frames, region).value(name)
 
 
 # --- how sure -----------------------------------------------------------------------------------------------------
 
 
 def test_the_interval_of_a_mean_is_that_of_a_plain_bootstrap_over_scenes() -> None:
-    found = scene_sums(scenes(), Selection())
+    found = summed(scenes())
     of_scenes = np.array([18.5, 20.75, 16.5, 24.5])
     drawn = of_scenes[np.random.default_rng(0).integers(0, 4, size=(20_000, 4))].mean(axis=1)
     interval = found.interval("psnr_db")
@@ -46,7 +42,7 @@ def test_the_interval_of_a_mean_is_that_of_a_plain_bootstrap_over_scenes() -> No
 
 
 def test_a_difference_is_paired_so_a_constant_lead_has_no_error() -> None:
-    first, other = (scene_sums(scenes(name, shift), Selection()) for name, shift in (("a", 1.5), ("b", 0.0)))
+    first, other = (summed(scenes(name, shift)) for name, shift in (("a", 1.5), ("b", 0.0)))
     apart = difference(first, other, "psnr_db")
     assert (apart.value, apart.low, apart.high) == pytest.approx((1.5,) * 3)
     assert apart.off_zero
@@ -55,7 +51,7 @@ def test_a_difference_is_paired_so_a_constant_lead_has_no_error() -> None:
 
 
 def test_a_single_scene_has_no_bounds_and_no_claim() -> None:
-    found = scene_sums(scenes()[:2], Selection())
+    found = summed(scenes()[:2])
     assert math.isnan(found.interval("psnr_db").low)
     assert not found.interval("psnr_db").off_zero
 
@@ -65,7 +61,7 @@ def test_intervals_of_pooled_classes_lie_around_the_figure_of_all() -> None:
         record("a", f"s{scene}", regions={"all": region(counts=[(0, 0, 50), (1, 1, 10 + scene), (1, 0, 9)])})
         for scene in range(5)
     ]
-    found = scene_sums(clips, Selection()).interval("miou_common")
+    found = summed(clips).interval("miou_common")
     assert found.low < found.value < found.high
     assert found.value == pytest.approx((250 / 295 + 60 / 105) / 2)
 
@@ -74,30 +70,34 @@ def test_intervals_of_pooled_classes_lie_around_the_figure_of_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("selection", "expected"),
+    ("frames", "pixels", "expected"),
     [
-        (Selection(), 20.0),
-        (Selection(frames="all"), 40.0),
-        (Selection(frames="last"), 30.0),
-        (Selection(frames=2), 10.0),
-        (OCCLUDED, 12.0),  # of frames 3 and 4, frame 2 has no such pixel
-        (Selection(frames=2, region="occluded"), math.nan),
-        (Selection(region="visible"), math.nan),
+        ("2-last", "all", 20.0),
+        ("all", "all", 40.0),
+        ("last", "all", 30.0),
+        (2, "all", 10.0),
+        ("2-last", "occluded", 12.0),  # of frames 3 and 4, frame 2 has no such pixel
+        (2, "occluded", math.nan),
+        ("2-last", "visible", math.nan),
     ],
 )
-def test_figures_are_of_the_frames_and_pixels_asked_for(selection: Selection, expected: float) -> None:
+def test_figures_are_of_the_frames_and_pixels_asked_for(frames: Span | int, pixels: Region, expected: float) -> None:
     regions = {"all": region((100.0, 10.0, 20.0, 30.0)), "occluded": region((None, None, 11.0, 13.0))}
-    clip = record(regions=regions)
-    assert figure([clip], "psnr_db", selection) == pytest.approx(expected, nan_ok=True)
+    assert figure(record(regions=regions), "psnr_db", frames, pixels) == pytest.approx(expected, nan_ok=True)
 
 
 def test_sharpness_and_flicker_are_ratios_of_sums_without_the_first_frame() -> None:
     clip = record(gradient=(9.0, 1.0, 2.0, 3.0), step=(9.0, 1.0, 3.0))
-    for frames, expected in (("2-last", (1.0, 1.0)), ("last", (1.5, 1.5)), (3, (1.0, 0.5))):
-        selection = Selection(frames=frames)
-        found = figure([clip], "gradient_energy", selection), figure([clip], "flicker", selection)
-        assert found == pytest.approx(expected)
-    assert math.isnan(figure([clip], "flicker", Selection(frames=1)))
+    expected: dict[Span | int, tuple[float, float]] = {
+        "2-last": (1.0, 1.0),
+        "last": (1.5, 1.5),
+        "all": (15 / 8, 13 / 6),
+        3: (1.0, 0.5),
+        2: (0.5, 4.5),
+    }
+    found = {frames: (figure(clip, "gradient_energy", frames), figure(clip, "flicker", frames)) for frames in expected}
+    assert found == {frames: pytest.approx(each) for frames, each in expected.items()}
+    assert math.isnan(figure(clip, "flicker", 1))
 
 
 # --- classes ------------------------------------------------------------------------------------------------------
@@ -106,22 +106,21 @@ def test_sharpness_and_flicker_are_ratios_of_sums_without_the_first_frame() -> N
 def test_iou_is_pooled_over_clips_not_averaged() -> None:
     one = record(key="a", regions={"all": region(counts=[(0, 0, 90), (1, 0, 10)])}, gradient=None, step=None)
     two = record(key="b", regions={"all": region(counts=[(0, 1, 10), (1, 1, 10)])}, gradient=None, step=None)
-    found = scene_sums([one, two], Selection())
-    assert class_iou(found.classes.sum(axis=0)) == pytest.approx((90 / 110, 10 / 30))
+    found = summed([one, two])
+    assert found.class_iou() == pytest.approx((90 / 110, 10 / 30))
     assert found.value("miou_full") == pytest.approx((90 / 110 + 10 / 30) / 2)
     assert math.isnan(found.value("psnr_db"))
 
 
 def test_what_is_said_to_be_of_no_class_is_wrong_and_makes_no_class() -> None:
-    clip = record(regions={"all": region(counts=[(0, 0, 6), (0, 255, 2), (1, 1, 4)])})
-    found = scene_sums([clip], Selection(), class_counts([clip], 3))
-    assert class_iou(found.classes[0]) == pytest.approx((6 / 8, 1.0, math.nan), nan_ok=True)
-    assert class_counts([clip]).common == (0, 1)
+    found = summed([record(regions={"all": region(counts=[(0, 0, 6), (0, 255, 2), (1, 1, 4)])})], classes=3)
+    assert found.class_iou() == pytest.approx((6 / 8, 1.0, math.nan), nan_ok=True)
+    assert found.common == (0, 1)
 
 
 def test_the_ten_commonest_classes_are_those_of_all_targets_in_every_region() -> None:
     counts = [(label, label, 100 - label) for label in range(12)]
     clip = record(regions={"all": region(counts=counts), "occluded": region(counts=[(11, 0, 50)])})
-    assert class_counts([clip]).common == tuple(range(10))
-    assert figure([clip], "miou_common") == pytest.approx(1.0)
-    assert figure([clip], "miou_common", OCCLUDED) == pytest.approx(0.0)  # class 0, said where 11 is
+    assert summed([clip]).common == tuple(range(10))
+    assert figure(clip, "miou_common") == pytest.approx(1.0)
+    assert figure(clip, "miou_common", region="occluded") == pytest.approx(0.0)  # class 0, said where 11 is

@@ -1,36 +1,28 @@
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from driving_plane import PlaneClips
+from driving_plane import PlaneClips, seen_of
 
 from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
-from gcd_model.geometry import CameraMount
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.measure import predicted_and_measured
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips, masked_mean, masked_psnr, psnr, ssim_map, window_mask
-from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip, to_pictures
-from gcd_train.evaluation.statistics import Selection, class_counts, class_iou, scene_sums
+from gcd_train.evaluation.predictors import Prediction, to_pictures
+from gcd_train.evaluation.statistics import ClipTable
 from gcd_train.evaluation.store import ClipRecord
 
 FRAMES, HEIGHT, WIDTH, CLASSES = 4, 32, 48, 14
 KINDS = tuple(SemanticClass(name=f"kind {number}", colour=(number, 0, 0)) for number in range(CLASSES))
 
 
-@dataclass
-class Fixed:
-    """The same of every clip."""
-
-    name: str
-    prediction: Prediction
-    privileged: bool = False
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        del clip
-        return self.prediction
+def fixed(prediction: Prediction) -> SimpleNamespace:
+    """A method that predicts the same of every clip."""
+    return SimpleNamespace(name="noisy", privileged=False, predict=lambda _: prediction)
 
 
 def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
@@ -41,13 +33,7 @@ def held_out(*, visible: bool = True, classes: bool = True) -> HeldOutClip:
     return HeldOutClip(
         key="plane-0",
         scene="plane",
-        seen=SourceClip(
-            source=clip.source,
-            source_depth=clip.source_depth,
-            source_classes=clip.source_classes,
-            cameras=CameraPair.driving(CameraMount(), frames=FRAMES, height=HEIGHT, width=WIDTH),
-            fps=10.0,
-        ),
+        seen=seen_of(clip),
         target=clip.target,
         target_classes=clip.target_classes if classes else None,
         visible=seen if visible else None,
@@ -69,7 +55,7 @@ def drawn(clip: HeldOutClip, draws: int) -> Prediction:
 
 
 def record_of(clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None) -> ClipRecord:
-    return predicted_and_measured(Fixed(name="noisy", prediction=prediction), clip, classes=KINDS, lpips=lpips)[1]
+    return predicted_and_measured(fixed(prediction), clip, classes=KINDS, lpips=lpips)[1]
 
 
 def test_figures_of_each_draw_and_region_are_those_of_the_metrics() -> None:
@@ -103,16 +89,16 @@ def test_void_is_not_counted_where_it_is_true_and_wrong_where_it_is_said() -> No
     said = true.clone()
     said[:, -2:] = void  # on the ground
     kinds = [SemanticClass(name="Void", colour=(0, 0, 0)) if i == void else kind for i, kind in enumerate(KINDS)]
-    named = Fixed(name="noisy", prediction=Prediction(classes=said))
+    named = fixed(Prediction(classes=said))
     record = predicted_and_measured(named, clip, classes=kinds)[1]
     counted = record.regions["all"].confusion
     assert void not in {label for frame in counted for entry in frame for label in entry[:2]}
     wrong = [sum(count for _, label, count in frame if label == NO_CLASS) for frame in counted]
     assert wrong == [2 * WIDTH] * FRAMES
     assert road in {entry[0] for frame in counted for entry in frame if entry[1] == NO_CLASS}
-    found = scene_sums([record], Selection(), class_counts([record], CLASSES))
-    assert math.isnan(class_iou(found.classes[0])[void])
-    assert void not in class_counts([record], CLASSES).common
+    found = ClipTable.of([record], CLASSES).scene_sums()
+    assert math.isnan(found.class_iou()[void])
+    assert void not in found.common
     assert found.value("miou_full") < 1.0
 
 
@@ -134,7 +120,7 @@ def test_a_view_that_is_no_number_somewhere_is_an_error_not_a_missing_figure() -
 
 def test_where_targets_are_class_maps_only_class_maps_count() -> None:
     clip = held_out()
-    named = Fixed(name="noisy", prediction=drawn(clip, 2))
+    named = fixed(drawn(clip, 2))
     prediction, record = predicted_and_measured(named, clip, classes=KINDS, painted=True)
     assert (record.regions["all"].psnr_db, record.draws) == (None, 2)
     assert record.regions["all"].confusion is not None

@@ -10,11 +10,12 @@ from gcd_train.evaluation.metrics import (
     NO_CLASS,
     class_iou,
     confusion_matrix,
-    diversity,
     frame_confusions,
     gradient_map,
+    masked_mean,
     masked_psnr,
     mean_iou,
+    pixel_deviation,
     psnr,
     ssim_map,
     void_ids,
@@ -63,7 +64,8 @@ def test_what_lies_outside_a_mask_is_not_looked_at() -> None:
     changed = torch.where(mask[:, None], second, 1 - second)
     changed[0, :, :, 19] = torch.nan
     assert_close(masked_psnr(first, second, mask)[0], masked_psnr(first, changed, mask)[0])
-    assert_close(diversity(torch.stack([first, changed]), mask)[0], diversity(torch.stack([first, second]), mask)[0])
+    spread = [masked_mean(pixel_deviation(torch.stack([first, each])), mask)[0] for each in (changed, second)]
+    assert_close(*spread)
     cut = psnr(first[:1, :, :, :8], second[:1, :, :, :8])
     assert_close(masked_psnr(first, second, mask)[:1], cut)
 
@@ -77,8 +79,8 @@ def test_ssim_masks_are_eroded_three_times_by_a_cross() -> None:
 
 def test_diversity_is_the_spread_over_all_draws() -> None:
     draws = torch.stack([grey(0.1), grey(0.3), grey(0.3), grey(0.5)])
-    assert diversity(draws).item() == pytest.approx(math.sqrt((0.2**2 + 0.2**2) / 4), rel=1e-5)
-    assert_close(diversity(torch.stack([noise(0)] * 3)), torch.zeros(2), rtol=0, atol=1e-6)
+    assert pixel_deviation(draws).mean().item() == pytest.approx(math.sqrt((0.2**2 + 0.2**2) / 4), rel=1e-5)
+    assert pixel_deviation(torch.stack([noise(0)] * 3)).amax() < 1e-6
 
 
 def test_gradient_of_a_ramp_is_its_slope() -> None:

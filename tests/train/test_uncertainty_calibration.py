@@ -14,7 +14,6 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
-from gcd_model.geometry import CameraMount
 from gcd_model.weights.load import inspect_weights
 from gcd_train.cli.calibrate import calibrate_command
 from gcd_train.errors import DataError
@@ -27,22 +26,15 @@ from gcd_train.evaluation.calibration import (
     miscoverage,
 )
 from gcd_train.evaluation.clips import HeldOutClip
-from gcd_train.evaluation.predictors import CameraPair, Prediction, SourceClip
+from gcd_train.evaluation.predictors import Prediction
 
 T, H, W = 4, 48, 64
 
 
-def held_out(target: Tensor, *, scene: str = "a", visible: np.ndarray | None = None) -> HeldOutClip:
+def held_out(target: Tensor) -> HeldOutClip:
     """target: [T, 3, H, W] in [0, 1]."""
     pictures = (target * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).numpy()
-    seen = SourceClip(
-        source=pictures,
-        source_depth=np.ones((T, H, W), np.float32),
-        source_classes=None,
-        cameras=CameraPair.driving(CameraMount(), frames=T, height=H, width=W),
-        fps=10.0,
-    )
-    return HeldOutClip(key=f"{scene}-0", scene=scene, seen=seen, target=pictures, visible=visible)
+    return HeldOutClip(key="a-0", scene="a", seen=None, target=pictures)
 
 
 def drawn(*videos: Tensor) -> Prediction:
@@ -50,19 +42,18 @@ def drawn(*videos: Tensor) -> Prediction:
     return replace(first, more=tuple(more))
 
 
-def spread_by(share: float, *, seed: int = 0, scene: str = "a", visible: np.ndarray | None = None) -> Distances:
+def spread_by(share: float, *, seed: int = 0) -> Distances:
     """A truth that lies so many deviations from the mean, as a standard deviation; the deviation differs by pixel."""
     random = torch.Generator().manual_seed(seed)
     std = 0.02 + 0.03 * torch.rand(T, 1, H, W, generator=random)
     truth = 0.5 + share * std * torch.randn(T, 3, H, W, generator=random)
-    return distances(
-        held_out(truth, scene=scene, visible=visible), drawn(0.5 + std.expand(T, 3, H, W), 0.5 - std.expand(T, 3, H, W))
-    )
+    std = std.expand(T, 3, H, W)
+    return distances(held_out(truth), drawn(0.5 + std, 0.5 - std))
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0, 2.0])
 def test_the_scale_is_the_truths_own_spread(share: float) -> None:
-    counts = spread_by(share).counts["all"]
+    counts = spread_by(share)["all"]
     assert best_scale(counts) == pytest.approx(share, rel=0.03)
     assert miscoverage(counts, share) < 0.01
 
@@ -72,7 +63,7 @@ def test_the_first_frame_does_not_count() -> None:
     truth = torch.full((T, 3, H, W), 0.5)
     other = truth.clone()
     other[0] = 0.0
-    both = [distances(held_out(each), drawn(*draws)).counts["all"] for each in (truth, other)]
+    both = [distances(held_out(each), drawn(*draws))["all"] for each in (truth, other)]
     assert np.array_equal(*both)
     assert both[0].sum() == (T - 1) * 3 * H * W
 
@@ -81,22 +72,22 @@ def test_flat_pixels_are_held_as_often_as_their_rounding_has_it() -> None:
     """Draws that miss a rounded truth by a tenth of a grey level are neither always right nor always wrong."""
     level = 0.1 / 255
     truth = torch.full((T, 3, H, W), 128 / 255)
-    counts = distances(held_out(truth), drawn(truth - level, truth + level)).counts["all"]
+    counts = distances(held_out(truth), drawn(truth - level, truth + level))["all"]
     assert coverage(counts, 0.5) == pytest.approx(2 * 0.674 * 0.1, abs=0.01)  # of one level, what the interval takes
 
 
 def test_samples_that_do_not_differ_have_no_scale() -> None:
     same = torch.full((T, 3, H, W), 0.3)
-    counts = distances(held_out(same + 0.1), drawn(same, same)).counts["all"]
+    counts = distances(held_out(same + 0.1), drawn(same, same))["all"]
     assert coverage(counts, 0.95, 1e6) == 0.0
     with pytest.raises(DataError):
         best_scale(counts)
     with pytest.raises(DataError):
-        calibrate([spread_by(1.0), spread_by(1.0, seed=1)])  # of one scene
+        calibrate([("a", spread_by(1.0)), ("a", spread_by(1.0, seed=1))])  # of one scene
 
 
 def test_the_scale_of_one_half_is_reported_on_the_other() -> None:
-    found = calibrate([spread_by(1.0 if i % 2 else 3.0, seed=i, scene=f"s{i}") for i in range(4)])
+    found = calibrate([(f"s{i}", spread_by(1.0 if i % 2 else 3.0, seed=i)) for i in range(4)])
     assert found.fitted == ("s0", "s2")
     assert found.reported == ("s1", "s3")
     assert found.scale == pytest.approx(3.0, rel=0.03)

@@ -36,7 +36,7 @@ def calibrate_command(
         from gcd_train.evaluation.calibration import CalibrationNote, calibrate, write_calibration
         from gcd_train.evaluation.methods import SynthesizedViews
         from gcd_train.evaluation.opening import ClipOptions, open_clips
-        from gcd_train.evaluation.plots import require_matplotlib
+        from gcd_train.pictures import require_matplotlib
 
         require_matplotlib()  # now, not after an hour
         path = None if store is None else _weights_file(weights, store, steps)
@@ -48,7 +48,7 @@ def calibrate_command(
         clips, notes = open_clips(ClipOptions(data=data, split=split, limit=limit, seed=seed), model.traits)
         for line in notes:
             say(line)
-        views = SynthesizedViews.of(model, clips, RenderOptions(steps=steps, samples=samples, seed=seed))
+        views = SynthesizedViews.of(lambda: model, clips, RenderOptions(steps=steps, samples=samples, seed=seed))
         if views.paints_classes:
             raise RecipeError(f"{model.traits.name} paints classes, which have no intervals; calibrate one of colours")
         measured, unreadable = _measured(clips, views)
@@ -90,11 +90,11 @@ def _weights_file(weights: str, store: Path, steps: int | None) -> Path:
     return weights_path(weights)
 
 
-def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Distances], tuple[str, ...]]":
+def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[tuple[str, Distances]], tuple[str, ...]]":
     """Of every clip that can be read; of the others the reason. Raises DataError where none can."""
     from gcd_train.evaluation.calibration import distances
 
-    measured: list[Distances] = []
+    measured: list[tuple[str, Distances]] = []
     unreadable: list[str] = []
     with progress_bar("held-out clips", len(clips.keys)) as show:
         for number, key in enumerate(clips.keys, 1):
@@ -104,7 +104,7 @@ def _measured(clips: "EvaluationSet", views: "Predictor") -> "tuple[Sequence[Dis
                 unreadable.append(f"{key}: {error}")
                 say(f"left out {key}: {error}")
             else:
-                measured.append(distances(clip, views.predict(clip.seen)))
+                measured.append((clip.scene, distances(clip, views.predict(clip.seen))))
             show(number)
     if not measured:
         raise DataError(f"none of the {len(clips.keys)} clips can be read: {unreadable[0]}")

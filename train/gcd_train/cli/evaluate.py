@@ -14,7 +14,7 @@ from gcd_train.errors import RecipeError, TrainError
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
-from gcd_train.evaluation.plan import EvaluateOptions, planned, run_note
+from gcd_train.evaluation.methods import EvaluateOptions, planned, run_note
 from gcd_train.evaluation.report import make_report
 from gcd_train.evaluation.store import RunKeeper
 
@@ -114,14 +114,14 @@ def _one(weights: list[str] | None) -> str | None:
 
 def _evaluate(options: EvaluateOptions, out: Path, *, views: KeptViews, workers: int, ray: str | None) -> None:
     out.mkdir(parents=True, exist_ok=True)  # to know at once
-    plan = planned(options)
-    for line in plan.notes:
+    clips, methods, notes = planned(options)
+    for line in notes:
         say(line)
-    with RunKeeper(out).in_use(run_note(plan, options, command_line())):
+    with RunKeeper(out).in_use(run_note(clips, methods, options, command_line())):
         work = ClipWork(
             folder=out.resolve(),
-            clips=plan.clips,
-            makers={method.name: method.make for method in plan.methods},
+            clips=clips,
+            methods={method.name: method for method in methods},
             lpips=None if options.lpips is None else options.lpips.resolve(),
             views=views,
         )

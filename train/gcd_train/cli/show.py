@@ -43,9 +43,9 @@ def show(
 ) -> None:
     """Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."""
     with errors_shown():
-        from gcd_train.evaluation.plots import require_matplotlib
         from gcd_train.look.open_scene import ShowOptions, open_scene
         from gcd_train.look.sheet import write_sheet, write_trajectory, write_video
+        from gcd_train.pictures import require_matplotlib
 
         require_matplotlib()
         _refuse_unwritable(out)

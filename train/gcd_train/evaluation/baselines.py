@@ -1,67 +1,200 @@
-"""Every baseline by name, and what it is built from."""
+"""The baselines: copies, reprojections, HexPlane, video out of a picture."""
 
-import difflib
 import hashlib
-import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Self
+from dataclasses import asdict, dataclass, field, replace
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gcd_model import (
-    Augmentation,
-    Clip,
-    RenderOptions,
-    SourceFeatures,
-    ViewSynthesizer,
-    inspect_weights,
-    load_synthesizer,
-    weights_path,
-)
+from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures
+from gcd_model.clip import nearest_classes, palette
+from gcd_model.config import SemanticClass
 from gcd_model.diffusion import unit_noise
-from gcd_model.geometry import pose_trajectory
-from gcd_train.data.sample import to_network
-from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.clips import EvaluationSet
+from gcd_model.geometry.trajectory import pose_trajectory
+from gcd_train.data.sample import Bytes, SceneView, to_network
+from gcd_train.errors import DataError
 from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
-from gcd_train.evaluation.predictors import CopySource, Maker, Method, Prediction, SourceClip, to_pictures
-from gcd_train.evaluation.reprojection import (
-    REPROJECT_RGBD,
-    REPROJECT_SEMD,
-    GroundHomography,
-    ReprojectRgbd,
-    ReprojectSemd,
+from gcd_train.evaluation.metrics import NO_CLASS
+from gcd_train.evaluation.predictors import (
+    CameraPair,
+    OpenedWeights,
+    Prediction,
+    SourceClip,
+    own_views,
+    pixel_rays,
+    to_labels,
+    to_pictures,
+    to_pixels,
 )
+from gcd_train.pointcloud import SplatOptions, published_tensor
 
-VANILLA_SVD = "vanilla_svd"
-"""Stable Video Diffusion."""
+VANILLA_SVD, REPROJECT_RGBD, REPROJECT_SEMD = "vanilla_svd", "reproject_rgbd", "reproject_semd"
 MOTION_BUCKET = 127.0
 """What Stable Video Diffusion is told of the motion: the middle of its range."""
 FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
 """Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
 
+_NEAREST_SOURCE_M = 0.1  # in front of the source camera
+_KERNEL, _SIGMA = 3, 0.75
+_HOLE = 0.5  # share of a pixel below which it counts as a hole
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class BaselineSettings:
-    """What baselines are built from.
+class Baseline:
+    """What all that moves the source about has; see Predictor. published: points count as released, `SplatOptions`."""
 
-    svd: the published weights, for vanilla SVD. device, dtype: see `gcd_model.load_synthesizer`. samples: draws of
-    what draws. seed: of all noise. published: points are counted as released, see `SplatOptions`. hexplane: what is
-    learnt of each clip.
+    name: str
+    privileged: bool = False
+    published: bool = False
+
+    @property
+    def details(self) -> dict[str, str]:
+        return {"baseline": self.name} | ({"published rounding": "yes"} if self.published else {})
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CopySource(Baseline):
+    """The source picture and its class map, as if they were the target's."""
+
+    name: str = "copy_source"
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. The class map is the source's exact one."""
+        return Prediction(video=to_pictures(clip.source), classes=to_labels(clip.source_classes))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GroundHomography(Baseline):
+    """The source picture and its class map as the target camera sees them if all of it lies on the ground.
+
+    Black, and of no class, where the target camera looks above the horizon or the source does not see the ground.
     """
 
-    svd: str | None = None
-    device: str = "auto"
-    dtype: str | None = None
-    samples: int = 1
-    seed: int = 0
-    published: bool = False
-    hexplane: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
+    name: str = "ground_homography"
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. The class map is warped from the source's exact one."""
+        grid, seen = ground_grid(clip.cameras)
+        video = F.grid_sample(to_pictures(clip.source), grid, padding_mode="border", align_corners=False)
+        classes = labels = to_labels(clip.source_classes)
+        if labels is not None:
+            each = labels[:, None].float()
+            moved = F.grid_sample(each, grid, mode="nearest", padding_mode="border", align_corners=False)
+            classes = torch.where(seen, moved[:, 0].to(torch.uint8), NO_CLASS)
+        return Prediction(video=torch.where(seen[:, None], video, 0.0), classes=classes)
+
+
+def ground_grid(cameras: CameraPair) -> tuple[Tensor, Tensor]:
+    """Sampling grid float32 [T, H, W, 2] and where it is meant, bool [T, H, W].
+
+        H = R + t n^T / d        for the plane n . x = d in the target camera's axes
+
+    takes rays of the target camera to rays of the source camera that meet the same point of the ground; H r is the
+    point itself over the multiple of r at which r meets the plane.
+    Source: Hartley and Zisserman 2004, result 13.1, with the opposite sign of d.
+    """
+    ground_from_target = cameras.ground_from_source @ cameras.source_from_target
+    normal = -ground_from_target[:, 2, :3]  # downwards, in the target camera's axes
+    height_m = ground_from_target[:, 2, 3]  # above the ground
+    turn, step = cameras.source_from_target[:, :3, :3], cameras.source_from_target[:, :3, 3]
+    homography = turn + step[:, :, None] * normal[:, None, :] / height_m[:, None, None]
+    rays = pixel_rays(cameras.target)
+    points = torch.einsum("tij,hwj->thwi", homography, rays)
+    below = torch.einsum("ti,hwi->thw", normal, rays) / height_m[:, None, None]  # 1 / reach, positive on the ground
+    ahead = points[..., 2] > _NEAREST_SOURCE_M * below.clamp(min=0.0)
+    size = points.new_tensor([cameras.source.width, cameras.source.height])
+    grid = to_pixels(points, cameras.source) * 2 / size - 1
+    seen = (below > 0) & ahead & (grid.abs() <= 1).all(dim=-1)
+    return grid.nan_to_num().clamp(-2.0, 2.0).float(), seen
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReprojectRgbd(Baseline):
+    """The source's colours where its depth puts them; black where no point falls within a pixel.
+
+    Source: Van Hoorick et al. 2024 (GCD), section 5, "Reproject RGB-D"; the renderer as released.
+    """
+
+    name: str = REPROJECT_RGBD
+    privileged: bool = True
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. No class map. Raises DataError where colour, depth and lens are of different sizes."""
+        return Prediction(video=_published(clip, source_views(clip), None, self.published))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReprojectSemd(Baseline):
+    """The source's class map in colours, drawn where its depth puts them, and read back: the nearest colour's class.
+
+    A pixel of which points cover less than half is a hole, and of no class: wrong, whatever the target shows. Colours
+    are read as if points covered the whole pixel, so that edges of holes are not darker than what is there.
+
+    classes: by id.
+    Source: Van Hoorick et al. 2024 (GCD), section 5, "Reproject Sem-D". How colours are read back, and what holes count
+    as, is not published.
+    """
+
+    classes: tuple[SemanticClass, ...]
+    name: str = REPROJECT_SEMD
+    privileged: bool = True
+
+    def predict(self, clip: SourceClip) -> Prediction:
+        """See Predictor. A class map alone. Raises DataError for a clip without classes."""
+        views = source_views(clip)
+        colours = palette(self.classes).numpy()
+        painted = [colours[_ids(view, len(self.classes), clip.key)] for view in views]
+        white = [np.full_like(each, 255) for each in painted]  # drawn with it, for how much of a pixel points cover
+        both = [np.concatenate(each, axis=-1) for each in zip(painted, white, strict=True)]
+        drawn = _published(clip, views, both, self.published)
+        cover = drawn[:, 3:4]
+        read = nearest_classes(drawn[:, :3] / cover.clamp(min=_HOLE), self.classes)
+        return Prediction(classes=torch.where(cover[:, 0] < _HOLE, NO_CLASS, read))
+
+
+def source_views(clip: SourceClip) -> Sequence[SceneView]:
+    """The T views of the source camera: as the data set holds them where the clip tells, else as the clip shows them.
+
+    The clip's own stand in the axes of the source camera, with its declared lens.
+    """
+    return clip.points or own_views(clip.source, clip.source_depth, clip.source_classes, clip.cameras.source)
+
+
+def _published(clip: SourceClip, views: Sequence[SceneView], values: Sequence[Bytes] | None, published: bool) -> Tensor:
+    """What the target camera sees of them, float32 [T, C, H, W] in [0, 1].
+
+    values: uint8 [H, W, C] for each, shown instead of the colours.
+    """
+    lens, poses = clip.cameras.target, clip.cameras.source_from_target.numpy()
+    options = replace(SplatOptions(), published=published)
+    frames = [
+        published_tensor(
+            [view],
+            view.world_from_camera @ pose,
+            lens,
+            width=lens.width,
+            height=lens.height,
+            values=None if values is None else [values[t]],
+            options=options,
+            kernel=_KERNEL,
+            sigma=_SIGMA,
+        )
+        for t, (view, pose) in enumerate(zip(views, poses, strict=True))
+    ]
+    return torch.stack(frames).permute(0, 3, 1, 2)
+
+
+def _ids(view: SceneView, count: int, key: str) -> Bytes:
+    if view.classes is None:
+        raise DataError(f"{REPROJECT_SEMD} wants clips with class maps, got {key or 'one'} without; leave it out")
+    if int(view.classes.max()) >= count:
+        raise DataError(
+            f"{key or 'a clip'} has class {int(view.classes.max())} of {count}; are the ontologies the same?"
+        )
+    return view.classes
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -80,13 +213,16 @@ class HexPlane:
 
     @property
     def name(self) -> str:
-        """`hexplane_K`."""
         return f"hexplane_{self.views}"
 
     @property
     def privileged(self) -> bool:
-        """True from two views on."""
         return self.views > 1
+
+    @property
+    def details(self) -> dict[str, str]:
+        learnt = {key: str(value) for key, value in asdict(self.settings).items()}
+        return {"baseline": self.name, "seed": str(self.seed), **learnt}
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. Raises DataError where the clip's scene has fewer cameras."""
@@ -102,16 +238,11 @@ class HexPlane:
             for colours, time in zip(to_pictures(clip.source), times, strict=True)
         ]
         for video in clip.others(self.views - 1) if clip.others is not None and self.views > 1 else ():
-            pictures += [
-                (
-                    to_pictures(view.rgb[None])[0],
-                    Camera(lens=view.lens, world_from_camera=torch.from_numpy(view.world_from_camera), time=time),
-                )
-                for view, time in zip(video, times, strict=True)
-            ]
+            for view, time in zip(video, times, strict=True):
+                camera = Camera(lens=view.lens, world_from_camera=torch.from_numpy(view.world_from_camera), time=time)
+                pictures.append((to_pictures(view.rgb[None])[0], camera))
         wanted = own.ground_from_source @ own.source_from_target  # [T, 4, 4]
-        known = torch.stack([camera.world_from_camera for _, camera in pictures])
-        bounds = SceneBounds.around(torch.cat([known, wanted]))
+        bounds = SceneBounds.around(torch.stack([*(camera.world_from_camera for _, camera in pictures), *wanted]))
         field = learn(pictures, bounds, self.settings, frames=frames, seed=self.seed, device=self.device)
         drawn = [
             draw(field, Camera(lens=own.target, world_from_camera=pose, time=time), self.settings)
@@ -127,47 +258,24 @@ class VanillaSVD:
     The frame is stretched to the size the network was trained at, and what comes out is stretched back: nothing is
     cropped, so that all of the target is measured.
 
-    synthesizer: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
+    weights: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
         the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
-        the clip's key.
+        the clip's key. details: see Predictor.
     Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
     """
 
-    synthesizer: ViewSynthesizer
+    weights: OpenedWeights
     size: tuple[int, int] | None = None
     steps: int | None = None
     samples: int = 1
     seed: int = 0
     name: str = VANILLA_SVD
     privileged: bool = False
-
-    @classmethod
-    def open(cls, weights: str | Path, settings: BaselineSettings | None = None) -> Self:
-        """The published file `svd.safetensors`, its diffusers folder, or our own weights of the same task.
-
-        Args:
-            weights: see `gcd_model.load_synthesizer`; a published file is taken to be SVD, whatever it is called.
-        Raises:
-            CheckpointError: the file is missing, damaged or of another architecture.
-            DataError: it is steered: that is another task.
-        """
-        settings = settings or BaselineSettings()
-        of_ours = isinstance(weights, str) and weights.startswith(("package:", "random:"))
-        family = None if of_ours or inspect_weights(weights).family else "svd"
-        opened = load_synthesizer(weights, family=family, device=settings.device, dtype=settings.dtype)
-        return cls(synthesizer=opened, samples=settings.samples, seed=settings.seed)
-
-    def __post_init__(self) -> None:
-        traits = self.synthesizer.traits
-        if traits.config.camera != "none":
-            raise DataError(
-                f"{self.name} wants weights that make a video out of a picture, {traits.name} is told a camera path; "
-                "give svd.safetensors"
-            )
+    details: dict[str, str] = field(default_factory=dict[str, str])
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. No class map. Raises DataError for a clip that is longer than what the network makes."""
-        traits, frames = self.synthesizer.traits, len(clip.source)
+        traits, frames = self.weights().traits, len(clip.source)
         if frames > traits.config.frames:
             raise DataError(
                 f"{traits.name} makes {traits.config.frames} frames, {clip.key or 'a clip'} has {frames}; evaluate on "
@@ -183,20 +291,20 @@ class VanillaSVD:
 
     def _features(self, clip: SourceClip) -> SourceFeatures:
         """Of the first frame, encoded once, for all frames."""
-        config = self.synthesizer.traits.config
+        config = self.weights().traits.config
         height, width = self.size or (config.height, config.width)
         first = _stretched(to_network(clip.source[:1]), height, width, low=-1.0)
         noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(clip.key)))
-        told = self.synthesizer.encode(Clip(video=first, fps=clip.fps), noise)
-        tokens = None if told.tokens is None else told.tokens.repeat(config.frames, 1)
-        return replace(told, tokens=tokens, latents=told.latents.repeat(config.frames, 1, 1, 1))
+        made = self.weights().encode(Clip(video=first, fps=clip.fps), noise)
+        tokens = None if made.tokens is None else made.tokens.repeat(config.frames, 1)
+        return replace(made, tokens=tokens, latents=made.latents.repeat(config.frames, 1, 1, 1))
 
     def _draw(self, features: SourceFeatures, key: str, number: int) -> Tensor:
         """One video, [T, 3, H, W] in [0, 1]: draws go one by one, as full size leaves no room for two."""
         still = torch.eye(4, dtype=torch.float64).repeat(features.frames, 1, 1)
         seed = self._seed(f"{key}#{number}")
         options = RenderOptions(steps=self.steps, seed=seed, motion_bucket=MOTION_BUCKET)
-        (view,) = self.synthesizer.render(features, [pose_trajectory(still)], options)
+        (view,) = self.weights().render(features, [pose_trajectory(still)], options)
         return view.video
 
     def _seed(self, name: str) -> int:
@@ -209,81 +317,3 @@ def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -
         return pictures
     resized = F.interpolate(pictures, size=(height, width), mode="bicubic", align_corners=False, antialias=True)
     return resized.clamp(low, 1.0)
-
-
-def hexplane_views(name: str) -> int | None:
-    """How many views the HexPlane of this name is given; None for another method."""
-    found = re.fullmatch(r"hexplane_([1-9]\d*)", name)
-    return None if found is None else int(found[1])
-
-
-def baselines(names: Sequence[str] | None, clips: EvaluationSet, settings: BaselineSettings) -> tuple[Method, ...]:
-    """Baselines by name; those that need nothing but the clips where none are named.
-
-    Raises:
-        RecipeError: there is none of a name, or it lacks what it needs.
-        CheckpointError: vanilla SVD's weights cannot be opened.
-    """
-    if names is None:
-        left_out = {REPROJECT_RGBD} if clips.painted else set[str]() if clips.classes else {REPROJECT_SEMD}
-        names = [name for name in _USUAL if name not in left_out]
-    return tuple(_baseline(name, clips, settings) for name in names)
-
-
-def _baseline(name: str, clips: EvaluationSet, settings: BaselineSettings) -> Method:
-    views = hexplane_views(name)
-    if clips.painted and (views or name in (REPROJECT_RGBD, VANILLA_SVD)):
-        raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
-    if views:
-        return _hexplane(name, views, clips.cameras, settings)
-    if name == VANILLA_SVD:
-        return _vanilla_svd(settings)
-    if name == REPROJECT_SEMD and not clips.classes:
-        raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
-    makers: dict[str, Maker] = {
-        "copy_source": CopySource,
-        "ground_homography": GroundHomography,
-        REPROJECT_RGBD: partial(ReprojectRgbd, published=settings.published),
-        REPROJECT_SEMD: partial(ReprojectSemd, classes=clips.classes, published=settings.published),
-    }
-    if name not in makers:
-        every = (*makers, VANILLA_SVD, *(f"hexplane_{views}" for views in (1, 2, 4, 8)))  # any other number goes too
-        near = difflib.get_close_matches(name, every, n=1)
-        meant = f"did you mean {near[0]}? " if near else ""
-        raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")
-    rounded = settings.published and name in (REPROJECT_RGBD, REPROJECT_SEMD)
-    told = {"baseline": name} | ({"published rounding": "yes"} if rounded else {})
-    return Method(name=name, make=makers[name], told=told)
-
-
-def _hexplane(name: str, views: int, cameras: int, settings: BaselineSettings) -> Method:
-    if views > cameras:
-        there = f"{cameras - 1} beside the source" if cameras > 1 else "the source alone"
-        raise RecipeError(
-            f"{name} wants {views} cameras, and these clips have {there}; give hexplane_{cameras} or less"
-        )
-    learnt = {key: str(value) for key, value in asdict(settings.hexplane).items()}
-    make = partial(HexPlane, views=views, settings=settings.hexplane, seed=settings.seed, device=settings.device)
-    return Method(name=name, make=make, told={"baseline": name, "seed": str(settings.seed), **learnt})
-
-
-def _vanilla_svd(settings: BaselineSettings) -> Method:
-    """Its weights are opened where they are used; what they are is asked here."""
-    if settings.svd is None:
-        raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
-    kind, _, name = settings.svd.partition(":")
-    if kind == "random":
-        family, weights = name, settings.svd
-    else:
-        inspected = inspect_weights(weights_path(settings.svd))
-        family, weights = inspected.family or "svd", inspected.digest[:12]
-    if family != "svd":
-        raise RecipeError(
-            f"{VANILLA_SVD} wants weights that make a video out of a picture, {settings.svd} is of the family "
-            f"{family}; give svd.safetensors"
-        )
-    told = {"baseline": VANILLA_SVD, "samples": str(settings.samples), "seed": str(settings.seed), "weights": weights}
-    return Method(name=VANILLA_SVD, make=partial(VanillaSVD.open, settings.svd, settings), told=told)
-
-
-_USUAL = ("copy_source", "ground_homography", REPROJECT_RGBD, REPROJECT_SEMD)

@@ -11,9 +11,9 @@ The first frame is left out: there the target camera of a gradual path stands wh
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
@@ -24,12 +24,12 @@ from torch import Tensor
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.metrics import pixel_deviation
-from gcd_train.evaluation.plots import new_figure, save
 from gcd_train.evaluation.predictors import Prediction, to_pictures
 from gcd_train.evaluation.statistics import FEW_SCENES, FIRST_MEASURED
 from gcd_train.evaluation.store import Region
 from gcd_train.evaluation.tables import counted, markdown_rows
 from gcd_train.files import write_whole
+from gcd_train.pictures import new_figure, save
 
 LEVELS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 """Shares of pixels that intervals are meant to hold, 5 % to 95 %."""
@@ -105,12 +105,8 @@ class CalibrationNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         return few if self.scenes < FEW_SCENES else ""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Distances:
-    """One clip's counts, by region. scene: the clip's."""
-
-    scene: str
-    counts: Mapping[Region, Counts]
+Distances: TypeAlias = Mapping[Region, Counts]
+"""One clip's counts, by region."""
 
 
 def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
@@ -135,10 +131,7 @@ def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
     if clip.visible is not None:
         seen = torch.from_numpy(clip.visible[FIRST_MEASURED:])[:, None].expand_as(places)
         parts |= {"visible": places[seen], "occluded": places[~seen]}
-    counts: dict[Region, Counts] = {
-        name: np.bincount(part.flatten().numpy(), minlength=_BINS).astype(np.int64) for name, part in parts.items()
-    }
-    return Distances(scene=clip.scene, counts=counts)
+    return {name: np.bincount(part.flatten().numpy(), minlength=_BINS).astype(np.int64) for name, part in parts.items()}
 
 
 def coverage(counts: Counts, level: float, scale: float = 1.0) -> float:
@@ -178,33 +171,33 @@ def best_scale(counts: Counts) -> float:
     return float(2.0 ** ((low + high) / 2))
 
 
-def calibrate(clips: Sequence[Distances]) -> Calibration:
+def calibrate(clips: Sequence[tuple[str, Distances]]) -> Calibration:
     """Choose the scale on every other scene, and measure on those between.
 
+    Args:
+        clips: each with its scene.
     Raises: DataError for fewer than two scenes, or as `best_scale`.
     """
-    scenes = sorted({clip.scene for clip in clips})
+    scenes = sorted({scene for scene, _ in clips})
     if len(scenes) < 2:
         raise DataError(f"a scale is chosen on half of the scenes and tried on the others: 2 wanted, got {len(scenes)}")
 
     def summed(chosen: Sequence[str], region: Region) -> Counts:
-        each = [clip.counts[region] for clip in clips if clip.scene in chosen and region in clip.counts]
+        each = [counts[region] for scene, counts in clips if scene in chosen and region in counts]
         return np.sum(each, axis=0) if each else np.zeros(_BINS, np.int64)
 
     fitted, reported = tuple(scenes[::2]), tuple(scenes[1::2])
-    scale = best_scale(summed(fitted, "all"))
-    by_region: dict[Region, Counts] = {region: summed(reported, region) for region in clips[0].counts}
-    regions: dict[Region, Reliability] = {
-        region: Reliability(
-            colours=int(counts.sum()),
-            held=tuple(coverage(counts, level) for level in LEVELS),
-            held_scaled=tuple(coverage(counts, level, scale) for level in LEVELS),
-            miscoverage=miscoverage(counts),
-            miscoverage_scaled=miscoverage(counts, scale),
-        )
-        for region, counts in by_region.items()
-        if counts.any()
-    }
+    scale, regions = best_scale(summed(fitted, "all")), dict[Region, Reliability]()
+    for region in clips[0][1]:
+        counts = summed(reported, region)
+        if counts.any():
+            regions[region] = Reliability(
+                colours=int(counts.sum()),
+                held=tuple(coverage(counts, level) for level in LEVELS),
+                held_scaled=tuple(coverage(counts, level, scale) for level in LEVELS),
+                miscoverage=miscoverage(counts),
+                miscoverage_scaled=miscoverage(counts, scale),
+            )
     return Calibration(scale=scale, fitted=fitted, reported=reported, levels=LEVELS, regions=regions)
 
 
@@ -213,22 +206,11 @@ def write_calibration(note: CalibrationNote, folder: Path) -> str:
 
     Raises: RunError if they cannot be written, RenderError without matplotlib.
     """
-    text = _text(note)
-    write_whole(folder / "calibration.json", msgspec.json.format(msgspec.json.encode(note), indent=1))
-    write_whole(folder / "calibration.md", text.encode())
-    _write_plot(note.found, folder / "reliability.png")
-    return text
-
-
-def _text(note: CalibrationNote) -> str:
-    """Markdown: one row for each kind of pixel."""
-    found = note.found
-    told = [*(f"{100 * level:.0f} % interval holds" for level in STATED), "mean absolute miscoverage"]
-    columns = ["pixels", *(heading for each in told for heading in (each, "with the scale"))]
-    rows: list[list[str]] = []
+    found, rows = note.found, list[list[str]]()
+    shown = [LEVELS.index(level) for level in STATED]
+    headings = [*(f"{100 * level:.0f} % interval holds" for level in STATED), "mean absolute miscoverage"]
     for region, of in found.regions.items():
-        places = [LEVELS.index(level) for level in STATED]
-        held = [f"{100 * share:.0f} %" for place in places for share in (of.held[place], of.held_scaled[place])]
+        held = [f"{100 * share:.0f} %" for place in shown for share in (of.held[place], of.held_scaled[place])]
         rows.append([region, *held, f"{of.miscoverage:.3f}", f"{of.miscoverage_scaled:.3f}"])
     lines = [
         f"# Calibration of {note.weights}",
@@ -240,10 +222,14 @@ def _text(note: CalibrationNote) -> str:
         f"{len(found.reported)}.",
         "",
         *([f"{note.warning}\n"] if note.warning else []),
-        *markdown_rows(columns, rows),
+        *markdown_rows(["pixels", *(each for head in headings for each in (head, "with the scale"))], rows),
         *(f"\nNot read: {why}" for why in note.unreadable),
     ]
-    return "\n".join(lines) + "\n"
+    text = "\n".join(lines) + "\n"
+    write_whole(folder / "calibration.json", msgspec.json.format(msgspec.json.encode(note), indent=1))
+    write_whole(folder / "calibration.md", text.encode())
+    _write_plot(found, folder / "reliability.png")
+    return text
 
 
 def _write_plot(found: Calibration, out: Path) -> None:

@@ -136,7 +136,6 @@ class PairedSet(EvaluationSet):
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """See EvaluationSet."""
         return tuple(self.numbers)
 
     def clip(self, key: str, /) -> HeldOutClip:
@@ -199,25 +198,18 @@ def seen_too(clip: PairedClip, cameras: CameraPair, *, picked: float = 0.0) -> N
 
 def identity_of(clips: PairedClips) -> str:
     """Digest of the worlds, and of every file of every clip by its checksum. Raises DataError."""
-    digest = hashlib.sha256(msgspec.json.encode(clips.worlds))
-    sums: dict[Path, dict[str, list[int]]] = {}
+    digest, sums = hashlib.sha256(msgspec.json.encode(clips.worlds)), dict[Path, dict[str, list[int]]]()
     for path, name in clips.places:
         if path not in sums:
-            sums[path] = _checksums(path)
+            sums[path] = {}
+            try:
+                with zipfile.ZipFile(path) as archive:
+                    for file in sorted(archive.infolist(), key=lambda each: each.filename):
+                        sums[path].setdefault(file.filename.partition("/")[0], []).append(file.CRC)
+            except ZIP_FAULTS as error:
+                raise DataError(f"{path} is damaged ({error}); delete it and generate again") from error
         digest.update(f"{name}{sums[path].get(name)}".encode())
     return digest.hexdigest()[:12]
-
-
-def _checksums(shard: Path) -> dict[str, list[int]]:
-    """Of the files of each clip, as the shard's directory tells them."""
-    sums: dict[str, list[int]] = {}
-    try:
-        with zipfile.ZipFile(shard) as archive:
-            for file in sorted(archive.infolist(), key=lambda each: each.filename):
-                sums.setdefault(file.filename.partition("/")[0], []).append(file.CRC)
-    except ZIP_FAULTS as error:
-        raise DataError(f"{shard} is damaged ({error}); delete it and generate again") from error
-    return sums
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +281,7 @@ class SceneSet(EvaluationSet):
             fps=sample.fps,
             key=key,
             others=partial(self._others, sample.scene, sample.frame_numbers),
-            points=partial(tuple[SceneView, ...], views) if own else None,
+            points=views if own else (),
         )
 
     def _cameras(self, sample: Sample, first: SceneView) -> CameraPair:

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 from typing import Literal, TypeAlias
@@ -18,9 +19,10 @@ from gcd_model.config import SemanticClass
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.clips import HeldOutClip
 from gcd_train.evaluation.predictors import Prediction, to_labels
-from gcd_train.evaluation.runs import EvaluatedSet, Method
+from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
 from gcd_train.evaluation.store import RunKeeper
 from gcd_train.files import write_whole
+from gcd_train.pictures import png
 
 Pictures = NDArray[np.uint8]
 
@@ -74,11 +76,6 @@ def _wanted(which: KeptViews, frames: int) -> range:
     return {"none": range(0), "last": range(frames - 1, frames)}.get(which, range(frames))
 
 
-def shown_frames(count: int) -> list[int]:
-    """Those of so many frames that a row of a sheet shows, evenly among them."""
-    return np.linspace(0, count - 1, min(SHOWN_FRAMES, count)).round().astype(int).tolist()
-
-
 def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:
     """Class ids uint8 [T, H, W] in colours, uint8 [T, H, W, 3]; what is of no class is black."""
     colours = torch.zeros(256, 3, dtype=torch.uint8)
@@ -90,13 +87,6 @@ def painted(labels: Tensor, classes: Sequence[SemanticClass]) -> Pictures:
 def to_bytes(video: Tensor) -> Pictures:
     """float32 [T, 3, H, W] in [0, 1] -> uint8 [T, H, W, 3]."""
     return (video.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
-
-
-def png(picture: Pictures) -> bytes:
-    """A PNG file of an RGB picture, uint8 [H, W, 3]."""
-    done, data = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2BGR))
-    assert done, "PNG takes any picture"
-    return data.tobytes()
 
 
 _GAP, _MARGIN, _INK = 4, 140, (40, 40, 40)
@@ -119,9 +109,9 @@ class Strip:
         return cls(name=name, frames=dict(enumerate(frames)))
 
 
-def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tuple[str, ...]:
+def shown_clips(of: EvaluatedSet, methods: Sequence[MethodRecords], count: int) -> tuple[str, ...]:
     """So many clips whose frames were kept, evenly among them; one of a scene before a second of another."""
-    kept = [key for key in of.keys if any(_folder(method, key).is_dir() for method in methods)]
+    kept = [key for key in of.clips if any(_folder(method, key).is_dir() for method in methods)]
     scenes = {record.key: record.scene for method in methods for record in method.records}
     first = list({scenes.get(key, key): key for key in reversed(kept)}.values())[::-1]
     chosen = first if len(first) >= count else kept
@@ -129,7 +119,7 @@ def shown_clips(of: EvaluatedSet, methods: Sequence[Method], count: int) -> tupl
     return tuple(chosen[place] for place in places)
 
 
-def strips(methods: Sequence[Method], key: str) -> tuple[Strip, ...]:
+def strips(methods: Sequence[MethodRecords], key: str) -> tuple[Strip, ...]:
     """Source, each method that kept frames of this clip, target; class maps beside the pictures they belong to.
 
     Raises DataError for a damaged picture.
@@ -159,18 +149,16 @@ def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None
 
 
 def write_mp4(frames: Iterable[Pictures], fps: float, out: Path) -> None:
-    """Pictures of one even size, as MPEG-4 part 2. Raises RunError if it cannot be written."""
+    """One picture or more of one even size, as MPEG-4 part 2. Raises RunError if it cannot be written."""
     out.parent.mkdir(parents=True, exist_ok=True)
-    video: cv2.VideoWriter | None = None
-    for frame in frames:
-        if video is None:
-            size = (frame.shape[1], frame.shape[0])
-            video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
-            if not video.isOpened():
-                raise RunError(f"{out} cannot be written; give a folder that takes files with --out")
+    each = iter(frames)
+    first = next(each)
+    video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), fps, (first.shape[1], first.shape[0]))
+    if not video.isOpened():
+        raise RunError(f"{out} cannot be written; give a folder that takes files with --out")
+    for frame in chain([first], each):
         video.write(frame[..., ::-1])
-    if video is not None:
-        video.release()
+    video.release()
 
 
 def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
@@ -186,7 +174,7 @@ def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
     return True
 
 
-def _folder(method: Method, key: str) -> Path:
+def _folder(method: MethodRecords, key: str) -> Path:
     return RunKeeper(method.folder).views(method.name, key)
 
 
@@ -203,7 +191,8 @@ def _read(folder: Path) -> dict[int, Pictures]:
 
 def _row(label: str, strip: Strip) -> Pictures:
     numbers = sorted(strip.frames)
-    pictures = [strip.frames[numbers[place]] for place in shown_frames(len(numbers))]
+    places = np.linspace(0, len(numbers) - 1, min(SHOWN_FRAMES, len(numbers))).round().astype(int)  # evenly
+    pictures = [strip.frames[numbers[place]] for place in places]
     lines = (*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS))
     height = max(pictures[0].shape[0], max(3, len(lines)) * _LINE)
     margin = np.full((height + _GAP, _MARGIN, 3), 255, np.uint8)

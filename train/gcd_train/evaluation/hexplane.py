@@ -64,14 +64,20 @@ class SceneBounds:
 
     @classmethod
     def around(cls, world_from_camera: Tensor) -> "SceneBounds":
-        """The cube where the cameras look.
+        """The cube about the point with the least summed squared distance to the cameras' optical axes.
+
+        Where all axes are parallel, that is the point on them 10 m ahead.
 
         Args:
             world_from_camera: float [M, 4, 4], input and wanted cameras, metres.
         """
         poses = world_from_camera.double()
-        centre = nearest_to_axes(poses)
-        distances = (poses[:, :3, 3] - centre).norm(dim=-1)
+        position, ahead = poses[:, :3, 3], poses[:, :3, 2]
+        across = torch.eye(3, dtype=torch.float64) - ahead[:, :, None] * ahead[:, None, :]  # [M, 3, 3]
+        guess = (position + _GUESS_M * ahead).mean(dim=0)
+        left = across.sum(dim=0) + _PULL * torch.eye(3, dtype=torch.float64)
+        centre = torch.linalg.solve(left, torch.einsum("mij,mj->i", across, position) + _PULL * guess)
+        distances = (position - centre).norm(dim=-1)
         half_m = max(float(distances.max()) * _INNER, 1e-3)
         nearest, farthest = (float(distance) / half_m for distance in (distances.min(), distances.max()))
         return cls(centre=centre.float(), half_m=half_m, begin=nearest * _BEGIN, reach=farthest + _END)
@@ -86,24 +92,6 @@ class SceneBounds:
         scaled = (points - self.centre.to(points.device)) / self.half_m
         size = scaled.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
         return scaled * (2.0 - 1.0 / size) / size / 2.0
-
-    def to_distance(self, place: Tensor) -> Tensor:
-        """How far along a ray, metres, for places in [0, 1], evenly."""
-        return (self.begin + (self.reach - self.begin) * place) * self.half_m
-
-
-def nearest_to_axes(world_from_camera: Tensor) -> Tensor:
-    """The point with the least summed squared distance to the optical axes, float64 [3].
-
-    Args:
-        world_from_camera: float64 [M, 4, 4]. Where all axes are parallel, the point on them 10 m ahead.
-    """
-    position, ahead = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
-    across = torch.eye(3, dtype=torch.float64) - ahead[:, :, None] * ahead[:, None, :]  # [M, 3, 3]
-    guess = (position + _GUESS_M * ahead).mean(dim=0)
-    left = across.sum(dim=0) + _PULL * torch.eye(3, dtype=torch.float64)
-    right = torch.einsum("mij,mj->i", across, position) + _PULL * guess
-    return torch.linalg.solve(left, right)
 
 
 SPACE = ((0, 1), (0, 2), (1, 2))
@@ -134,14 +122,8 @@ class HexPlanes(nn.Module):
 
     def roughness(self) -> Tensor:
         """Mean squared difference between neighbouring cells, over both directions of all planes (total variation)."""
-        return torch.stack(
-            [
-                (table.diff(dim=axis) ** 2).mean()
-                for table in (self.space, self.time)
-                for axis in (2, 3)
-                if table.shape[axis] > 1
-            ]
-        ).sum()
+        steps = [table.diff(dim=axis) for table in (self.space, self.time) for axis in (2, 3)]
+        return torch.stack([(step**2).mean() for step in steps if step.numel()]).sum()
 
     @torch.no_grad()
     def refine(self, side: int) -> None:
@@ -226,9 +208,8 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     return layer
 
 
-_SPREAD = (
-    0.01  # weight that every stretch of a ray gets before samples are drawn, so that no surface is missed for good
-)
+# Weight that every stretch of a ray gets before samples are drawn, so that no surface is missed for good.
+_SPREAD = 0.01
 
 
 def render(
@@ -245,27 +226,29 @@ def render(
     even = torch.linspace(0.0, 1.0, coarse + 1, device=rays.device).expand(len(rays), -1)
     with torch.no_grad():
         searched = _jittered(even, generator)
-        features, lengths = _along(field, rays, searched)
-        found = weights(field.density(features).view_as(lengths) * lengths)
-        edges = resampled(searched, found, fine, generator)
-    features, lengths = _along(field, rays, edges)
-    share = weights(field.density(features).view_as(lengths) * lengths)
+        edges = resampled(searched, _shares(field, rays, searched)[1], fine, generator)
+    features, share = _shares(field, rays, edges)
     passed = 1.0 - share.sum(dim=1, keepdim=True)
     seen = (share[..., None] * field.colour(features).view(*share.shape, 3)).sum(dim=1)
     return seen + passed * field.background(rays[:, 3:6])
 
 
-def weights(optical_depth: Tensor) -> Tensor:
-    """What each stretch adds to the light of a ray; what is left to 1 comes from the background.
+def _shares(field: HexField, rays: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+    """Features in the middle of stretches, [P * N, D], and what each adds to the light of its ray, [P, N].
 
         w_i = exp(-sum over j < i of tau_j) (1 - exp(-tau_i))
 
-    Args:
-        optical_depth: tau, [P, N], density times length, nearest first.
+    What is left to 1 comes from the background. tau: density times length, nearest first.
     Source: Mildenhall et al. 2020 (NeRF), equation 3.
     """
+    bounds = field.bounds
+    distances = (bounds.begin + (bounds.reach - bounds.begin) * edges) * bounds.half_m
+    middle = (distances[:, 1:] + distances[:, :-1]) / 2.0
+    points = rays[:, None, :3] + middle[..., None] * rays[:, None, 3:6]
+    features = field(points.flatten(0, 1), rays[:, 6:].expand_as(middle).flatten())
+    optical_depth = field.density(features).view_as(middle) * distances.diff(dim=-1)
     before = optical_depth.cumsum(dim=-1) - optical_depth
-    return (-before).exp() * -torch.expm1(-optical_depth)
+    return features, (-before).exp() * -torch.expm1(-optical_depth)
 
 
 def resampled(edges: Tensor, share: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
@@ -294,15 +277,6 @@ def _jittered(edges: Tensor, generator: torch.Generator | None) -> Tensor:
     moved = torch.rand(edges.shape, generator=generator, device=generator.device).to(edges.device) - 0.5
     moved[:, 0] = moved[:, -1] = 0.0
     return edges + step * moved
-
-
-def _along(field: HexField, rays: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
-    """Features in the middle of stretches, [P * N, D], and the stretches' lengths in metres, [P, N]."""
-    distances = field.bounds.to_distance(edges)
-    middle = (distances[:, 1:] + distances[:, :-1]) / 2.0
-    points = rays[:, None, :3] + middle[..., None] * rays[:, None, 3:6]
-    times = rays[:, 6:].expand_as(middle)
-    return field(points.flatten(0, 1), times.flatten()), distances.diff(dim=-1)
 
 
 _RAYS_AT_ONCE = 4096  # drawn together without gradients: 4096 rays of 48 samples with 48 features are 38 MB

@@ -3,11 +3,11 @@
 import math
 import os
 import time
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
@@ -21,7 +21,7 @@ from gcd_train.errors import DataError, RunError, TrainError
 from gcd_train.evaluation import metrics
 from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
 from gcd_train.evaluation.galleries import FEW_CLIPS, KeptViews, has_views, write_views
-from gcd_train.evaluation.predictors import Maker, Prediction, Predictor, to_labels, to_pictures
+from gcd_train.evaluation.predictors import Prediction, Predictor, to_labels, to_pictures
 from gcd_train.evaluation.statistics import FIRST_MEASURED
 from gcd_train.evaluation.store import ClipRecord, Counted, Frames, Region, RegionRecord, RunKeeper
 from gcd_train.parallel import Outcome, map_items, one_thread_each
@@ -54,8 +54,14 @@ def predicted_and_measured(
     if painted:
         first, *more = (replace(draw, video=None, more=()) for draw in prediction.draws)
         prediction = replace(first, more=tuple(more))
-    target, draws = to_pictures(clip.target), _pictures(prediction, f"{predictor.name} on {clip.key}")
-    labels = _class_maps(clip, prediction, classes)
+    target, draws = to_pictures(clip.target), _alike([draw.video for draw in prediction.draws], "pictures")
+    if draws is not None and not draws.isfinite().all():
+        raise NonFiniteError(f"pictures must be finite to be measured; {predictor.name} on {clip.key} gave NaN or Inf")
+    draws = None if draws is None else draws.float()
+    said, true = _alike([draw.classes for draw in prediction.draws], "class maps"), to_labels(clip.target_classes)
+    labels, void = None, metrics.void_ids([each.name for each in classes])
+    if said is not None and true is not None and classes:
+        labels = (metrics.without_classes(said, void), metrics.without_classes(true, void))
     return prediction, ClipRecord(
         method=predictor.name,
         privileged=predictor.privileged,
@@ -82,7 +88,7 @@ def _regions(
 ) -> dict[Region, RegionRecord]:
     """Figures on all pixels and, where it is known which are visible, on those and the others.
 
-    draws: [S, T, 3, H, W]. labels: see `_class_maps`. classes: how many there are.
+    draws: [S, T, 3, H, W]. labels: what was said, [S, T, H, W], and what is true, [T, H, W]. classes: how many.
     """
     likeness = [] if draws is None else [metrics.ssim_map(each, target) for each in draws]  # [S][T, H-6, W-6]
     detail = [] if draws is None else [metrics.gradient_map(each) for each in draws]
@@ -105,45 +111,19 @@ def _regions(
                 found[name],
                 psnr_db=tuple(map(_frames, near)),
                 ssim=tuple(_within(each, inside) for each in likeness),
-                diversity=None if len(draws) < 2 else _frames(metrics.diversity(draws, mask)),
+                diversity=None if len(draws) < 2 else _within(metrics.pixel_deviation(draws), mask),
                 gradient=tuple(_within(each, mask) for each in detail),
             )
     return found
 
 
-def _class_maps(
-    clip: HeldOutClip, prediction: Prediction, classes: Sequence[SemanticClass]
-) -> tuple[Tensor, Tensor] | None:
-    """What was said, [S, T, H, W], and what is true, [T, H, W]; None where one of the two is not there."""
-    said = _alike([draw.classes for draw in prediction.draws], "class maps")
-    true, void = to_labels(clip.target_classes), metrics.void_ids([each.name for each in classes])
-    if said is None or true is None or not classes:
-        return None
-    return metrics.without_classes(said.cpu(), void), metrics.without_classes(true, void)
-
-
-def _within(values: Tensor, mask: Tensor | None) -> Frames:
-    """Mean of [T, H, W] over each frame, or over a mask of it."""
-    return _frames(values.mean(dim=(1, 2)) if mask is None else metrics.masked_mean(values, mask))
-
-
-def _pictures(prediction: Prediction, whose: str) -> Tensor | None:
-    """All draws' pictures, float32 [S, T, 3, H, W]."""
-    draws = _alike([draw.video for draw in prediction.draws], "pictures")
-    if draws is None:
-        return None
-    if not draws.isfinite().all():
-        raise NonFiniteError(f"pictures must be finite to be measured; {whose} gave NaN or Inf")
-    return draws.float().cpu()
-
-
-def _alike(draws: list[Tensor | None], what: str) -> Tensor | None:
-    """Draws one after the other; None where none shows such things."""
+def _alike(draws: Sequence[Tensor | None], what: str) -> Tensor | None:
+    """Draws one after the other, [S, ...]; None where none shows such things."""
     made = [each for each in draws if each is not None]
     if len({each.shape for each in made}) > 1 or 0 < len(made) < len(draws):
         got = [None if each is None else list(each.shape) for each in draws]
         raise ShapeError(f"draws of one prediction must have {what} of one shape, all or none of them; got {got}")
-    return torch.stack(made) if made else None
+    return torch.stack(made).cpu() if made else None
 
 
 def _counted(said: Tensor, true: Tensor, classes: int, mask: Tensor | None) -> tuple[Counted, ...]:
@@ -158,6 +138,11 @@ def _counted(said: Tensor, true: Tensor, classes: int, mask: Tensor | None) -> t
     return tuple(frames)
 
 
+def _within(values: Tensor, mask: Tensor | None) -> Frames:
+    """Mean of [T, H, W] over each frame, or over a mask of it."""
+    return _frames(values.mean(dim=(1, 2)) if mask is None else metrics.masked_mean(values, mask))
+
+
 def _frames(values: Tensor) -> Frames:
     """NaN, where there was no pixel to measure, becomes None."""
     return tuple(None if math.isnan(value) else value for value in tuple(values.tolist()))
@@ -166,71 +151,56 @@ def _frames(values: Tensor) -> Frames:
 GIVE_UP_AFTER = 5
 """Clips in a row of which nothing could be measured, after which a run stops: something is wrong with all of them."""
 
-_MADE: dict[tuple[str, str], Predictor] = {}
-"""Methods of this process by run and name: weights are opened once, and those of an earlier run are let go."""
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClipItem:
-    """One clip, and the methods that have no record of it yet, or not the frames that are to be kept."""
-
-    key: str
-    methods: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClipDone:
-    """What became of a clip's methods. measured: how many. failed: name to why there is nothing."""
-
-    measured: int
-    failed: dict[str, str]
+ClipItem: TypeAlias = tuple[str, tuple[str, ...]]
+"""A clip's key, and the methods that have no record of it yet, or not the frames that are to be kept."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipWork:
-    """Measures methods on one clip and keeps the records; goes to other processes whole.
+    """Measures methods on one clip, keeps the records, and says which failed and why; goes to other processes whole.
 
-    folder: the run's. makers: of all methods, by name. lpips: folder of the weights, or None. views: frames to keep.
-    run: names this run within a process.
+    folder: the run's. methods: all, by name. lpips: folder of the weights, or None. views: frames to keep.
     """
 
     folder: Path
     clips: EvaluationSet
-    makers: Mapping[str, Maker]
+    methods: Mapping[str, Predictor]
     lpips: Path | None = None
     views: KeptViews = "none"
-    run: str = field(default_factory=lambda: uuid.uuid4().hex)
 
-    def __call__(self, item: ClipItem) -> ClipDone:
+    def __call__(self, item: ClipItem) -> dict[str, str]:
         """Raises: DataError where the clip cannot be read, RunError where nothing can be written."""
-        predictors = {name: self._predictor(name) for name in item.methods}
-        clip, keeper, views = self.clips.clip(item.key), RunKeeper(self.folder), self._views(item.key)
+        key, methods = item
+        clip, keeper, views = self.clips.clip(key), RunKeeper(self.folder), self._views(key)
         classes, painted, failed = self.clips.classes, self.clips.painted, dict[str, str]()
         lpips = None if self.lpips is None else _opened_lpips(self.lpips)
-        for name, predictor in predictors.items():
+        for name in methods:
             try:
                 prediction, record = predicted_and_measured(
-                    predictor, clip, classes=classes, painted=painted, lpips=lpips
+                    self.methods[name], clip, classes=classes, painted=painted, lpips=lpips
                 )
-                write_views(keeper.views(name, clip.key), clip, prediction, views, classes)
+                write_views(keeper.views(name, key), clip, prediction, views, classes)
                 keeper.keep(record)  # written last: what has a record is whole
             except RunError:
                 raise
             except (TrainError, ModelError) as error:
                 failed[name] = str(error)
-        return ClipDone(measured=len(predictors) - len(failed), failed=failed)
+        return failed
 
     def missing(self) -> list[ClipItem]:
         """Clips with the methods that have no record of them, or not the frames that are to be kept."""
         keeper, items, frames = RunKeeper(self.folder), list[ClipItem](), self.clips.frames
         for key in self.clips.keys:
+            views = self._views(key)
             lacking = [
                 name
-                for name in self.makers
-                if not (keeper.has(name, key) and has_views(keeper.views(name, key), self._views(key), frames))
+                for name in self.methods
+                if not (keeper.has(name, key) and has_views(keeper.views(name, key), views, frames))
             ]
-            items += [ClipItem(key=key, methods=tuple(lacking))] if lacking else []
+            items += [(key, tuple(lacking))] if lacking else []
         return items
 
     def _views(self, key: str) -> KeptViews:
@@ -238,14 +208,6 @@ class ClipWork:
         if self.views == "few":
             return "all" if key in self.clips.keys[:FEW_CLIPS] else "none"
         return self.views
-
-    def _predictor(self, name: str) -> Predictor:
-        """The method of that name, made once in each process."""
-        for place in [place for place in _MADE if place[0] != self.run]:
-            del _MADE[place]
-        if (self.run, name) not in _MADE:
-            _MADE[self.run, name] = self.makers[name]()
-        return _MADE[self.run, name]
 
 
 _opened_lpips = lru_cache(maxsize=1)(metrics.Lpips.open)
@@ -276,20 +238,19 @@ class Account:
         """Whether too many clips in a row had no record."""
         return self._in_a_row >= GIVE_UP_AFTER
 
-    def add(self, outcome: Outcome[ClipItem, ClipDone]) -> None:
+    def add(self, outcome: Outcome[ClipItem, dict[str, str]]) -> None:
         """Count one clip. Raises RunError where nothing can be written."""
         self._tried += 1
-        key, useful, faults = outcome.item.key, False, dict[str, str]()
+        key, methods = outcome.item
         try:
-            found = outcome.unwrap()
+            failed = outcome.unwrap()
         except TrainError as error:
             if type(error) is RunError:  # and not an item's own
                 raise
-            faults = {key: str(error)}
+            faults, useful = {key: str(error)}, False
         else:
-            faults = {f"{key}, {name}": why for name, why in found.failed.items()}
-            useful = bool(found.measured)
-            self.measured += useful
+            faults, useful = {f"{key}, {name}": why for name, why in failed.items()}, len(failed) < len(methods)
+        self.measured += useful
         self.failures |= faults
         self._in_a_row = self._in_a_row + 1 if faults and not useful else 0
 

@@ -1,24 +1,52 @@
-"""What is measured beside baselines: weights, and the frames that other methods saved."""
+"""What is measured, and on what: from the options of a user to clips and methods, and what the run says of itself."""
 
-import hashlib
+import difflib
+import platform
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from datetime import UTC, datetime
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Self, TypeAlias
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from gcd_model import Clip, RenderOptions, Sampler, Trajectory, View, ViewSynthesizer, load_synthesizer
+from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, sampler_of, weights_path
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
+from gcd_model.diffusion import Quality, SolverName
+from gcd_train.data.files import package_version
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.clips import EvaluationSet, names_of
-from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import CameraPair, Method, Prediction, Predictor, SavedFrames, SourceClip
-from gcd_train.evaluation.store import FRAMES_IN
+from gcd_train.evaluation.baselines import (
+    REPROJECT_RGBD,
+    REPROJECT_SEMD,
+    VANILLA_SVD,
+    CopySource,
+    GroundHomography,
+    HexPlane,
+    ReprojectRgbd,
+    ReprojectSemd,
+    VanillaSVD,
+)
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet, names_of
+from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.metrics import NO_CLASS, Lpips
+from gcd_train.evaluation.opening import ClipOptions, data_kind, open_clips
+from gcd_train.evaluation.predictors import (
+    CameraPair,
+    OpenedWeights,
+    Prediction,
+    Predictor,
+    SavedFrames,
+    SourceClip,
+    open_weights,
+)
+from gcd_train.evaluation.protocol import SAMPLES
+from gcd_train.evaluation.store import LPIPS, RunNote
 
 _SAME_PATH_M = 1e-3
 """Largest difference between the entries of two poses that count as one; more is another path."""
@@ -28,45 +56,69 @@ _SAME_PATH_M = 1e-3
 class SynthesizedViews:
     """A model with its own sampler settings, on its fixed view or on each clip's path.
 
-    options: instead of what the weights ship with. The noise of their seed is the same for every clip, as in a live
-    node. painted: classes that its colours are read by, where it paints class maps and its file does not say which.
-    classes: so many the clips have, None for any; what a model sees of others, as a robot on a street, is none of them.
+    weights: give the model. options: instead of what it ships with. The noise of their seed is the same for every clip,
+    as in a live node. painted: classes that its colours are read by, where it paints class maps and its file does not
+    say which. classes: so many the clips have, None for any; what a model sees of others, as a robot on a street, is
+    none of them.
     """
 
-    synthesizer: ViewSynthesizer
+    weights: OpenedWeights
     options: RenderOptions = RenderOptions()  # noqa: RUF009  it is frozen
     painted: tuple[SemanticClass, ...] = ()
     classes: int | None = None
     privileged: bool = False
 
     @classmethod
-    def of(cls, synthesizer: ViewSynthesizer, clips: EvaluationSet, options: RenderOptions | None = None) -> Self:
+    def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions | None = None) -> Self:
         """A model that is measured on these clips.
 
         Raises DataError where model and clips do not fit together.
         """
-        _require_fit(synthesizer, clips)
-        options = RenderOptions() if options is None else options
-        made = cls(synthesizer=synthesizer, options=options, classes=len(clips.classes) or None)
-        if not made.paints_classes or synthesizer.traits.classes:
+        _require_fit(weights(), clips)
+        made, traits = cls(weights=weights, classes=len(clips.classes) or None), weights().traits
+        made = made if options is None else replace(made, options=options)
+        if not made.paints_classes or traits.classes:
             return made
         if not clips.classes:
             raise DataError(
-                f"{synthesizer.traits.name} paints class maps but names no classes, and the clips have none either; "
-                "give clips with classes"
+                f"{traits.name} paints class maps but names no classes, and the clips have none either; give clips "
+                "with classes"
             )
-        return replace(made, painted=tuple(clips.classes))
+        return replace(made, painted=clips.classes)
 
     @property
     def name(self) -> str:
         """The weights' name, with what is not as shipped of how they are sampled."""
-        told = told_of(self.options)
-        return self.synthesizer.traits.name + (f" ({told})" if told else "")
+        options = self.options
+        told = [] if options.quality == "exact" else [options.quality]
+        told += [] if options.steps is None else [f"{options.steps} step{'' if options.steps == 1 else 's'}"]
+        told += [] if options.solver is None else [options.solver]
+        told += [] if options.guidance is None else ["guidance {:g} to {:g}".format(*options.guidance)]
+        if options.guidance_interval is not None:
+            told.append("guided from {:g} to {:g}".format(*options.guidance_interval))
+        return self.weights().traits.name + (f" ({', '.join(told)})" if told else "")
+
+    @property
+    def details(self) -> dict[str, str]:
+        traits, options = self.weights().traits, self.options
+        used = Sampler.of(traits.config.sampling, options)
+        interval = used.guidance_interval
+        return {
+            "weights": traits.sha256_12,
+            "family": "unknown" if traits.family is None else traits.family.name,
+            "steps": str(used.steps),
+            "solver": used.solver,
+            "guidance": "{:g} to {:g}".format(*used.guidance),
+            "samples": str(options.samples),
+            "seed": str(options.seed),
+            "precision": traits.precision,
+            **({} if interval is None else {"guided from": "{:g} to {:g}".format(*interval)}),
+        }
 
     @property
     def paints_classes(self) -> bool:
         """Whether its picture is a class map in colours, which is compared as classes alone."""
-        family = self.synthesizer.traits.family
+        family = self.weights().traits.family
         return family is not None and family.output == "semantic"
 
     def predict(self, clip: SourceClip) -> Prediction:
@@ -75,12 +127,11 @@ class SynthesizedViews:
 
     def drawer(self, clip: SourceClip) -> Callable[[RenderOptions], View]:
         """Draws the clip's view, encoded once, with any options. Raises DataError as `predict`."""
-        synthesizer, mount = self.synthesizer, clip.cameras.mount
-        live, video = synthesizer.traits.live, to_network(clip.source)
-        declared = mount if live else None
-        path = self._path(clip.cameras)
-        lens = clip.cameras.source if live else None
-        features = synthesizer.encode(Clip(video=video, fps=clip.fps, mount=declared, lens=lens))
+        synthesizer, path = self.weights(), self._path(clip.cameras)
+        own = Clip(video=to_network(clip.source), fps=clip.fps)
+        if synthesizer.traits.live:
+            own = replace(own, mount=clip.cameras.mount, lens=clip.cameras.source)
+        features = synthesizer.encode(own)
         return lambda options: synthesizer.render(features, [path], options)[0]
 
     def shown(self, view: View) -> Prediction:
@@ -97,7 +148,7 @@ class SynthesizedViews:
         return Prediction(video=None if self.paints_classes else video, classes=classes)
 
     def _path(self, cameras: CameraPair) -> Trajectory:
-        traits, asked = self.synthesizer.traits, cameras.trajectory
+        traits, asked = self.weights().traits, cameras.trajectory
         if traits.live:
             return asked
         if traits.config.camera == "none":
@@ -113,16 +164,6 @@ class SynthesizedViews:
                 f"arrive in frame {asked.at_goal.index(True)}); evaluate it on clips like those of its training"
             )
         return planned
-
-
-def told_of(options: RenderOptions) -> str:
-    """What options say of sampling, in few words; empty where all is as shipped."""
-    told = [] if options.quality == "exact" else [options.quality]
-    told += [] if options.steps is None else [f"{options.steps} step{'' if options.steps == 1 else 's'}"]
-    told += [] if options.solver is None else [options.solver]
-    told += [] if options.guidance is None else ["guidance {:g} to {:g}".format(*options.guidance)]
-    told += [] if options.guidance_interval is None else ["guided from {:g} to {:g}".format(*options.guidance_interval)]
-    return ", ".join(told)
 
 
 def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
@@ -141,99 +182,189 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
         raise DataError(f"{traits.name} has classes {names_of(traits.classes)}, the clips {names_of(clips.classes)}")
 
 
-OpenedWeights: TypeAlias = Callable[[], ViewSynthesizer]
-"""Gives a model, opened once in each process: `partial` of `open_weights`. Raises CheckpointError."""
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EvaluateOptions(ClipOptions):
+    """What is asked of `gcd-train evaluate`: one field for each of its options, see there. None: left out."""
+
+    weights: str | None = None
+    steps: Sequence[int] | None = None
+    samples: int | None = None
+    guidance: tuple[float, float] | None = None
+    quality: Quality = "exact"
+    solver: SolverName | None = None
+    guidance_interval: tuple[float, float] | None = None
+    baselines: bool = True
+    methods: Sequence[str] | None = None
+    svd: str | None = None
+    predictions: Sequence[str] | None = None
+    privileged: Sequence[str] | None = None
+    hexplane: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
+    lpips: Path | None = None
+    device: str = "auto"
+    dtype: str | None = None
 
 
-@lru_cache(maxsize=1)
-def open_weights(path: str, device: str, dtype: str | None) -> ViewSynthesizer:
-    """Weights by name or path; see `load_synthesizer`."""
-    return load_synthesizer(path, device=device, dtype=dtype)
+def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, ...], tuple[str, ...]]:
+    """Open the data and the weights, and choose the methods: all that is quick, so that faults are told at once.
 
-
-def of_weights(
-    weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions, steps: Sequence[int]
-) -> tuple[Method, ...]:
-    """The weights as they ship, then with each other number of steps.
-
-    Args:
-        options: all but the steps. steps: the shipped number is passed over.
+    Returns: the clips, the methods with the weights first, and what is odd about the clips, line by line.
     Raises:
-        DataError: the weights do not fit the clips. CheckpointError: they cannot be opened.
+        DataError: data or frames are missing, or do not fit together. RecipeError: options contradict each other, or
+            there is nothing to measure. CheckpointError: weights cannot be opened.
     """
-    shipped = weights().traits.config.sampling.steps
-    others = [number for number in dict.fromkeys(steps) if number != shipped]
-    return tuple(_of_weights(weights, clips, replace(options, steps=number)) for number in (None, *others))
-
-
-def of_saved_frames(
-    named: Sequence[str], painted: Sequence[SemanticClass], *, privileged: Sequence[str] = ()
-) -> tuple[Method, ...]:
-    """Methods whose frames lie in folders.
-
-    Args:
-        named: `NAME=FOLDER` each. painted: the classes in whose colours they are; empty for photographs. privileged:
-            names of those that were given more than the source video.
-    Raises:
-        RecipeError: one has no name or no folder, or a privileged one is none of them. DataError: there is no such
-            folder.
-    """
-    methods = tuple(_of_saved_frames(each, tuple(painted), privileged) for each in named)
-    names = [method.name for method in methods]
-    unknown = [name for name in privileged if name not in names]
-    if unknown:
-        raise RecipeError(
-            f"--privileged wants the name of a method of --predictions, got {unknown[0]!r}; "
-            f"there are {', '.join(names) or 'none'}"
+    named = options.methods and [name.strip() for name in ",".join(options.methods).split(",") if name.strip()]
+    if options.methods is not None and not options.baselines:
+        raise RecipeError("--methods names baselines and --no-baselines wants none; leave one of the two out")
+    if options.svd is not None and VANILLA_SVD not in (named or ()):
+        raise RecipeError(f"--svd is for {VANILLA_SVD}, which --methods does not name; name it, or leave out --svd")
+    weights = None
+    if options.weights is not None:
+        weights = partial(open_weights, _resolved(options.weights), options.device, options.dtype)
+    clips, notes = open_clips(options, None if weights is None else weights().traits)
+    samples = options.samples or (1 if data_kind(options.data) == "pairs" else SAMPLES[options.protocol])
+    options, methods = replace(options, samples=samples), list[Predictor]()
+    if weights is not None:
+        sampling = RenderOptions(
+            quality=options.quality,
+            solver=options.solver,
+            guidance=options.guidance,
+            guidance_interval=options.guidance_interval,
+            samples=samples,
+            seed=options.seed,
         )
-    return methods
+        shipped = weights().traits.config.sampling.steps  # as it ships first, then with each other number of steps
+        others = [number for number in dict.fromkeys(options.steps or ()) if number != shipped]
+        methods += [SynthesizedViews.of(weights, clips, replace(sampling, steps=steps)) for steps in (None, *others)]
+    if options.baselines:
+        methods += baselines(named, clips, options)
+    methods += _saved_frames(options, clips.classes if clips.painted else ())
+    if not methods:
+        raise RecipeError("there is nothing to measure: give --weights, or leave out --no-baselines")
+    for first, second in pairwise(sorted(method.name for method in methods)):
+        if first == second:
+            raise RecipeError(
+                f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
+            )
+    return clips, tuple(methods), notes
 
 
-def _of_weights(weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions) -> Method:
-    made = SynthesizedViews.of(weights(), clips, options)
-    traits = made.synthesizer.traits
-    used = Sampler.of(traits.config.sampling, options)
-    told = {
-        "weights": traits.sha256_12,
-        "family": "unknown" if traits.family is None else traits.family.name,
-        "steps": str(used.steps),
-        "solver": used.solver,
-        "guidance": "{:g} to {:g}".format(*used.guidance),
-        "samples": str(options.samples),
-        "seed": str(options.seed),
-        "precision": traits.precision,
+def _resolved(weights: str) -> str:
+    """A path that does not depend on where a process stands; names of weights as they are."""
+    return str(Path(weights).resolve()) if Path(weights).exists() else weights
+
+
+def _saved_frames(options: EvaluateOptions, painted: tuple[SemanticClass, ...]) -> list[Predictor]:
+    """Methods whose frames lie in folders. painted: the classes in whose colours they are; empty for photographs."""
+    found: list[Predictor] = []
+    for named in options.predictions or ():
+        name, _, folder = named.partition("=")
+        if not (name and folder):
+            raise RecipeError(f"frames of another method are given as NAME=FOLDER, got {named!r}")
+        if not Path(folder).is_dir():
+            raise DataError(f"the frames of {name} should lie in {folder}, which is no folder; give NAME=FOLDER")
+        more = name in (options.privileged or ())
+        found.append(SavedFrames(name=name, folder=Path(folder).resolve(), painted=painted, privileged=more))
+    names = [method.name for method in found]
+    for name in options.privileged or ():
+        if name not in names:
+            raise RecipeError(
+                f"--privileged wants the name of a method of --predictions, got {name!r}; "
+                f"there are {', '.join(names) or 'none'}"
+            )
+    return found
+
+
+def run_note(clips: EvaluationSet, methods: Sequence[Predictor], options: EvaluateOptions, command: str) -> RunNote:
+    """What the run says of itself. command: the line that began it. Raises DataError for LPIPS weights."""
+    lpips = {} if options.lpips is None else {LPIPS: Lpips.open(options.lpips).identity}
+    return RunNote(
+        command=command,
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions={
+            "gcd-node": package_version(),
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+        },
+        data=tuple(map(str, options.data)),
+        data_identity=clips.identity,
+        kind=clips.kind,
+        modality="semantic" if clips.painted else "rgb",
+        protocol="pairs" if isinstance(clips, PairedSet) else options.protocol,
+        frames=clips.frames,
+        height=clips.height,
+        width=clips.width,
+        seed=options.seed,
+        classes=tuple(each.name for each in clips.classes),
+        methods={method.name: {**method.details, **lpips} for method in methods},
+    )
+
+
+def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: EvaluateOptions) -> tuple[Predictor, ...]:
+    """Baselines by name; those that need nothing but the clips where none are named.
+
+    Raises:
+        RecipeError: there is none of a name, or it lacks what it needs.
+        CheckpointError: vanilla SVD's weights cannot be opened.
+    """
+    published = options.protocol == "release"
+    makers: dict[str, Callable[[], Predictor]] = {
+        "copy_source": CopySource,
+        "ground_homography": GroundHomography,
+        REPROJECT_RGBD: partial(ReprojectRgbd, published=published),
+        REPROJECT_SEMD: partial(ReprojectSemd, classes=clips.classes, published=published),
     }
-    if used.guidance_interval is not None:
-        told["guided from"] = "{:g} to {:g}".format(*used.guidance_interval)
-    return Method(name=made.name, make=partial(_synthesized, weights, options, made.painted, made.classes), told=told)
+    if names is None:
+        left_out = REPROJECT_RGBD if clips.painted else None if clips.classes else REPROJECT_SEMD
+        names = [name for name in makers if name != left_out]
+    found: list[Predictor] = []
+    for name in names:
+        match = re.fullmatch(r"hexplane_([1-9]\d*)", name)
+        views = int(match[1]) if match else 0
+        if clips.painted and (views or name in (REPROJECT_RGBD, VANILLA_SVD)):
+            raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
+        if views > clips.cameras:
+            there = f"{clips.cameras - 1} beside the source" if clips.cameras > 1 else "the source alone"
+            raise RecipeError(
+                f"{name} wants {views} cameras, and these clips have {there}; give hexplane_{clips.cameras} or less"
+            )
+        if name == REPROJECT_SEMD and not clips.classes:
+            raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
+        if views:
+            settings = options.hexplane
+            found.append(HexPlane(views=views, settings=settings, seed=options.seed, device=options.device))
+        elif name == VANILLA_SVD:
+            found.append(_vanilla_svd(options))
+        elif name in makers:
+            found.append(makers[name]())
+        else:
+            every = (
+                *makers,
+                VANILLA_SVD,
+                *(f"hexplane_{views}" for views in (1, 2, 4, 8)),
+            )  # any other number goes too
+            near = difflib.get_close_matches(name, every, n=1)
+            meant = f"did you mean {near[0]}? " if near else ""
+            raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")
+    return tuple(found)
 
 
-def _synthesized(
-    weights: OpenedWeights, options: RenderOptions, painted: tuple[SemanticClass, ...], classes: int | None
-) -> Predictor:
-    return SynthesizedViews(synthesizer=weights(), options=options, painted=painted, classes=classes)
-
-
-def _of_saved_frames(named: str, painted: tuple[SemanticClass, ...], privileged: Sequence[str]) -> Method:
-    name, separator, folder = named.partition("=")
-    if not (name and separator and folder):
-        raise RecipeError(f"frames of another method are given as NAME=FOLDER, got {named!r}")
-    place = Path(folder).resolve()
-    SavedFrames.open(name, place)  # to refuse at once
-    more = name in privileged
-    told = {FRAMES_IN: str(place), "digest": _listing(place)} | ({"privileged": "yes"} if more else {})
-    return Method(name=name, make=partial(SavedFrames.open, name, place, painted=painted, privileged=more), told=told)
-
-
-def _listing(folder: Path) -> str:
-    """Digest of the names and contents of all files below: frames that are made anew are another method."""
-    digest = hashlib.sha256()
-    try:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                with path.open("rb") as file:
-                    content = hashlib.file_digest(file, "sha256").hexdigest()
-                digest.update(f"{path.relative_to(folder)} {content}\n".encode())
-    except OSError as error:
-        raise DataError(f"{folder} cannot be read ({error}); give NAME=FOLDER") from error
-    return digest.hexdigest()[:12]
+def _vanilla_svd(options: EvaluateOptions) -> VanillaSVD:
+    """With weights that are opened where they are used: the published file `svd.safetensors`, its diffusers folder, or
+    our own of the same task. A published file is taken to be SVD, whatever it is called."""
+    if options.svd is None:
+        raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
+    kind, _, name = options.svd.partition(":")
+    if kind == "random":
+        family, digest = name, options.svd
+    else:
+        inspected = inspect_weights(weights_path(options.svd))
+        family, digest = inspected.family, inspected.digest[:12]
+    if family not in ("svd", None):
+        raise RecipeError(
+            f"{VANILLA_SVD} wants weights that make a video out of a picture, {options.svd} is of the family "
+            f"{family}; give svd.safetensors"
+        )
+    samples, seed = options.samples or 1, options.seed
+    details = {"baseline": VANILLA_SVD, "samples": str(samples), "seed": str(seed), "weights": digest}
+    weights = partial(open_weights, _resolved(options.svd), options.device, options.dtype, None if family else "svd")
+    return VanillaSVD(weights=weights, samples=samples, seed=seed, details=details)

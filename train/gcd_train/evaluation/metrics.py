@@ -4,7 +4,7 @@ Pictures are float [T, 3, H, W] in [0, 1]; masks are bool [T, H, W]; class maps 
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
@@ -51,18 +51,8 @@ def _to_db(error: Tensor) -> Tensor:
     return -10.0 * torch.log10(error.clamp(min=_SMALLEST_ERROR))
 
 
-def diversity(draws: Tensor, mask: Tensor | None = None) -> Tensor:
-    """How far apart several draws of one view are: population standard deviation over draws, mean over the frame: [T].
-
-    Args:
-        draws: [S, T, 3, H, W], S at least 2. mask: the pixels that count; NaN where it is empty. None for all.
-    """
-    spread = pixel_deviation(draws)
-    return spread.mean(dim=(1, 2)) if mask is None else masked_mean(spread, mask)
-
-
 def pixel_deviation(draws: Tensor) -> Tensor:
-    """As `View.std`: population standard deviation over draws [S, T, 3, H, W], channel mean: [T, H, W]."""
+    """Diversity, as `View.std`: population standard deviation over draws [S, T, 3, H, W], channel mean: [T, H, W]."""
     return draws.std(dim=0, correction=0).mean(dim=1)
 
 
@@ -252,6 +242,7 @@ class _Kind:
     """How a network is found and used: files of its features and of its linear weights, places of the features that are
     compared among torchvision's, their channels, and a side of the smallest picture."""
 
+    made: Callable[[], nn.Sequential]
     features: str
     linear: str
     compared: tuple[int, ...]
@@ -260,8 +251,8 @@ class _Kind:
 
 
 _KINDS = {
-    "vgg": _Kind("vgg16-*.pth", "vgg.pth", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), 16),
-    "alex": _Kind("alexnet-*.pth", "alex.pth", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), 31),
+    "vgg": _Kind(_vgg16, "vgg16-*.pth", "vgg.pth", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), 16),
+    "alex": _Kind(_alexnet, "alexnet-*.pth", "alex.pth", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), 31),
 }
 
 
@@ -291,19 +282,13 @@ class Lpips:
             DataError: a file is missing, damaged or another one than wanted.
         """
         name, path, linear = _files(Path(folder))
-        features, body, weights = _vgg16() if name == "vgg" else _alexnet(), _read(path), _read(linear)
-        digest = hashlib.sha256()
-        state = {
-            key: _taken(body, f"features.{key}", tuple(blank.shape), path)
-            for key, blank in features.state_dict().items()
-        }
-        heads = tuple(
-            _taken(weights, f"lin{number}.model.1.weight", (1, channels, 1, 1), linear)
-            for number, channels in enumerate(_KINDS[name].channels)
-        )
-        for tensor in (*state.values(), *heads):
+        features, digest = _KINDS[name].made(), hashlib.sha256()
+        names = {f"features.{key}": blank.shape for key, blank in features.state_dict().items()}
+        state = _read(path, names)
+        heads = _read(linear, {f"lin{n}.model.1.weight": (1, c, 1, 1) for n, c in enumerate(_KINDS[name].channels)})
+        for tensor in (*state, *heads):
             digest.update(tensor.contiguous().numpy().tobytes())
-        features.load_state_dict(state)
+        features.load_state_dict(dict(zip(features.state_dict(), state, strict=True)))
         return cls(
             network=name,
             features=features.to(device).eval().requires_grad_(False),
@@ -355,8 +340,8 @@ def _files(folder: Path) -> tuple[str, Path, Path]:
     raise DataError(f"no LPIPS weights in {folder}: {_WANTED}, got {held}")
 
 
-def _read(path: Path) -> Mapping[str, object]:
-    """What a file of named tensors holds; code in it is never run."""
+def _read(path: Path, wanted: Mapping[str, Sequence[int]]) -> list[Tensor]:
+    """The tensors of these names and shapes that a file holds; code in it is never run. Raises DataError."""
     try:
         if not path.is_file():
             raise ValueError("it is no regular file")
@@ -366,15 +351,13 @@ def _read(path: Path) -> Mapping[str, object]:
         raise DataError(f"cannot read the LPIPS weights {path}: {cause}; fetch the file again") from error
     if not isinstance(held, Mapping):
         raise DataError(f"the LPIPS weights {path} must be named tensors, got {type(held).__name__}; {_WANTED}")
-    return cast("Mapping[str, object]", held)
-
-
-def _taken(held: Mapping[str, object], name: str, shape: tuple[int, ...], path: Path) -> Tensor:
-    """One tensor of a file. Raises DataError if it lacks it, or has it in another shape or with a value not finite."""
-    tensor = held.get(name)
-    if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
-        got = list(tensor.shape) if isinstance(tensor, Tensor) else "none"
-        raise DataError(f"{path} must hold {name} of {list(shape)}, got {got}; {_WANTED}")
-    if not tensor.isfinite().all():
-        raise DataError(f"{name} in {path} holds values that are not finite; fetch the file again")
-    return tensor.detach().float()
+    taken: list[Tensor] = []
+    for name, shape in wanted.items():
+        tensor = cast("Mapping[str, object]", held).get(name)
+        if not isinstance(tensor, Tensor) or tuple(tensor.shape) != tuple(shape):
+            got = list(tensor.shape) if isinstance(tensor, Tensor) else "none"
+            raise DataError(f"{path} must hold {name} of {list(shape)}, got {got}; {_WANTED}")
+        if not tensor.isfinite().all():
+            raise DataError(f"{name} in {path} holds values that are not finite; fetch the file again")
+        taken.append(tensor.detach().float())
+    return taken

@@ -28,7 +28,6 @@ from gcd_train.evaluation.protocol import (
     controlled,
     released_controls,
     require_cameras,
-    require_orbits,
     scene_number,
 )
 
@@ -208,13 +207,18 @@ def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tupl
             options.modality is None and model.family is not None and model.family.output == "semantic"
         )
         gradual = gradual and (options.path is not None or model.move_time > 0)
-    whole = _dataset(folder, options, orbits=orbits, painted=painted)
+    if orbits and painted:
+        raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
+    cameras = tuple(options.camera or (kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS))
+    whole = (
+        Kubric4D.open(folder, cameras=cameras, published=released)
+        if orbits
+        else ParallelDomain4D.open(folder, cameras=cameras, classes=painted)
+    )
     sampling = _sampling(options, size[0], orbits=orbits, gradual=gradual)
     controls = _controls(options, whole.scenes, sampling)
     scenes = wanted_scenes(folder, whole.scenes, options, notes)
     scenes = controlled(scenes, controls, options.controls, folder, notes)[: options.limit]
-    if orbits and options.controls is not None and controls.listed is not None:
-        require_orbits(controls.listed, scenes, options.controls)
     data = whole.only(scenes)
     require_cameras(data)
     pictures = PictureOptions(
@@ -240,16 +244,6 @@ def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tupl
         cameras=len(data.cameras),
     )
     return clips, tuple(notes.lines())
-
-
-def _dataset(folder: Path, options: ClipOptions, *, orbits: bool, painted: bool) -> Kubric4D | ParallelDomain4D:
-    names = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
-    cameras = tuple(options.camera or names)
-    if not orbits:
-        return ParallelDomain4D(folder, cameras=cameras, classes=painted)
-    if painted:
-        raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
-    return Kubric4D(folder, cameras=cameras, published=options.protocol == "release")
 
 
 def _controls(options: ClipOptions, scenes: Sequence[str], sampling: OrbitSampling | DrivingSampling) -> SceneControls:
@@ -287,38 +281,35 @@ def _sampling(options: ClipOptions, clip: int, *, orbits: bool, gradual: bool) -
 
 
 def _identity(folder: Path, scenes: Sequence[str], cuts: Sequence[object], controls: Path | None) -> str:
-    """Of the scenes by name and files, and how clips are cut."""
+    """Digest of how clips are cut, and of the names and sizes of all files of the scenes and what small JSON files say.
+
+    Pictures are not read, and times do not count: a copy has the same identity. What begins with a dot is left out, as
+    file browsers leave such things.
+
+    Raises:
+        DataError: a folder or a file cannot be read.
+    """
     digest = hashlib.sha256(repr(cuts).encode())
     if controls is not None:
         digest.update(read_small(controls, MOST_BYTES).encode())
-    for scene in scenes:
-        digest.update(scene.encode() + fingerprint(folder / scene))
-    return digest.hexdigest()[:12]
-
-
-def fingerprint(folder: Path) -> bytes:
-    """Digest of the names and sizes of all files below, and of what small JSON files say.
-
-    Pictures are not read, and times do not count: a copy has the same fingerprint. What begins with a dot is left out,
-    as file browsers leave such things.
-
-    Raises:
-        DataError: the folder or a file cannot be read.
-    """
-    digest, found = hashlib.sha256(), dict[str, Path]()
 
     def passed_on(error: OSError) -> None:
         raise error
 
-    try:
-        for place, folders, names in os.walk(folder, onerror=passed_on, followlinks=True):
-            folders[:] = [name for name in folders if not name.startswith(".")]
-            paths = [Path(place) / name for name in names if not name.startswith(".")]
-            found |= {path.relative_to(folder).as_posix(): path for path in paths}
-        for name, size in sorted((name, path.stat().st_size) for name, path in found.items()):
-            digest.update(f"{name} {size}\n".encode())
-            if name.endswith(".json") and size <= _SMALL_BYTES and found[name].is_file():
-                digest.update(hashlib.sha256(found[name].read_bytes()).digest())
-    except OSError as error:
-        raise DataError(f"{folder} cannot be read ({error}); look at the scene, or leave it out with --list") from error
-    return digest.digest()
+    for scene in scenes:
+        of_scene, found = hashlib.sha256(), dict[str, Path]()
+        try:
+            for place, folders, names in os.walk(folder / scene, onerror=passed_on, followlinks=True):
+                folders[:] = [name for name in folders if not name.startswith(".")]
+                paths = [Path(place) / name for name in names if not name.startswith(".")]
+                found |= {path.relative_to(folder / scene).as_posix(): path for path in paths}
+            for name, size in sorted((name, path.stat().st_size) for name, path in found.items()):
+                of_scene.update(f"{name} {size}\n".encode())
+                if name.endswith(".json") and size <= _SMALL_BYTES and found[name].is_file():
+                    of_scene.update(hashlib.sha256(found[name].read_bytes()).digest())
+        except OSError as error:
+            raise DataError(
+                f"{folder / scene} cannot be read ({error}); look at the scene, or leave it out with --list"
+            ) from error
+        digest.update(scene.encode() + of_scene.digest())
+    return digest.hexdigest()[:12]

@@ -24,23 +24,7 @@ class Column:
     @property
     def of_classes(self) -> bool:
         """Whether it tells how good class maps are, not pictures."""
-        return self.figure in ("miou_full", "miou_common")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PaperTable:
-    """One table of the paper. name: of its file. kind, modality: of the runs it is for. frames: that it is over.
-
-    rows: label, as it stands there, to the printed figures by column, None for none.
-    """
-
-    name: str
-    title: str
-    kind: Literal["kubric", "driving"]
-    modality: Literal["rgb", "semantic"]
-    frames: Span
-    columns: tuple[Column, ...]
-    rows: Mapping[str, tuple[float | None, ...]]
+        return self.figure == "miou_common"
 
 
 PICTURE_COLUMNS = (
@@ -56,14 +40,36 @@ CLASS_COLUMNS = (
 )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PaperTable:
+    """One table of the paper. kind, modality: of the runs it is for. frames: that it is over.
+
+    rows: label, as it stands there, to the printed figures by column, None for none.
+    """
+
+    title: str
+    kind: Literal["kubric", "driving"]
+    modality: Literal["rgb", "semantic"]
+    frames: Span
+    rows: Mapping[str, tuple[float | None, ...]]
+
+    @property
+    def name(self) -> str:
+        """Of its file: `table1`."""
+        return self.title.partition(":")[0].replace(" ", "").lower()
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """What it is of."""
+        return PICTURE_COLUMNS if self.modality == "rgb" else CLASS_COLUMNS
+
+
 PAPER_TABLES = (
     PaperTable(
-        name="table1",
         title="Table 1: Kubric-4D, ablation, last frame",
         kind="kubric",
         modality="rgb",
         frames="last",
-        columns=PICTURE_COLUMNS,
         rows={
             "GCD (direct, max 90, scratch)": (15.96, 0.450, 0.575, 15.85, 0.470),
             "GCD (direct, max 180, scratch)": (14.71, 0.426, 0.611, 15.15, 0.458),
@@ -76,12 +82,10 @@ PAPER_TABLES = (
         },
     ),
     PaperTable(
-        name="table2",
         title="Table 2: ParallelDomain-4D, RGB, ablation, last frame",
         kind="driving",
         modality="rgb",
         frames="last",
-        columns=PICTURE_COLUMNS,
         rows={
             "GCD (direct, scratch)": (22.49, 0.622, 0.487, 22.62, 0.653),
             "GCD (gradual, scratch)": (22.73, 0.632, 0.467, 22.76, 0.664),
@@ -90,12 +94,10 @@ PAPER_TABLES = (
         },
     ),
     PaperTable(
-        name="table3",
         title="Table 3: ParallelDomain-4D, semantic, ablation, last frame",
         kind="driving",
         modality="semantic",
         frames="last",
-        columns=CLASS_COLUMNS,
         rows={
             "GCD (direct, scratch)": (0.312, 0.286),
             "GCD (gradual, scratch)": (0.344, 0.321),
@@ -104,12 +106,10 @@ PAPER_TABLES = (
         },
     ),
     PaperTable(
-        name="table4",
         title="Table 4: Kubric-4D, baselines",
         kind="kubric",
         modality="rgb",
         frames="2-last",
-        columns=PICTURE_COLUMNS,
         rows={
             "HexPlane": (15.38, 0.428, 0.568, 14.71, 0.428),
             "4D-GS": (14.92, 0.388, 0.584, 14.55, 0.392),
@@ -121,12 +121,10 @@ PAPER_TABLES = (
         },
     ),
     PaperTable(
-        name="table5",
         title="Table 5: ParallelDomain-4D, RGB, baselines",
         kind="driving",
         modality="rgb",
         frames="2-last",
-        columns=PICTURE_COLUMNS,
         rows={
             "Vanilla SVD": (12.88, 0.400, 0.658, 13.96, 0.466),
             "ZeroNVS": (18.88, 0.490, 0.555, 19.29, 0.552),
@@ -135,12 +133,10 @@ PAPER_TABLES = (
         },
     ),
     PaperTable(
-        name="table6",
         title="Table 6: ParallelDomain-4D, semantic, baselines",
         kind="driving",
         modality="semantic",
         frames="2-last",
-        columns=CLASS_COLUMNS,
         rows={
             "GCD (gradual, finetuned)": (0.434, 0.382),
             "Reproject Sem-D": (0.373, None),

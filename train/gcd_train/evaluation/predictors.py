@@ -1,8 +1,10 @@
-"""What is measured: a clip in, its target view out; and the predictors that copy or read saved frames."""
+"""What is measured: a clip in, its target view out; and what reads saved frames."""
 
+import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, Self, TypeAlias
 
@@ -12,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gcd_model import ViewSynthesizer, load_synthesizer
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
@@ -19,6 +22,7 @@ from gcd_train.data.encodings import read_colour
 from gcd_train.data.files import FileFault
 from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.errors import DataError
+from gcd_train.evaluation.store import FRAMES_IN
 from gcd_train.pointcloud.project import tangents
 
 
@@ -95,7 +99,7 @@ class SourceClip:
     key: names the clip in its set; frames that others have made are found by it.
     others: the T views of each of so many further cameras of the scene, for predictors that are given them (raises
     DataError if it has fewer); None where there is one camera. points: the T source views at their full size, for
-    privileged predictors only, with ids as in `source_classes`; None where `source` is all there is.
+    privileged predictors only, with ids as in `source_classes`; empty where `source` is all there is.
     """
 
     source: Bytes
@@ -105,7 +109,7 @@ class SourceClip:
     fps: float
     key: str = ""
     others: Callable[[int], Sequence[Sequence[SceneView]]] | None = None
-    points: Callable[[], Sequence[SceneView]] | None = None
+    points: Sequence[SceneView] = ()
 
 
 FAR_M = 1e4
@@ -141,26 +145,28 @@ class Prediction:
 
 
 class Predictor(Protocol):
-    """Makes the target view of a clip from its source alone, or, where `privileged`, from its exact depth too."""
+    """Makes the target view of a clip from its source alone, or, where `privileged`, from its exact depth too.
+
+    It is sent to other processes, so it holds no network; see `OpenedWeights`. details: what it is, for `run.json`.
+    """
 
     @property
     def name(self) -> str: ...
     @property
     def privileged(self) -> bool: ...
+    @property
+    def details(self) -> dict[str, str]: ...
     def predict(self, clip: SourceClip) -> Prediction: ...
 
 
-Maker: TypeAlias = Callable[[], Predictor]
-"""Makes a method where it is to run. It is sent to other processes: a function of a module, or `partial` of one."""
+OpenedWeights: TypeAlias = Callable[[], ViewSynthesizer]
+"""Gives a model, opened once in each process: `partial` of `open_weights`. Raises CheckpointError."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Method:
-    """One row of a table. make: the method itself, in any process. told: what it is, for `run.json`."""
-
-    name: str
-    make: Maker
-    told: dict[str, str]
+@lru_cache(maxsize=2)
+def open_weights(path: str, device: str, dtype: str | None, family: str | None = None) -> ViewSynthesizer:
+    """Weights by name or path; see `load_synthesizer`."""
+    return load_synthesizer(path, family=family, device=device, dtype=dtype)
 
 
 def to_pictures(frames: Bytes) -> Tensor:
@@ -169,40 +175,14 @@ def to_pictures(frames: Bytes) -> Tensor:
 
 
 def to_labels(classes: Bytes | None) -> Tensor | None:
-    """A class map as a tensor, uint8 [T, H, W]; None for none."""
+    """A class map as a tensor, uint8 [T, H, W]."""
     return None if classes is None else torch.from_numpy(np.ascontiguousarray(classes))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CopySource:
-    """The source picture and its class map, as if they were the target's."""
-
-    name: str = "copy_source"
-    privileged: bool = False
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor. The class map is the source's exact one."""
-        return Prediction(video=to_pictures(clip.source), classes=to_labels(clip.source_classes))
 
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 _VIDEO = ".mp4"
 _SAMPLE = re.compile(r"sample_(\d+)")
 _RELEASED = re.compile(r"(.+)_pred_s(\d+)")
-
-
-def read_draw(path: Path) -> list[Bytes]:
-    """RGB pictures, uint8 [H, W, 3] each, of a folder of numbered pictures, or of a video.
-
-    Raises: FileFault for a damaged file; DataError for a folder whose pictures do not count up one by one.
-    """
-    if not path.is_dir():
-        return _video_frames(path)
-    found = sorted(_pictures(path), key=lambda each: int(each.stem))
-    numbers = [int(each.stem) for each in found]
-    if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
-        raise DataError(f"{path} holds frames {numbers}, one is missing or there twice; number them from 0 on")
-    return [read_colour(each) for each in found]
 
 
 def find_draws(folder: Path, key: str) -> list[Path]:
@@ -220,7 +200,10 @@ def find_draws(folder: Path, key: str) -> list[Path]:
     """
     if not key or Path(key).name != key:
         raise DataError(f"saved frames are found by the clip's name, which must be a file name, got {key!r}")
-    found = _ours(folder, key) or _released(folder / "extra", key) or _released(folder, key)
+    samples = {int(named[1]): path for path, named in _draws_in(folder / key, _SAMPLE)}
+    alone = [path for path in (folder / key, folder / (key + _VIDEO)) if _is_draw(path)]
+    found = [samples[number] for number in sorted(samples)] or alone[:1]
+    found = found or _released(folder / "extra", key) or _released(folder, key)
     if not found:
         raise DataError(
             f"{folder} holds no frames for clip {key}: wanted {key}/0000.png and so on, {key}/sample_0/0000.png, "
@@ -229,63 +212,52 @@ def find_draws(folder: Path, key: str) -> list[Path]:
     return found
 
 
-def _ours(folder: Path, key: str) -> list[Path]:
-    place = folder / key
-    samples: dict[int, Path] = {}
-    for path in _entries(place):
-        named = _SAMPLE.fullmatch(_name_of(path))
-        if named and _is_draw(path):
-            samples.setdefault(int(named[1]), path)
-    if samples:
-        return [samples[number] for number in sorted(samples)]
-    return [path for path in (place, place.with_name(key + _VIDEO)) if _is_draw(path)][:1]
-
-
 def _released(folder: Path, key: str) -> list[Path]:
+    """Outputs of the paper's script for the clip of this name; without a number they are the first trajectory's."""
+    scene, _, sample = key.partition(".")
+    wanted = re.search(r"\d+$", sample)
     by_prefix: dict[str, dict[int, Path]] = {}
-    for path in _entries(folder):
-        named = _RELEASED.fullmatch(_name_of(path))
-        if named and _is_draw(path) and _tells_of(named[1], key):
-            by_prefix.setdefault(named[1], {}).setdefault(int(named[2]), path)
+    for path, named in _draws_in(folder, _RELEASED):
+        of = re.search(rf"(?:_c(\d+))?_{re.escape(scene)}_fs", named[1])
+        if of is not None and int(of[1] or 0) == (int(wanted[0]) if wanted else 0):
+            by_prefix.setdefault(named[1], {})[int(named[2])] = path
     if len(by_prefix) > 1:
         raise DataError(f"{folder} holds clip {key} several times: {', '.join(sorted(by_prefix))}; keep one")
     return [draws[number] for draws in by_prefix.values() for number in sorted(draws)]
 
 
-def _tells_of(prefix: str, key: str) -> bool:
-    """Whether the name of a released output is that of a clip; without its number it is the first trajectory's."""
-    scene, _, sample = key.partition(".")
-    told = re.search(rf"(?:_c(\d+))?_{re.escape(scene)}_fs", prefix)
-    wanted = re.search(r"\d+$", sample)
-    return told is not None and int(told[1] or 0) == (int(wanted[0]) if wanted else 0)
-
-
-def _entries(folder: Path) -> list[Path]:
-    """What is in a folder, folders before files; nothing where there is none."""
-    return sorted(folder.iterdir(), key=lambda path: (path.is_file(), path.name)) if folder.is_dir() else []
-
-
-def _name_of(path: Path) -> str:
-    return path.stem if path.suffix == _VIDEO else path.name
+def _draws_in(folder: Path, names: re.Pattern[str]) -> Iterator[tuple[Path, re.Match[str]]]:
+    """What a folder holds under such names, folders after videos, so that of one name they count; none without it."""
+    each = sorted(folder.iterdir(), key=lambda path: (path.is_dir(), path.name)) if folder.is_dir() else []
+    for path in each:
+        named = names.fullmatch(path.stem if path.suffix == _VIDEO else path.name)
+        if named and _is_draw(path):
+            yield path, named
 
 
 def _is_draw(path: Path) -> bool:
     return bool(_pictures(path)) if path.is_dir() else path.suffix == _VIDEO and path.is_file()
 
 
-def _pictures(folder: Path) -> Sequence[Path]:
+def _pictures(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.suffix in _PICTURES and path.stem.isdecimal()]
 
 
-def _video_frames(path: Path) -> list[Bytes]:
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+def read_draw(path: Path) -> list[Bytes]:
+    """RGB pictures, uint8 [H, W, 3] each, of a folder of numbered pictures, or of a video.
+
+    Raises: FileFault for a damaged file; DataError for a folder whose pictures do not count up one by one.
+    """
+    if path.is_dir():
+        found = sorted(_pictures(path), key=lambda each: int(each.stem))
+        numbers = [int(each.stem) for each in found]
+        if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
+            raise DataError(f"{path} holds frames {numbers}, one is missing or there twice; number them from 0 on")
+        return [read_colour(each) for each in found]
+    capture, frames = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG), list[Bytes]()
     try:
-        frames: list[Bytes] = []
-        while True:
-            there, frame = capture.read()
-            if not there:
-                break
-            frames.append(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB).astype("uint8", copy=False))
+        while (read := capture.read())[0]:
+            frames.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB).astype("uint8", copy=False))
     finally:
         capture.release()
     if not frames:
@@ -307,12 +279,22 @@ class SavedFrames:
     painted: tuple[SemanticClass, ...] = ()
     privileged: bool = False
 
-    @classmethod
-    def open(cls, name: str, folder: Path, *, painted: Sequence[SemanticClass] = (), privileged: bool = False) -> Self:
-        """Raises DataError if there is no such folder."""
-        if not folder.is_dir():
-            raise DataError(f"the frames of {name} should lie in {folder}, which is no folder; give NAME=FOLDER")
-        return cls(name=name, folder=folder, painted=tuple(painted), privileged=privileged)
+    @property
+    def details(self) -> dict[str, str]:
+        """See Predictor; with a digest of all names and contents, as frames that are made anew are another method.
+
+        Raises: DataError where they cannot be read.
+        """
+        digest = hashlib.sha256()
+        try:
+            for path in sorted(each for each in self.folder.rglob("*") if each.is_file()):
+                with path.open("rb") as file:
+                    content = hashlib.file_digest(file, "sha256").hexdigest()
+                digest.update(f"{path.relative_to(self.folder)} {content}\n".encode())
+        except OSError as error:
+            raise DataError(f"{self.folder} cannot be read ({error}); give NAME=FOLDER") from error
+        more = {"privileged": "yes"} if self.privileged else {}
+        return {FRAMES_IN: str(self.folder), "digest": digest.hexdigest()[:12], **more}
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor; each sample that was saved is a draw.
@@ -321,23 +303,18 @@ class SavedFrames:
             DataError: there is nothing for this clip, or something of another length or size; nothing is resized.
             FileFault: a file is damaged.
         """
-        videos = [_read(draw, clip) for draw in find_draws(self.folder, clip.key)]
-        first, *more = (
-            Prediction(classes=nearest_classes(video, self.painted)) if self.painted else Prediction(video=video)
-            for video in videos
-        )
-        return replace(first, more=tuple(more))
-
-
-def _read(draw: Path, clip: SourceClip) -> Tensor:
-    """float32 [T, 3, H, W] in [0, 1]. Raises DataError."""
-    frames, lens = read_draw(draw), clip.cameras.target
-    if len(frames) != len(clip.source):
-        raise DataError(f"{draw} holds {len(frames)} frames, clip {clip.key} has {len(clip.source)}; save all")
-    for number, frame in enumerate(frames):
-        if frame.shape != (lens.height, lens.width, 3):
-            raise DataError(
-                f"{draw}: frame {number} is {frame.shape[1]} x {frame.shape[0]}, the target {lens.width} x "
-                f"{lens.height}; save them in that size"
-            )
-    return torch.cat([to_pictures(frame[None]) for frame in frames])
+        made, lens = list[Prediction](), clip.cameras.target
+        for draw in find_draws(self.folder, clip.key):
+            frames = read_draw(draw)
+            if len(frames) != len(clip.source):
+                raise DataError(f"{draw} holds {len(frames)} frames, clip {clip.key} has {len(clip.source)}; save all")
+            for number, frame in enumerate(frames):
+                if frame.shape != (lens.height, lens.width, 3):
+                    raise DataError(
+                        f"{draw}: frame {number} is {frame.shape[1]} x {frame.shape[0]}, the target {lens.width} x "
+                        f"{lens.height}; save them in that size"
+                    )
+            video = to_pictures(np.stack(frames))
+            classes = nearest_classes(video, self.painted) if self.painted else None
+            made.append(Prediction(video=None if self.painted else video, classes=classes))
+        return replace(made[0], more=tuple(made[1:]))

@@ -112,7 +112,7 @@ def controlled(
     Args:
         listed: the control list, None without. folder: where the scenes lie.
     Raises:
-        DataError: there are scenes, and the list has none of them.
+        DataError: there are scenes, and the list has none of them, or is for driving and they are seen along orbits.
     """
     there = tuple(scene for scene in scenes if controls.names(scene))
     if scenes and not there:
@@ -123,34 +123,28 @@ def controlled(
     for scene in scenes:
         if scene not in there:
             notes.add(scene, str(listed), "has no control for it")
-    return there
-
-
-def require_cameras(data: Dataset4D) -> None:
-    """Raises DataError, with the first fault, where no scene can be opened with all of its cameras."""
-    fault: DataError | None = None
-    for scene in data.scenes:
-        try:
-            data.frames(scene)
-        except DataError as error:
-            fault = fault or error
-        else:
-            return
-    if fault is not None:
-        names, count = ", ".join(data.cameras), len(data.cameras)
-        cameras = f"the cameras {names}" if count <= _NAMED else f"its {count} cameras"
-        raise DataError(
-            f"none of {len(data.scenes)} scenes can be opened with {cameras}: {fault}; name those there are with "
-            "--camera"
-        ) from fault
-
-
-def require_orbits(controls: Controls, scenes: Sequence[str], listed: Path) -> None:
-    """Raises DataError where a control of these scenes has no cameras: the list is for driving."""
-    for scene in scenes:
-        for control in controls[scene]:
+    if controls.listed is not None and isinstance(controls.sampling, OrbitSampling):
+        for scene, control in ((name, control) for name in there for control in controls.listed[name]):
             if control.start is None or control.goal is None:
                 raise DataError(
                     f"{listed}: {scene}, {control.name} has no spherical_start: it is a driving control, and these "
                     "scenes are seen along orbits; give Kubric-4D's controls"
                 )
+    return there
+
+
+def require_cameras(data: Dataset4D) -> None:
+    """Raises DataError, with the first fault, where no scene can be opened with all of its cameras."""
+    faults: list[DataError] = []
+    for scene in data.scenes:
+        try:
+            data.frames(scene)
+            return
+        except DataError as error:
+            faults.append(error)
+    names, count = ", ".join(data.cameras), len(data.cameras)
+    cameras = f"the cameras {names}" if count <= _NAMED else f"its {count} cameras"
+    raise DataError(
+        f"none of {len(data.scenes)} scenes can be opened with {cameras}: {faults[0]}; name those there are with "
+        "--camera"
+    ) from faults[0]

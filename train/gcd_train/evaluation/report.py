@@ -1,17 +1,20 @@
 """The report as a folder: `report.md`, its tables as CSV, plots, galleries and videos."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
+from typing import Any
+
+import numpy as np
 
 from gcd_train.errors import RecipeError, RunError
 from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
 from gcd_train.evaluation.paper import is_model, tables_for
-from gcd_train.evaluation.plots import all_plots, curves_csv, draw, require_matplotlib
-from gcd_train.evaluation.runs import EvaluatedSet, Method, Run, gather, on_the_same_goals
-from gcd_train.evaluation.statistics import FEW_SCENES, SEED, Span
-from gcd_train.evaluation.store import folder_name
+from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords, Run, gather, on_the_same_goals
+from gcd_train.evaluation.statistics import FEW_SCENES, FIRST_MEASURED, SEED, FigureName, Interval, Span
+from gcd_train.evaluation.store import Region, folder_name
 from gcd_train.evaluation.tables import (
     NOTHING,
     STAR_OF_FIGURE,
@@ -20,17 +23,20 @@ from gcd_train.evaluation.tables import (
     all_figures,
     class_table,
     clips_csv,
+    csv_text,
     differences,
     differences_csv,
     differences_markdown,
     frames_told,
     main_tables,
     markdown_rows,
+    numbers,
     region_table,
     to_csv,
     to_markdown,
 )
 from gcd_train.files import write_whole
+from gcd_train.pictures import new_figure, require_matplotlib, save
 
 _SPANS: tuple[Span, ...] = ("2-last", "last")
 """Of tables; the released script's figures are over all frames, so these come first where a run used it."""
@@ -64,20 +70,26 @@ def make_report(
     runs = tuple(Run.read(folder) for folder in folders)
     sets = gather(runs, rows)
     _require_choices(leads, rows or {}, sets)
-    pages = [_first_page(runs, command)]
-
-    def writer(of: EvaluatedSet, place: str) -> _Writer:
-        return _Writer(of=of, out=out, place=place, chosen=tuple(leads), clips=clips, drawn=drawn)
-
+    pages = ["# Report", *([f"```bash\n{command}\n```"] if command else [])]
+    pages.append(f"Intervals: 95 %, 10 000 draws of scenes, seed {SEED}.")
+    pages += map(_about, runs)
     for number, each in enumerate(sets, start=1):
-        place = "." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}"
-        pages.append("\n".join(writer(each, place).sections()))
+        place = Path("." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}")
+        writer = _Writer(of=each, out=out, place=place, chosen=tuple(leads))
+        spans: tuple[Span, ...] = ("all", *_SPANS) if each.note.protocol == "release" else _SPANS
+        pages += [f"## {each.title}", *writer.tables(spans), *writer.differences(spans)]
+        pages += [*writer.plots(drawn), *writer.gallery(clips)]
     joined, notes = on_the_same_goals(sets)
     for number, each in enumerate(joined, start=1):
-        pages.append("\n".join(writer(each, f"last-frame-{number}").last_frames()))
+        writer = _Writer(of=each, out=out, place=Path(f"last-frame-{number}"), chosen=tuple(leads))
+        pages.append(f"## The last frame together: {each.title}")
+        pages.append(
+            "Clips of the same names end at the same goals here, so their last frames are comparable and no others."
+        )
+        pages += [*map(writer.table, main_tables(each, ("last",))), *writer.differences(("last",))]
     if notes:
-        pages.append("\n".join(["## What is not compared\n", *(f"- {note}" for note in notes)]))
-    write_whole(out / "report.md", ("\n".join(pages).rstrip() + "\n").encode())
+        pages += ["## What is not compared", "\n".join(f"- {note}" for note in notes)]
+    write_whole(out / "report.md", ("\n\n".join(page.rstrip("\n") for page in pages) + "\n").encode())
     return out / "report.md"
 
 
@@ -99,20 +111,9 @@ def _require_choices(leads: Sequence[str], rows: Mapping[str, str], sets: Sequen
             raise RecipeError(f"--row {method}: no row is called {label!r}; there are {'; '.join(labels)}")
 
 
-def _first_page(runs: Sequence[Run], command: str) -> str:
-    """What the figures were made by: commands, seeds, digests."""
-    lines = ["# Report", ""]
-    if command:
-        lines += ["```bash", command, "```", ""]
-    lines += [f"Intervals: 95 %, 10 000 draws of scenes, seed {SEED}.", ""]
-    for run in runs:
-        lines += [f"## Run {run.folder.name}", "", "```bash", run.note.command, "```", "", *_note_lines(run), ""]
-    return "\n".join(lines)
-
-
-def _note_lines(run: Run) -> list[str]:
+def _about(run: Run) -> str:
+    """What the figures of a run were made by: command, seeds, digests."""
     note = run.note
-    versions = ", ".join(f"{name} {version}" for name, version in note.versions.items())
     seconds: dict[str, list[float]] = {name: [] for name in note.methods}
     for record in run.records:
         seconds.setdefault(record.method, []).append(record.seconds)
@@ -121,12 +122,13 @@ def _note_lines(run: Run) -> list[str]:
             name,
             str(len(seconds[name])),
             f"{fmean(seconds[name]):.2f}" if seconds[name] else NOTHING,
-            ", ".join(f"{key} {value}" for key, value in told.items()),
+            ", ".join(f"{key} {value}" for key, value in details.items()),
         ]
-        for name, told in note.methods.items()
+        for name, details in note.methods.items()
     ]
     lines = [
-        f"- made: {note.made}, {versions}",
+        f"## Run {run.folder.name}\n\n```bash\n{note.command}\n```\n",
+        f"- made: {note.made}, {', '.join(f'{name} {version}' for name, version in note.versions.items())}",
         f"- clips: {', '.join(note.data)}, digest {note.data_identity}",
         f"- protocol: {note.protocol}, seed {note.seed}",
         f"- size: {note.frames} frames of {note.width}x{note.height}",
@@ -136,119 +138,249 @@ def _note_lines(run: Run) -> list[str]:
     without = [name for name in note.methods if not seconds[name]]
     if without:
         why = "No clip was measured; the line of `gcd-train evaluate` says why."
-        lines += ["", f"**Failed: {', '.join(without)}. {why}**"]
-    return lines
+        lines.append(f"\n**Failed: {', '.join(without)}. {why}**")
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Writer:
-    """One set's part of the report. place: its folder within `out`. chosen, clips, drawn: see `make_report`."""
+    """One set's part of the report, as paragraphs; its files are written on the way.
+
+    place: its folder within `out`. chosen: see `make_report`.
+    """
 
     of: EvaluatedSet
     out: Path
-    place: str
+    place: Path
     chosen: tuple[str, ...]
-    clips: int
-    drawn: bool
 
-    @property
-    def leads(self) -> tuple[Method, ...]:
-        """The methods that are compared with all others; those of the choice that the set has."""
-        if self.chosen:
-            return tuple(method for name in self.chosen for method in self.of.methods if method.name == name)
-        models = tuple(method for method in self.of.methods if is_model(method.name, method.details))
-        return models or self.of.methods[:1]
+    def table(self, table: Table) -> str:
+        return f"{to_markdown(table)}\n{self._written(f'tables/{table.name}.csv', to_csv(table))}"
 
-    def sections(self) -> Iterator[str]:
-        spans: tuple[Span, ...] = ("all", *_SPANS) if self.of.note.protocol == "release" else _SPANS
-        yield f"## {self.of.title}\n"
-        yield from self._tables(spans)
-        yield from self._differences(spans)
-        yield from self._plots()
-        yield from self._gallery()
-
-    def last_frames(self) -> Iterator[str]:
-        """Only what the last frame tells, of methods that go there in different ways."""
-        yield f"## The last frame together: {self.of.title}\n"
-        yield "Clips of the same names end at the same goals here, so their last frames are comparable and no others.\n"
-        yield from map(self._table, main_tables(self.of, ("last",)))
-        yield from self._differences(("last",))
-
-    def _table(self, table: Table) -> str:
-        self._write(f"tables/{table.name}.csv", to_csv(table))
-        return f"{to_markdown(table)}\n{self._link(f'tables/{table.name}.csv')}\n"
-
-    def _tables(self, spans: Sequence[Span]) -> Iterator[str]:
-        yield from map(self._table, main_tables(self.of, spans))
-        yield self._table(region_table(self.of, spans[0]))
+    def tables(self, spans: Sequence[Span]) -> Iterator[str]:
+        yield from map(self.table, main_tables(self.of, spans))
+        yield self.table(region_table(self.of, spans[0]))
         if any(method.makes_classes for method in self.of.methods):
-            yield self._table(class_table(self.of, spans[0]))
-        self._write("tables/figures.csv", all_figures(self.of))
-        self._write("tables/clips.csv", clips_csv(self.of))
-        yield (
-            f"All figures with their intervals: {self._link('tables/figures.csv')}; "
-            f"clip by clip: {self._link('tables/clips.csv')}.\n"
-        )
+            yield self.table(class_table(self.of, spans[0]))
+        figures = self._written("tables/figures.csv", all_figures(self.of))
+        by_clip = self._written("tables/clips.csv", clips_csv(self.of))
+        yield f"All figures with their intervals: {figures}; clip by clip: {by_clip}."
 
-    def _differences(self, spans: Sequence[Span]) -> Iterator[str]:
-        every: list[Difference] = []
+    def differences(self, spans: Sequence[Span]) -> Iterator[str]:
+        """Of the chosen methods that the set has, else of its models, else of its first, from all others."""
+        methods, every = self.of.methods, list[Difference]()
+        leads = tuple(method for name in self.chosen for method in methods if method.name == name)
+        if not self.chosen:
+            leads = tuple(method for method in methods if is_model(method.name, method.details)) or methods[:1]
         for frames in spans:
-            told = frames_told(self.of, frames)
-            for lead in self.leads:
-                found = differences(self.of, lead, frames)
+            for lead in leads:
+                others = (other for other in methods if other.name != lead.name)
+                found = [each for other in others for each in differences(lead, other, frames)]
                 every += found
                 if found:
-                    yield f"### {lead.starred} against the others, {told}\n"
+                    yield f"### {lead.starred} against the others, {frames_told(self.of, frames)}"
                     yield differences_markdown(found, self.of)
         if every:
-            self._write("tables/differences.csv", differences_csv(every))
             yield (
                 "How far it lies above the other on the same clips; bold where zero lies outside the 95 % interval, "
-                f"which is paired over scenes. {self._link('tables/differences.csv')}\n"
+                f"which is paired over scenes. {self._written('tables/differences.csv', differences_csv(every))}"
             )
         if any(each.starred for each in every):
-            yield f"{STAR_OF_FIGURE}\n"
+            yield STAR_OF_FIGURE
         if every and self.of.scenes < FEW_SCENES:
-            yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold.\n"
+            yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold."
 
-    def _plots(self) -> Iterator[str]:
+    def plots(self, drawn: bool) -> Iterator[str]:
         for plot in all_plots(self.of):
-            self._write(f"plots/{plot.name}.csv", curves_csv(plot))
-            if self.drawn:
-                told = f"{plot.up} by {plot.across}"
-                draw(plot, self._path(f"plots/{plot.name}.png"))
-                yield f"### {plot.title}: {told}\n\n![{told}]({self._name(f'plots/{plot.name}.png')})\n"
-            yield f"The numbers: {self._link(f'plots/{plot.name}.csv')}\n"
+            by_point = self._written(f"plots/{plot.name}.csv", curves_csv(plot))
+            if drawn:
+                shown, picture = f"{plot.up} by {plot.across}", self.place / f"plots/{plot.name}.png"
+                draw(plot, self.out / picture)
+                yield f"### {plot.title}: {shown}\n\n![{shown}]({picture})"
+            yield f"The numbers: {by_point}"
 
-    def _gallery(self) -> Iterator[str]:
-        if not self.clips:
-            return
-        keys = shown_clips(self.of, self.of.methods, self.clips)
+    def gallery(self, count: int) -> Iterator[str]:
+        """A sheet of so many clips, and a video of each."""
+        keys = shown_clips(self.of, self.of.methods, count) if count else ()
+        if count and not keys:
+            yield "No frames were kept, so there is no gallery: evaluate with `--views few`."
         if not keys:
-            yield "No frames were kept, so there is no gallery: evaluate with `--views few`.\n"
             return
-        yield "### Gallery\n"
-        yield from self._shown("gallery", keys)
+        clips, sheet = [(key, strips(self.of.methods, key)) for key in keys], self.place / "gallery/sheet.png"
+        write_sheet(clips, self.out / sheet)
+        yield f"### Gallery\n\n![{', '.join(keys)}]({sheet})"
+        files = {key: self.place / f"gallery/{folder_name(key)}.mp4" for key in keys}
+        made = [files[key] for key, rows in clips if write_video(rows, self.of.clips[key].fps, self.out / files[key])]
+        if made:
+            yield f"Videos: {', '.join(f'[{file.name}]({file})' for file in made)}"
 
-    def _shown(self, folder: str, keys: Sequence[str]) -> Iterator[str]:
-        """A sheet of clips, and a video of each."""
-        clips = [(key, strips(self.of.methods, key)) for key in keys]
-        write_sheet(clips, self._path(f"{folder}/sheet.png"))
-        yield f"![{', '.join(keys)}]({self._name(f'{folder}/sheet.png')})\n"
-        names = {key: f"{folder}/{folder_name(key)}.mp4" for key in keys}
-        made = {names[key]: write_video(rows, self.of.clips[key].fps, self._path(names[key])) for key, rows in clips}
-        videos = [self._link(name) for name, done in made.items() if done]
-        if videos:
-            yield f"Videos: {', '.join(videos)}\n"
+    def _written(self, name: str, text: str) -> str:
+        """Write a file; gives the link to it."""
+        write_whole(self.out / self.place / name, text.encode())
+        return f"[{Path(name).name}]({self.place / name})"
 
-    def _name(self, name: str) -> str:
-        return name if self.place == "." else f"{self.place}/{name}"
 
-    def _path(self, name: str) -> Path:
-        return self.out / self._name(name)
+ANGLE_STEP_DEG = 15.0
+_MOST_ANGLES = 13  # so many different ones are shown as they are
+_HEXPLANE = re.compile(r"hexplane[ _-]?(\d+)", re.IGNORECASE)
 
-    def _link(self, name: str) -> str:
-        return f"[{Path(name).name}]({self._name(name)})"
 
-    def _write(self, name: str, text: str) -> None:
-        write_whole(self._path(name), text.encode())
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Point:
+    """x: where on the axis. y: the figure there. clips: that it is of."""
+
+    x: float
+    y: Interval
+    clips: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Plot:
+    """name: of its files. title, across, up: what it shows. curves: points by the name of their line.
+
+    levels: lines right across, of what has no x. counted: x are whole numbers, of frames or views.
+    """
+
+    name: str
+    title: str
+    across: str
+    up: str
+    curves: dict[str, list[Point]]
+    levels: dict[str, Point] = field(default_factory=dict[str, Point])
+    counted: bool = False
+
+
+def all_plots(of: EvaluatedSet) -> tuple[Plot, ...]:
+    """All that the records are enough for."""
+    made = (error_by_angle(of), ssim_by_views(of), psnr_by_frame(of))
+    return tuple(plot for plot in made if plot.curves)
+
+
+def _curves(curves: Mapping[str, Iterable[Point]], least: int = 1) -> dict[str, list[Point]]:
+    """Those of so many points or more whose figure is known, and these."""
+    known = {name: [point for point in points if point.y.known] for name, points in curves.items()}
+    return {name: points for name, points in known.items() if len(points) >= least}
+
+
+def error_by_angle(of: EvaluatedSet) -> Plot:
+    """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; no curve on one path for all.
+
+    Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
+    """
+    curves: dict[str, list[Point]] = {}
+    for method in of.methods:
+        turned = {record.key: abs(record.change[0]) for record in method.records if record.change is not None}
+        groups: dict[float, list[str]] = {}
+        for key, place in zip(turned, angle_bins(list(turned.values())), strict=True):
+            groups.setdefault(place, []).append(key)
+        curves[method.name] = [
+            Point(x=x, y=method.sums("last", keys=groups[x]).interval("psnr_db"), clips=len(groups[x]))
+            for x in sorted(groups)
+        ]
+    return Plot(
+        name="psnr_by_angle",
+        title="Last frame, all pixels",
+        across="azimuth turned by, degrees",
+        up="PSNR, dB",
+        curves=_curves(curves, least=2),
+    )
+
+
+def psnr_by_frame(of: EvaluatedSet) -> Plot:
+    """PSNR of each frame from the second on, all pixels; mIoU where there are only class maps."""
+    pictures = [method for method in of.methods if method.makes_pictures]
+    figure: FigureName = "psnr_db" if pictures else "miou_common"
+    frames = range(FIRST_MEASURED + 1, of.note.frames + 1)
+    curves = {
+        method.name: [
+            Point(x=frame, y=method.sums(frame).interval(figure), clips=len(method.records)) for frame in frames
+        ]
+        for method in pictures or of.methods
+    }
+    return Plot(
+        name="by_frame",
+        title="Each frame, all pixels",
+        across="frame",
+        up="PSNR, dB" if pictures else "mIoU",
+        curves=_curves(curves, least=2),
+        counted=True,
+    )
+
+
+def ssim_by_views(of: EvaluatedSet) -> Plot:
+    """SSIM over the number of views that HexPlane is given; every other method as a level. No curve without HexPlane.
+
+    Source: GCD, section 5: how many input views a reconstruction needs to come near.
+    """
+    views = {method.name: int(m[1]) for method in of.methods if (m := _HEXPLANE.search(method.name))}
+    given = sorted((method for method in of.methods if method.name in views), key=lambda m: (views[m.name], m.name))
+
+    def point(method: MethodRecords, region: Region) -> Point:
+        y = method.sums(region=region).interval("ssim")
+        return Point(x=views.get(method.name, 0), y=y, clips=len(method.records))
+
+    regions: tuple[Region, ...] = ("all", "occluded")
+    return Plot(
+        name="ssim_by_views",
+        title="HexPlane, frames 2 to the last",
+        across="views given",
+        up="SSIM",
+        curves=_curves({f"HexPlane, {region}": [point(method, region) for method in given] for region in regions}),
+        levels={
+            f"{method.name}, all": point(method, "all")
+            for method in of.methods
+            if method.name not in views and method.makes_pictures
+        },
+        counted=True,
+    )
+
+
+def curves_csv(plot: Plot) -> str:
+    """One point a line; levels have no x."""
+    points = [(name, f"{point.x:g}", point) for name, curve in plot.curves.items() for point in curve]
+    points += [(name, "", point) for name, point in plot.levels.items()]
+    lines = [[name, x, *numbers(point.y), str(point.clips)] for name, x, point in points]
+    return csv_text(["method", plot.across, plot.up, "low", "high", "clips"], lines)
+
+
+def angle_bins(angles: Sequence[float]) -> list[float]:
+    """Where each angle, in degrees, stands on the axis: as it is, or, where many differ, in the middle of its step."""
+    rounded = [round(angle, 1) for angle in angles]
+    if len(set(rounded)) <= _MOST_ANGLES:
+        return rounded
+    return [(np.floor(min(angle, 179.999) / ANGLE_STEP_DEG) + 0.5) * ANGLE_STEP_DEG for angle in angles]
+
+
+_SIZE_IN = (7.2, 4.4)
+_MOST_TICKS = 16
+_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+
+def draw(plot: Plot, out: Path) -> None:
+    """One PNG: lines with 95 % intervals, levels dashed. Raises RenderError without matplotlib."""
+    figure = new_figure(*_SIZE_IN)
+    from matplotlib.ticker import FixedLocator, MaxNLocator
+
+    axes = figure.add_subplot()
+    for number, (name, curve) in enumerate(plot.curves.items()):
+        x, y = [point.x for point in curve], [point.y.value for point in curve]
+        bounds = np.array([(each.value - each.low, each.high - each.value) for each in (point.y for point in curve)])
+        yerr, mark = np.nan_to_num(bounds).clip(0.0).T, _MARKS[number % len(_MARKS)]
+        style: dict[str, Any] = {"marker": mark, "color": f"C{number % 10}", "markersize": 4, "linewidth": 1.2}
+        axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=name, **style)
+    for number, (name, level) in enumerate(plot.levels.items(), start=len(plot.curves)):
+        axes.axhline(level.y.value, linestyle="--", linewidth=1.0, color=f"C{number % 10}", label=name)
+    axes.set_title(plot.title, fontsize=10, loc="left")
+    axes.set_xlabel(plot.across)
+    axes.set_ylabel(plot.up)
+    if plot.counted:
+        places = sorted({point.x for curve in plot.curves.values() for point in curve})
+        few = len(places) <= _MOST_TICKS
+        axes.xaxis.set_major_locator(FixedLocator(places) if few else MaxNLocator(integer=True))
+        if len(places) == 1:
+            axes.set_xlim(places[0] - 1, places[0] + 1)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    figure.tight_layout()
+    save(figure, out)

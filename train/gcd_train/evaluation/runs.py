@@ -2,25 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from gcd_train.errors import RunError
 from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
-from gcd_train.evaluation.statistics import (
-    Array,
-    ClassCounts,
-    FigureName,
-    Selection,
-    Span,
-    Sums,
-    class_counts,
-    clip_sums,
-    scene_sums,
-)
+from gcd_train.evaluation.statistics import FRAMES_OF, ClipTable, Span, Sums
 from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, ClipRecord, Region, RunNote, read_run
 
 
@@ -41,37 +31,28 @@ class Run:
         return cls(folder=folder, note=note, records=records)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Method:
-    """One method on the clips of a set.
+@dataclass(frozen=True, kw_only=True)
+class MethodRecords:
+    """One method on the clips of a set; its table is worked out once.
 
-    details: what the run's note says of it. folder: of the run that its views are in.
+    details: what the run's note says of it. folder: of the run that its views are in. classes: how many there are.
     """
 
     name: str
     details: dict[str, str]
     folder: Path
     records: tuple[ClipRecord, ...]
-
-    @property
-    def privileged(self) -> bool:
-        """Whether it was given the exact depth, or further cameras."""
-        return self.records[0].privileged
+    classes: int = 0
 
     @property
     def starred(self) -> str:
-        """Its name, with a star where it was given more than the source video."""
-        return f"{self.name} *" if self.privileged else self.name
+        """Its name, with a star where it was given more than the source video: exact depth, or further cameras."""
+        return f"{self.name} *" if self.records[0].privileged else self.name
 
     @property
     def copies_classes(self) -> bool:
         """Whether its class maps, and nothing else of it, are made from the source's exact ones."""
-        return not self.privileged and self.details.get("baseline") in FROM_EXACT_CLASSES
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Of the clips it was measured on."""
-        return tuple(record.key for record in self.records)
+        return not self.records[0].privileged and self.details.get("baseline") in FROM_EXACT_CLASSES
 
     @property
     def makes_pictures(self) -> bool:
@@ -83,20 +64,36 @@ class Method:
         """Whether it has class maps that were compared."""
         return any(record.regions["all"].confusion is not None for record in self.records)
 
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """Of the clips it was measured on, by their names, among the records."""
+        return {record.key: place for place, record in enumerate(self.records)}
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+    @cached_property
+    def table(self) -> ClipTable:
+        """All figures of the records."""
+        return ClipTable.of(self.records, self.classes)
+
+    def sums(self, frames: Span | int = "2-last", region: Region = "all", keys: Sequence[str] | None = None) -> Sums:
+        """By scene, for some frames and pixels; of the clips of these names, or of all."""
+        return self.table.scene_sums(frames, region, None if keys is None else [self.places[key] for key in keys])
+
+    def common_keys(self, other: "MethodRecords") -> tuple[str, ...]:
+        """The clips that both were measured on, in this one's order."""
+        return tuple(key for key in self.places if key in other.places)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluatedSet:
-    """Methods that were measured on the same clips, by one run or by several; their sums are worked out once.
+    """Methods that were measured on the same clips, by one run or by several.
 
-    note: of the first run. runs: all of them. methods: in the order of the runs. rows: method to the row of the paper's
-    tables that a user says it belongs in.
+    note: of the first run. methods: in the order of the runs. rows: method to the row of the paper's tables that a user
+    says it belongs in.
     """
 
     note: RunNote
-    runs: tuple[Run, ...]
-    methods: tuple[Method, ...]
+    methods: tuple[MethodRecords, ...]
     rows: Mapping[str, str] = field(default_factory=dict[str, str])
-    _known: dict[object, Any] = field(default_factory=dict[object, Any], init=False, repr=False, compare=False)
 
     @property
     def title(self) -> str:
@@ -104,18 +101,13 @@ class EvaluatedSet:
         names = ", ".join(dict.fromkeys("/".join(Path(folder).parts[-2:]) or folder for folder in self.note.data))
         return f"{_KINDS[self.note.kind]} ({names}), {_PROTOCOLS[self.note.protocol]}"
 
-    @property
+    @cached_property
     def clips(self) -> dict[str, ClipRecord]:
-        """All clips that any method was measured on, each with its first record."""
+        """All clips that any method was measured on by name, each with its first record."""
         found: dict[str, ClipRecord] = {}
         for record in (record for method in self.methods for record in method.records):
             found.setdefault(record.key, record)
         return found
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Of all clips."""
-        return tuple(self.clips)
 
     @property
     def scenes(self) -> int:
@@ -127,27 +119,14 @@ class EvaluatedSet:
         """All, and the others where somebody knows which they are."""
         return tuple(region for region in REGIONS if any(region in each.regions for each in self.clips.values()))
 
-    def method(self, name: str) -> Method:
+    @property
+    def folders(self) -> str:
+        """Of all runs that its methods are from, in one line."""
+        return ", ".join(dict.fromkeys(str(method.folder) for method in self.methods))
+
+    def method(self, name: str) -> MethodRecords:
         """The one of this name, which there must be."""
         return next(each for each in self.methods if each.name == name)
-
-    def sums(self, method: Method, selection: Selection, records: Sequence[ClipRecord] | None = None) -> Sums:
-        """A method's sums by scene for some frames and pixels; of some of its records, or of all."""
-        if records is not None and tuple(record.key for record in records) != method.keys:
-            return scene_sums(records, selection, class_counts(records, len(self.note.classes)))
-        at = (method.name, selection)
-        if at not in self._known:
-            self._known[at] = scene_sums(method.records, selection, self._counts(method))
-        return self._known[at]
-
-    def by_clip(self, method: Method, region: Region, name: FigureName) -> Array:
-        """A figure of each clip of a method, [n], in frames 2 to the last."""
-        return clip_sums(method.records, Selection(region=region), self._counts(method)).figure(name)
-
-    def _counts(self, method: Method) -> ClassCounts:
-        if method.name not in self._known:
-            self._known[method.name] = class_counts(method.records, len(self.note.classes))
-        return self._known[method.name]
 
 
 _KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits"}
@@ -165,32 +144,33 @@ def gather(runs: Sequence[Run], rows: Mapping[str, str] | None = None) -> tuple[
     groups: dict[str, list[Run]] = {}
     for run in runs:
         groups.setdefault(run.note.data_identity, []).append(run)
-    return tuple(_set(tuple(members), rows or {}) for members in groups.values())
+    return tuple(_set(members, rows or {}) for members in groups.values())
 
 
-def _set(runs: tuple[Run, ...], rows: Mapping[str, str]) -> EvaluatedSet:
-    first = runs[0]
+def _set(runs: Sequence[Run], rows: Mapping[str, str]) -> EvaluatedSet:
+    first, found = runs[0], dict[str, MethodRecords]()
     for run, name in ((run, name) for run in runs[1:] for name in COMPARABLE):
         was, now = getattr(first.note, name), getattr(run.note, name)
         if was != now:
             raise RunError(
                 f"{run.folder} has {name} {now}, {first.folder} has {was}, on the same clips; report them apart"
             )
-    found: dict[str, Method] = {}
     for run in runs:
-        records: dict[str, list[ClipRecord]] = {}
-        for record in run.records:
-            records.setdefault(record.method, []).append(record)
-        for name, own in records.items():
-            details = run.note.methods.get(name, {})
-            method = Method(name=name, details=details, folder=run.folder, records=tuple(own))
+        for name in dict.fromkeys(record.method for record in run.records):
+            method = MethodRecords(
+                name=name,
+                details=run.note.methods.get(name, {}),
+                folder=run.folder,
+                records=tuple(record for record in run.records if record.method == name),
+                classes=len(run.note.classes),
+            )
             other = found.setdefault(name, method)
-            if not _same_method(other.details, details):
+            if not _same_method(other.details, method.details):
                 raise RunError(
                     f"{name} is another method in {other.folder} than in {run.folder}: {other.details} and "
-                    f"{details}; measure it alike in both, give one another name, or report the runs apart"
+                    f"{method.details}; measure it alike in both, give one another name, or report the runs apart"
                 )
-    return EvaluatedSet(note=first.note, runs=runs, methods=tuple(found.values()), rows=rows)
+    return EvaluatedSet(note=first.note, methods=tuple(found.values()), rows=rows)
 
 
 def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
@@ -207,28 +187,28 @@ _SAME_FIGURE = 1e-4  # of the larger one: two cameras at one goal see one pictur
 def targets_apart(one: ClipRecord, other: ClipRecord, frames: Span = "last") -> str:
     """Why two clips of one name do not have the same target in these frames, in words; empty where they have.
 
-    Told by where the camera goes and how sharp the target is, frame by frame.
+    Known by where the camera goes and how sharp the target is, frame by frame.
     """
     changes = [np.array(each.change if each.change is not None else (np.nan,) * 3) for each in (one, other)]
     if not np.allclose(*changes, rtol=0.0, atol=_SAME_CHANGE, equal_nan=True):
-        return "the camera goes {} and {}".format(*(_told(each.change) for each in (one, other)))
-    chosen = Selection(frames=frames).frame_slice()
+        ways = [
+            "its fixed path"
+            if each.change is None
+            else "by azimuth {:+.1f}, elevation {:+.1f}, radius {:+.1f}".format(*each.change)
+            for each in (one, other)
+        ]
+        return f"the camera goes {ways[0]} and {ways[1]}"
+    chosen = FRAMES_OF[frames]
     sharp = [np.array(each.regions["all"].gradient_target[chosen], np.float64) for each in (one, other)]
     if sharp[0].shape != sharp[1].shape or not np.allclose(*sharp, rtol=_SAME_FIGURE, atol=1e-9, equal_nan=True):
         return "the target's pictures differ: other moments, or another path"
     return ""
 
 
-def _told(change: tuple[float, float, float] | None) -> str:
-    if change is None:
-        return "its fixed path"
-    return "by azimuth {:+.1f}, elevation {:+.1f}, radius {:+.1f}".format(*change)
-
-
 def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> tuple[tuple[EvaluatedSet, ...], tuple[str, ...]]:
-    """Sets with clips of one name that end at the same goal, put together, for figures of the last frame.
+    """Methods of several sets together, as far as clips of the same names end at the same goals.
 
-    A gradual and a direct path end at the same goal, so their last frames can be compared and no others. Clips of the
+    Gradual and direct models see other clips, but their last frames show the same: these can be compared. Clips of the
     same name that go elsewhere are left out. A method that several of the sets have is taken from the first.
 
     Returns: the sets, each put together from several; and what is not compared, and why, line by line.
@@ -247,17 +227,14 @@ def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str
             continue
         ours, theirs = group[0].clips, each.clips
         why = {key: targets_apart(record, theirs[key]) for key, record in ours.items() if key in theirs}
-        apart = {key: reason for key, reason in why.items() if reason}
+        apart = [key for key, reason in why.items() if reason]
         if apart:
-            first, other = (", ".join(dict.fromkeys(str(run.folder) for run in of.runs)) for of in (group[0], each))
-            key, reason = next(iter(apart.items()))
             notes.append(
-                f"{first} and {other}: of {len(why)} clips of the same names {len(apart)} do not end at the same goal, "
-                f"so they are not compared. In {key} {reason}."
+                f"{group[0].folders} and {each.folders}: of {len(why)} clips of the same names {len(apart)} do not end "
+                f"at the same goal, so they are not compared. In {apart[0]} {why[apart[0]]}."
             )
         if len(apart) < len(why):
-            wanted = why.keys() - apart.keys()
-            kept = [replace(m, records=tuple(r for r in m.records if r.key in wanted)) for m in each.methods]
+            kept = [replace(m, records=tuple(r for r in m.records if why.get(r.key) == "")) for m in each.methods]
             group.append(replace(each, methods=tuple(method for method in kept if method.records)))
             return
     groups.append([each])
@@ -265,7 +242,7 @@ def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str
 
 def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSet:
     """One set of all; methods that share a name and nothing else are noted, and only the first of each is kept."""
-    methods: dict[str, Method] = {}
+    methods: dict[str, MethodRecords] = {}
     for method in (method for each in sets for method in each.methods):
         other = methods.setdefault(method.name, method)
         if other.details != method.details:
@@ -275,7 +252,6 @@ def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSe
             )
     return EvaluatedSet(
         note=msgspec.structs.replace(sets[0].note, data=tuple(folder for each in sets for folder in each.note.data)),
-        runs=tuple(run for each in sets for run in each.runs),
         methods=tuple(methods.values()),
         rows=sets[0].rows,
     )

@@ -1,20 +1,20 @@
-"""Records as sums that add up, the figures that are functions of them, and how sure those are.
+"""Records as one table of sums that add up, the figures that are ratios of them, and how sure those are.
 
-Every figure of some clips is a function of sums over them, so any grouping or weighting of clips is one product.
-Intervals are the bootstrap over scenes, Efron 1979: scenes are drawn, not clips, as clips of one scene are
-alike; the same seed draws the same scenes of every method, so that differences are paired.
+Every figure is a ratio of two sums over clips, or, of classes, a mean of such ratios; so any grouping or weighting of
+clips is one product. Intervals are the bootstrap over scenes, Efron 1979: scenes are drawn, not clips, as clips of one
+scene are alike; the same seed draws the same scenes of every method, so that differences are paired.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, Self, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.store import REGIONS, ClipRecord, Counted, Frames, Region, RegionRecord
+from gcd_train.evaluation.store import REGIONS, ClipRecord, Counted, Region
 
 FIRST_MEASURED = 1
 """Frames before this one, counted from 0, are left out: a gradual path begins where the source camera stands."""
@@ -25,7 +25,9 @@ FEW_SCENES = 10
 """Of fewer, no claim can rest on what was found: the bootstrap knows no more scenes than it is given."""
 
 Span: TypeAlias = Literal["2-last", "last", "all"]
-"""Which frames are measured."""
+"""Which frames are measured: as the paper's main tables, as its ablations, or as the released script."""
+SPANS: tuple[Span, ...] = get_args(Span)
+FRAMES_OF: dict[Span, slice] = {"2-last": slice(FIRST_MEASURED, None), "last": slice(-1, None), "all": slice(None)}
 
 FigureName: TypeAlias = Literal[
     "psnr_db", "ssim", "lpips", "diversity", "gradient_energy", "flicker", "miou_full", "miou_common"
@@ -34,80 +36,14 @@ FigureName: TypeAlias = Literal[
 
 psnr_db, ssim, lpips: means over frames, draws and clips, each clip weighing the same. diversity: mean spread of a pixel
 over draws. gradient_energy, flicker: views over targets, 1 is ideal. miou_full: mean over the classes. miou_common:
-the same, mean over the ten commonest classes.
+the same, mean over the ten commonest classes. LPIPS and flicker are of all pixels only.
 """
 
 FIGURE_NAMES: tuple[FigureName, ...] = get_args(FigureName)
-_PARTS = FIGURE_NAMES[:6]
+_CLASSES = FIGURE_NAMES.index("miou_full")  # the first column of a class; before it one of each figure that is no mIoU
+_MEANS, _GRADIENT, _FLICKER = 4, 4, 5
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Selection:
-    """Which frames and pixels figures are of.
-
-    frames: "2-last" as the paper's main tables, "last" as its ablations, "all" as the released script, or one frame
-    counted from 1. region: which pixels of the target. LPIPS and flicker are of all pixels only.
-    """
-
-    frames: Span | int = "2-last"
-    region: Region = "all"
-
-    def frame_slice(self) -> slice:
-        """The frames, of values from the first frame on."""
-        if isinstance(self.frames, int):
-            return slice(self.frames - 1, self.frames)
-        return {"2-last": slice(FIRST_MEASURED, None), "last": slice(-1, None), "all": slice(None)}[self.frames]
-
-    def step_slice(self) -> slice:
-        """The changes between these frames, of values from frames 1 to 2 on; for one frame the change into it."""
-        if isinstance(self.frames, int):
-            return slice(max(self.frames - 2, 0), self.frames - 1)
-        return self.frame_slice()
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClassCounts:
-    """Pixels that are right, predicted and true by class, of n clips with T frames and K classes.
-
-    regions: [n, T, 3, K], of regions that any clip has. common: ids of the commonest classes.
-    """
-
-    regions: Mapping[Region, Array]
-    common: tuple[int, ...] = ()
-
-
-def class_counts(records: Sequence[ClipRecord], classes: int = 0) -> ClassCounts:
-    """Counts of one method's clips. classes: how many there are at least; ids beyond make it more."""
-    found: dict[Region, list[Sequence[Counted]]] = {
-        name: [(record.regions[name].confusion if name in record.regions else None) or () for record in records]
-        for name in REGIONS
-        if any(name in record.regions for record in records)
-    }
-    ids = {
-        label for clips in found.values() for clip in clips for frame in clip for each in frame for label in each[:2]
-    }
-    count = max([classes, *(1 + label for label in ids - {NO_CLASS})])
-    regions: dict[Region, Array] = {
-        name: np.array([_counts(clip, records[0].frames, count) for clip in clips]) for name, clips in found.items()
-    }
-    true = regions["all"][:, :, 2].sum(axis=(0, 1))
-    commonest = np.argsort(-true, kind="stable")[:COMMON_CLASSES].tolist()
-    return ClassCounts(regions=regions, common=tuple(sorted(label for label in commonest if true[label] > 0)))
-
-
-def _counts(clip: Sequence[Counted], frames: int, classes: int) -> Array:
-    """[T, 3, K] of one clip; zeros where nothing was counted."""
-    counts = np.zeros((frames, 3, classes))
-    for frame, counted in zip(counts, clip, strict=bool(clip)):
-        if counted:
-            true, predicted, pixels = np.array(counted).T
-            known = predicted < classes  # the others are of no class, and wrong
-            np.add.at(frame[0], true, pixels * (true == predicted))
-            np.add.at(frame[1], predicted[known], pixels[known])
-            np.add.at(frame[2], true, pixels)
-    return counts
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -115,8 +51,8 @@ class Interval:
     """A figure and where it lies in 95 of 100 draws of scenes. NaN bounds for a single scene."""
 
     value: float
-    low: float
-    high: float
+    low: float = np.nan
+    high: float = np.nan
 
     @property
     def known(self) -> bool:
@@ -133,112 +69,46 @@ class Interval:
 class Sums:
     """Sums of n rows, each a clip or a scene.
 
-    parts: [n, 6, 2], of each figure that is no mIoU what is divided and by what: the clips' means by how many clips
-    have one, or views by targets. classes: [n, 3, K], pixels that are right, predicted and true by class. common: ids
-    of the commonest classes.
+    above, below: [n, 6 + K], what is divided and by what: of each figure that is no mIoU the clips' means by how many
+    clips have one, or views by targets; of each class pixels that are right by those predicted or true. common: ids of
+    the commonest classes.
     """
 
-    parts: Array
-    classes: Array
-    common: tuple[int, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.parts)
+    above: Array
+    below: Array
+    common: tuple[int, ...]
 
     def figure(self, name: FigureName, weights: Array | None = None) -> Array:
         """One figure of each row, or of the rows as often as each weighting [..., n] says; NaN for nothing."""
-        if name in ("miou_full", "miou_common"):
-            iou = class_iou(_weighted(self.classes, weights))
-            return _nanmean(iou[..., list(self.common)] if name == "miou_common" else iou)
-        part = _weighted(self.parts[:, _PARTS.index(name)], weights)
-        return _divided(part[..., 0], part[..., 1])
+        if name == "miou_common":
+            columns = [_CLASSES + label for label in self.common]
+        elif name == "miou_full":
+            columns = list(range(_CLASSES, self.above.shape[1]))
+        else:
+            columns = [FIGURE_NAMES.index(name)]
+        above, below = self.above[:, columns], self.below[:, columns]
+        if weights is not None:
+            above, below = weights @ above, weights @ below
+        ratio = _divided(above, below)
+        there = ~np.isnan(ratio)
+        return _divided(np.where(there, ratio, 0.0).sum(-1), there.sum(-1))
+
+    def class_iou(self) -> Array:
+        """Intersection over union of each class over all rows, [K]; NaN for one that is nowhere."""
+        return _divided(self.above[:, _CLASSES:].sum(0), self.below[:, _CLASSES:].sum(0))
 
     def value(self, name: FigureName) -> float:
         """One figure of all rows."""
-        return float(self.figure(name, np.ones(len(self))))
+        return float(self.figure(name, np.ones(len(self.above))))
 
     def again(self, name: FigureName) -> Array:
         """The figure of rows drawn with repetition, [DRAWS]; NaN for a single row."""
-        return np.full(DRAWS, np.nan) if len(self) < 2 else self.figure(name, scene_weights(len(self)))
+        rows = len(self.above)
+        return np.full(DRAWS, np.nan) if rows < 2 else self.figure(name, scene_weights(rows))
 
     def interval(self, name: FigureName) -> Interval:
         """One figure with its bounds."""
         return _interval(self.value(name), lambda: self.again(name))
-
-    def grouped(self, groups: Sequence[str]) -> "Sums":
-        """Sums of rows by group, in the order of each group's first row."""
-        weights = np.array([[float(group == each) for group in groups] for each in dict.fromkeys(groups)])
-        return replace(self, parts=_weighted(self.parts, weights), classes=_weighted(self.classes, weights))
-
-
-def class_iou(counts: Array) -> Array:
-    """Intersection over union of each class, [..., K], from counts [..., 3, K]; NaN for one that is nowhere."""
-    right, predicted, true = np.moveaxis(counts, -2, 0)
-    return _divided(right, predicted + true - right)
-
-
-def clip_sums(records: Sequence[ClipRecord], selection: Selection, counts: ClassCounts | None = None) -> Sums:
-    """Sums of each clip of one method. counts: of these records, where they are known."""
-    counts = counts or class_counts(records)
-    of_region = counts.regions.get(selection.region, np.zeros_like(counts.regions["all"]))
-    return Sums(
-        parts=np.array([_parts(record, selection) for record in records]),
-        classes=of_region[:, selection.frame_slice()].sum(axis=1),
-        common=counts.common,
-    )
-
-
-def scene_sums(records: Sequence[ClipRecord], selection: Selection, counts: ClassCounts | None = None) -> Sums:
-    """`clip_sums` of each scene, ready to be drawn from."""
-    return clip_sums(records, selection, counts).grouped([record.scene for record in records])
-
-
-def _parts(record: ClipRecord, selection: Selection) -> list[tuple[float, float]]:
-    """Of one clip, in the order of `_PARTS`. Gradients: each frame by the region's share of it, so that one without
-    such pixels adds nothing."""
-    frames, everywhere = selection.frame_slice(), selection.region == "all"
-    region = record.regions.get(selection.region, RegionRecord(pixels=(), gradient_target=()))
-    spread = None if region.diversity is None else (region.diversity,)
-    lpips = record.lpips if everywhere else None
-    means = [_clip_mean(values, frames) for values in (region.psnr_db, region.ssim, lpips, spread)]
-    gradients = flicker = (0.0, 0.0)
-    if region.gradient is not None:
-        share = _array(region.pixels)
-        views, targets = (np.nan_to_num(_array(each)) * share for each in (region.gradient, region.gradient_target))
-        gradients = _ratio(views, targets, frames)
-    if everywhere and record.step is not None:
-        flicker = _ratio(_array(record.step), _array(record.step_target), selection.step_slice())
-    return [*((0.0, 0.0) if np.isnan(value) else (value, 1.0) for value in means), gradients, flicker]
-
-
-def _clip_mean(values: Sequence[Frames] | None, frames: slice) -> float:
-    """Mean over draws and frames of [S][T] values, of those that there are; NaN for none."""
-    return float("nan") if values is None else float(_nanmean(_array(values)[:, frames].ravel()))
-
-
-def _ratio(views: Array, targets: Array, chosen: slice) -> tuple[float, float]:
-    """Sums over frames of views [S, T], a mean over draws, and of targets [T]."""
-    return float(views[:, chosen].mean(axis=0).sum()), float(targets[chosen].sum())
-
-
-def _array(values: Sequence[Frames] | Frames) -> Array:
-    """Values with NaN for None."""
-    return np.array(values, dtype=np.float64)
-
-
-def _weighted(sums: Array, weights: Array | None) -> Array:
-    return sums if weights is None else np.tensordot(weights, sums, axes=1)
-
-
-def _divided(above: Array, below: Array) -> Array:
-    """Above over below, NaN for nothing over nothing."""
-    return np.divide(above, below, out=np.full(np.shape(above), np.nan), where=np.asarray(below) != 0)
-
-
-def _nanmean(values: Array) -> Array:
-    """Mean over the last dimension of what is not NaN; NaN if all is."""
-    there = ~np.isnan(values)
-    return _divided(np.where(there, values, 0.0).sum(-1), there.sum(-1).astype(np.float64))
 
 
 @lru_cache(maxsize=4)
@@ -253,20 +123,112 @@ def difference(first: Sums, other: Sums, name: FigureName) -> Interval:
     return _interval(first.value(name) - other.value(name), lambda: first.again(name) - other.again(name))
 
 
-def common_clips(
-    first: Sequence[ClipRecord], other: Sequence[ClipRecord]
-) -> tuple[tuple[ClipRecord, ...], tuple[ClipRecord, ...]]:
-    """The records of the clips that both have, in one order."""
-    of_first, of_other = ({record.key: record for record in records} for records in (first, other))
-    both = [key for key in of_first if key in of_other]
-    return tuple(of_first[key] for key in both), tuple(of_other[key] for key in both)
-
-
 def _interval(value: float, again: Callable[[], Array]) -> Interval:
     """The middle 95 % of what is not NaN; `again` is called only for a figure that there is."""
     drawn = np.empty(0) if np.isnan(value) else again()
     known = drawn[~np.isnan(drawn)]
     if not known.size:
-        return Interval(value=value, low=float("nan"), high=float("nan"))
+        return Interval(value=value)
     low, high = np.quantile(known, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
     return Interval(value=value, low=float(low), high=float(high))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClipTable:
+    """All that one method was measured as: a row for each clip and frame, a column for all that figures are made of.
+
+    scenes: of the n clips. above, below: [n, T, 6 + K] by region, see `Sums`, summed over draws. true: [n, K], pixels
+    of each class in all of a clip's targets.
+    """
+
+    scenes: tuple[str, ...]
+    above: dict[Region, Array]
+    below: dict[Region, Array]
+    true: Array
+
+    @classmethod
+    def of(cls, records: Sequence[ClipRecord], classes: int = 0) -> Self:
+        """The table of these records. classes: how many there are at least; ids beyond make it more."""
+        maps = [region.confusion for record in records for region in record.regions.values() if region.confusion]
+        ids = {label for clip in maps for frame in clip for entry in frame for label in entry[:2]}
+        count = max([classes, *(1 + label for label in ids - {NO_CLASS})])
+        true = np.zeros((len(records), count))
+        shape = (len(REGIONS), len(records), records[0].frames, _CLASSES + count)
+        above, below = np.zeros(shape), np.zeros(shape)
+        for place, name in enumerate(REGIONS):
+            for row, record in enumerate(records):
+                if name in record.regions:
+                    _add_pictures(record, name, above[place, row], below[place, row])
+                    counts = _add_classes(record.regions[name].confusion or (), above[place, row], below[place, row])
+                    true[row] += counts if name == "all" else 0.0
+        return cls(
+            scenes=tuple(record.scene for record in records),
+            above=dict(zip(REGIONS, above, strict=True)),
+            below=dict(zip(REGIONS, below, strict=True)),
+            true=true,
+        )
+
+    def clip_sums(
+        self, frames: Span | int = "2-last", region: Region = "all", rows: Sequence[int] | None = None
+    ) -> Sums:
+        """Sums of each clip. frames: a span, or one frame counted from 1. rows: only these clips; None for all."""
+        chosen = slice(frames - 1, frames) if isinstance(frames, int) else FRAMES_OF[frames]
+        rows = range(len(self.scenes)) if rows is None else rows
+        each = [table[region][rows] for table in (self.above, self.below)]
+        above, below = (table[:, chosen].sum(axis=1) for table in each)
+        if frames == "2-last":  # the change into the first of these frames is none between them
+            above[:, _FLICKER], below[:, _FLICKER] = (
+                table[:, FIRST_MEASURED + 1 :, _FLICKER].sum(axis=1) for table in each
+            )
+        means = _divided(above[:, :_MEANS], below[:, :_MEANS])
+        above[:, :_MEANS], below[:, :_MEANS] = np.nan_to_num(means), ~np.isnan(means)
+        true = self.true[rows].sum(axis=0)
+        commonest = np.argsort(-true, kind="stable")[:COMMON_CLASSES].tolist()
+        return Sums(above=above, below=below, common=tuple(sorted(label for label in commonest if true[label] > 0)))
+
+    def scene_sums(
+        self, frames: Span | int = "2-last", region: Region = "all", rows: Sequence[int] | None = None
+    ) -> Sums:
+        """`clip_sums` added up over each scene, in the order of their first clips, ready to be drawn from."""
+        sums = self.clip_sums(frames, region, rows)
+        scenes = self.scenes if rows is None else [self.scenes[row] for row in rows]
+        weights = np.array([[float(scene == each) for scene in scenes] for each in dict.fromkeys(scenes)])
+        return replace(sums, above=weights @ sums.above, below=weights @ sums.below)
+
+
+def _add_pictures(record: ClipRecord, name: Region, above: Array, below: Array) -> None:
+    """Fill in what a clip's pictures are, [T, 6 + K]; the change from a frame to the next stands at the next.
+
+    Gradients count by the region's share of each frame, so that one without such pixels adds nothing.
+    """
+    region, everywhere = record.regions[name], name == "all"
+    spread = None if region.diversity is None else (region.diversity,)
+    for column, values in enumerate((region.psnr_db, region.ssim, record.lpips if everywhere else None, spread)):
+        if values is not None:
+            each = np.array(values, np.float64)  # [S, T], NaN for None
+            above[:, column], below[:, column] = np.nan_to_num(each).sum(axis=0), (~np.isnan(each)).sum(axis=0)
+    if region.gradient is not None:
+        views, targets = (np.array(each, np.float64) for each in (region.gradient, region.gradient_target))
+        above[:, _GRADIENT] = (np.nan_to_num(views) * region.pixels).mean(axis=0)
+        below[:, _GRADIENT] = np.nan_to_num(targets) * region.pixels
+    if everywhere and record.step is not None:
+        above[1:, _FLICKER], below[1:, _FLICKER] = np.mean(record.step, axis=0), record.step_target
+
+
+def _add_classes(confusion: Sequence[Counted], above: Array, below: Array) -> Array:
+    """Fill in what a clip's class maps are; gives how many pixels are truly of each class, [K]."""
+    truly = np.zeros(above.shape[1] - _CLASSES)
+    for right, united, counted in zip(above[:, _CLASSES:], below[:, _CLASSES:], confusion, strict=bool(confusion)):
+        if counted:
+            true, predicted, pixels = np.array(counted).T
+            known = predicted < len(truly)  # the others are of no class, and wrong
+            np.add.at(right, true, pixels * (true == predicted))
+            np.add.at(united, true, pixels)
+            np.add.at(united, predicted[known], (pixels * (true != predicted))[known])
+            np.add.at(truly, true, pixels)
+    return truly
+
+
+def _divided(above: Array, below: Array) -> Array:
+    """Above over below, NaN for nothing over nothing."""
+    return np.divide(above, below, out=np.full(np.shape(above), np.nan), where=np.asarray(below) != 0)

@@ -15,7 +15,7 @@ from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, TypeVar, get_args
 
 import msgspec
 
@@ -107,11 +107,12 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     methods: dict[str, dict[str, str]] = {}
 
 
+Stored = TypeVar("Stored", RunNote, ClipRecord)
+
 RUN_FILE = "run.json"
-_MOST_RECORD = 1 << 24
+_MOST_BYTES = 1 << 24
 COMPARABLE = ("kind", "modality", "protocol", "frames", "height", "width", "classes")
 """What the notes of two runs must have alike before any of their figures are compared."""
-_PACKAGE = "gcd-node"
 _SHOWN = 48  # letters of a value in a message
 
 
@@ -157,7 +158,7 @@ class RunKeeper:
         """
         path = self.folder / RUN_FILE
         if path.exists():
-            found = _read_note(path)
+            found = _read(path, RunNote, "delete the run, or choose another folder")
             kept = {name: told for name, told in found.methods.items() if self._binds(name, note)}
             note = _joined(self.folder, msgspec.structs.replace(found, methods=kept), note) if kept else note
         owners: dict[str, str] = {}
@@ -212,30 +213,24 @@ def read_run(folder: Path | str) -> tuple[RunNote, tuple[ClipRecord, ...]]:
     folder = Path(folder)
     if not (folder / RUN_FILE).exists():
         raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
-    note = _read_note(folder / RUN_FILE)
+    note = _read(folder / RUN_FILE, RunNote, "delete the run, or choose another folder")
     places = [folder / "records" / folder_name(method) for method in note.methods]
-    return note, tuple(_read_record(path) for place in places for path in sorted(place.glob("*.json")))
+    files = [path for place in places for path in sorted(place.glob("*.json"))]
+    return note, tuple(_read(path, ClipRecord, "delete it and evaluate again, the others are kept") for path in files)
 
 
-def _read_note(path: Path) -> RunNote:
+def _read(path: Path, kind: type[Stored], cure: str) -> Stored:
     try:
-        return read_json(path, RunNote)
+        return read_json(path, kind, _MOST_BYTES)
     except FileError as error:
-        raise RunError(f"{path} {error}; delete the run, or choose another folder") from error
-
-
-def _read_record(path: Path) -> ClipRecord:
-    try:
-        return read_json(path, ClipRecord, _MOST_RECORD)
-    except FileError as error:
-        raise RunError(f"{path} {error}; delete it and evaluate again, the others are kept") from error
+        raise RunError(f"{path} {error}; {cure}") from error
 
 
 def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
     """The note that is there with the new methods. Raises RunError where records of both would not go together."""
     same = ("data_identity", *COMPARABLE, "seed")
     differ = {name: (getattr(found, name), getattr(new, name)) for name in same}
-    differ[_PACKAGE] = (found.versions.get(_PACKAGE), new.versions.get(_PACKAGE))
+    differ["gcd-node"] = (found.versions.get("gcd-node"), new.versions.get("gcd-node"))
     for method in found.methods.keys() & new.methods.keys():
         was, now = found.methods[method], new.methods[method]
         names = dict.fromkeys([*was, *now])

@@ -2,38 +2,20 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product, zip_longest
+from itertools import product
 from math import isnan, nan
-from typing import TypeAlias
 
 import numpy as np
 
-from gcd_train.evaluation.paper import (
-    CLASS_COLUMNS,
-    PICTURE_COLUMNS,
-    Column,
-    PaperTable,
-    row_label,
-    tables_for,
-)
-from gcd_train.evaluation.runs import EvaluatedSet, Method
-from gcd_train.evaluation.statistics import (
-    FIGURE_NAMES,
-    FigureName,
-    Interval,
-    Selection,
-    Span,
-    class_iou,
-    common_clips,
-    difference,
-)
+from gcd_train.evaluation.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, row_label, tables_for
+from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
+from gcd_train.evaluation.statistics import FIGURE_NAMES, SPANS, FigureName, Interval, Span, difference
 from gcd_train.evaluation.store import REGIONS, Region
 
 NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
 _LINE = "———"
-_SPANS: tuple[Span, ...] = ("2-last", "last", "all")
 _OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
 _BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
 STAR_OF_FIGURE = "A * behind a mIoU: these class maps are made from the source's exact ones, which no model is given."
@@ -48,30 +30,28 @@ class Cell:
     the method was given more for this figure than for its others.
     """
 
-    figure: Interval | None = None
+    figure: Interval = Interval(value=nan)  # noqa: RUF009  it is frozen
     digits: int = 2
     note: str = NOTHING
     paper: float | None = None
     starred: bool = False
 
     def __str__(self) -> str:
-        if self.figure is None or not self.figure.known:
+        if not self.figure.known:
             return self.note
-        star, value = " *" if self.starred else "", f"{self.figure.value:.{self.digits}f}"
-        if isnan(self.figure.low):  # of one scene
-            return value + star
-        return f"{value} [{self.figure.low:.{self.digits}f}, {self.figure.high:.{self.digits}f}]{star}"
-
-    def numbers(self) -> tuple[str, str, str]:
-        """Value and bounds in full, empty for none."""
-        numbers = (nan,) * 3 if self.figure is None else (self.figure.value, self.figure.low, self.figure.high)
-        value, low, high = ("" if isnan(number) else f"{number:.6g}" for number in numbers)
-        return value, low, high
+        values = [f"{number:.{self.digits}f}" for number in (self.figure.value, self.figure.low, self.figure.high)]
+        bounds = "" if isnan(self.figure.low) else f" [{values[1]}, {values[2]}]"  # of one scene there are none
+        return values[0] + bounds + (" *" if self.starred else "")
 
     @property
     def printed(self) -> str:
         """What the paper prints, empty for nothing."""
         return "" if self.paper is None else f"{self.paper:g}"
+
+
+def numbers(figure: Interval) -> list[str]:
+    """Value and bounds in full, empty for none."""
+    return ["" if isnan(each) else f"{each:.6g}" for each in (figure.value, figure.low, figure.high)]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -121,7 +101,7 @@ def to_csv(table: Table) -> str:
     parts = [f"{heading}{what}" for heading in table.headings for what in ("", " low", " high", " paper")]
     rows: list[list[str]] = []
     for row in (*table.rows, *table.below):
-        cells = [part for cell in row.cells for part in (*cell.numbers(), cell.printed)]
+        cells = [part for cell in row.cells for part in (*numbers(cell.figure), cell.printed)]
         rows.append([row.label, row.method or NOT_RUN, row.clips, *cells])
     return csv_text(["row", "method", "clips", *parts], rows)
 
@@ -158,13 +138,39 @@ def main_tables(of: EvaluatedSet, spans: Sequence[Span] = ("2-last", "last")) ->
     papers = {each.frames: each for each in tables_for(of.note)}
     pictures, classes = any(m.makes_pictures for m in of.methods), any(m.makes_classes for m in of.methods)
     every = (*(PICTURE_COLUMNS if pictures else ()), *(CLASS_COLUMNS if classes else ()))
-    columns = tuple(column for column in every if column.region in of.regions)
-    ours = tuple(
-        _own_table(of, columns, frames, _OWN_NAMES[frames], f"{of.title}: {frames_told(of, frames)}")
+    made = [
+        _own_table(of, every, frames, _OWN_NAMES[frames], f"{of.title}: {frames_told(of, frames)}")
         for frames in spans
         if frames not in papers
-    )
-    return (*ours, *(_paper_table(of, each) for frames, each in papers.items() if frames in spans))
+    ]
+    for paper in (each for frames, each in papers.items() if frames in spans):
+        labels = {m.name: of.rows.get(m.name) or row_label(m.name, m.details, paper) or "" for m in of.methods}
+        rows: list[Row] = []
+        for label, printed in paper.rows.items():
+            found = [method for method in of.methods if labels[method.name] == label]
+            rows += [_row(of, each, paper.columns, paper.frames, label, printed) for each in found]
+            if not found:
+                rows.append(Row(label=label, cells=tuple(Cell(note=NOT_RUN, paper=value) for value in printed)))
+        apart = dict.fromkeys(label for label in labels.values() if label not in paper.rows)
+        below = [
+            _row(
+                of, method, paper.columns, paper.frames, f"{label}, not in this table" if label else "not in the paper"
+            )
+            for label in apart
+            for method in of.methods
+            if labels[method.name] == label
+        ]
+        made.append(
+            Table(
+                name=paper.name,
+                title=f"{paper.title} ({of.title})",
+                headings=tuple(column.heading for column in paper.columns),
+                rows=tuple(rows),
+                below=tuple(below),
+                notes=_notes(of, paper.columns, paper.frames),
+            )
+        )
+    return tuple(made)
 
 
 def region_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
@@ -174,33 +180,33 @@ def region_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
         "diversity": "Diversity: standard deviation over the draws of one view; of two draws or more.",
         "gradient energy": "Gradient energy: view over target, 1 is as sharp as the target.",
     }
-    columns = tuple(column for column in _REGION_COLUMNS if column.region in of.regions)
-    table = _own_table(of, columns, frames, "regions", title)
+    table = _own_table(of, _REGION_COLUMNS, frames, "regions", title)
     return replace(table, notes=(*table.notes, *(notes[name] for name in table.headings if name in notes)))
 
 
 def class_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
     """Intersection over union of each class at picture size; what occurs nowhere is left out."""
     methods = [method for method in of.methods if method.makes_classes]
-    iou = [class_iou(of.sums(each, Selection(frames=frames)).classes.sum(axis=0)) for each in methods]
+    iou = [each.sums(frames).class_iou() for each in methods]
     there = [place for place in range(len(of.note.classes)) if any(np.isfinite(each[place]) for each in iou)]
-    rows = tuple(
+    rows = [
         Row(
             method=method.starred,
-            clips=f"{len(method.records)} of {len(of.keys)}",
+            clips=f"{len(method.records)} of {len(of.clips)}",
             cells=tuple(
-                Cell(figure=Interval(value=float(each[place]), low=nan, high=nan), starred=method.copies_classes)
-                for place in there
+                Cell(figure=Interval(value=float(each[place])), starred=method.copies_classes) for place in there
             ),
         )
         for method, each in zip(methods, iou, strict=True)
-    )
+    ]
     names = tuple(of.note.classes[place] for place in there)
-    return Table(name="classes", title=f"IoU of each class: {frames_told(of, frames)}", headings=names, rows=rows)
+    title = f"IoU of each class: {frames_told(of, frames)}"
+    return Table(name="classes", title=title, headings=names, rows=tuple(rows))
 
 
 def _own_table(of: EvaluatedSet, columns: Sequence[Column], frames: Span, name: str, title: str) -> Table:
     """Of the columns in which any method has a figure."""
+    columns = [column for column in columns if column.region in of.regions]
     rows = [_row(of, method, columns, frames) for method in of.methods]
     there = [place for place, _ in enumerate(columns) if any(str(row.cells[place]) != NOTHING for row in rows)]
     kept = [columns[place] for place in there]
@@ -213,72 +219,35 @@ def _own_table(of: EvaluatedSet, columns: Sequence[Column], frames: Span, name: 
     )
 
 
-def _paper_table(of: EvaluatedSet, table: PaperTable) -> Table:
-    placed: dict[str, list[Method]] = {}
-    for method in of.methods:
-        label = of.rows.get(method.name) or row_label(method.name, method.details, table)
-        placed.setdefault(label or "", []).append(method)
-    rows, columns, frames = list[Row](), table.columns, table.frames
-    for label, printed in table.rows.items():
-        found = placed.pop(label, [])
-        rows += [_row(of, each, columns, frames, label, printed) for each in found]
-        rows += [] if found else [Row(label=label, cells=_not_run(printed, columns))]
-    below = [  # label: of a row in another of the paper's tables, or empty
-        _row(of, each, columns, frames, f"{label}, not in this table" if label else "not in the paper")
-        for label, methods in placed.items()
-        for each in methods
-    ]
-    return Table(
-        name=table.name,
-        title=f"{table.title} ({of.title})",
-        headings=tuple(column.heading for column in table.columns),
-        rows=tuple(rows),
-        below=tuple(below),
-        notes=_notes(of, table.columns, table.frames),
-    )
-
-
-Printed: TypeAlias = Sequence[float | None]
-
-
 def _row(
     of: EvaluatedSet,
-    method: Method,
+    method: MethodRecords,
     columns: Sequence[Column],
     frames: Span,
     label: str = "",
-    printed: Printed = (),
+    printed: Sequence[float | None] = (),
 ) -> Row:
     """A method's figures, beside what the paper prints in its row."""
-    cells = tuple(
-        Cell(
-            figure=of.sums(method, Selection(frames=frames, region=column.region)).interval(column.figure),
-            digits=column.digits,
-            note=_why_not(of, method, column),
-            paper=blank.paper,
-            starred=method.copies_classes and column.of_classes,
+    cells: list[Cell] = []
+    for place, column in enumerate(columns):
+        why_not = NOTHING if column.region in of.regions else "unknown"
+        cells.append(
+            Cell(
+                figure=method.sums(frames, column.region).interval(column.figure),
+                digits=column.digits,
+                note=NO_WEIGHTS if column.figure == "lpips" and method.makes_pictures else why_not,
+                paper=printed[place] if printed else None,
+                starred=method.copies_classes and column.of_classes,
+            )
         )
-        for column, blank in zip(columns, _not_run(printed, columns), strict=True)
-    )
-    clips = f"{len(method.records)} of {len(of.keys)}"
-    return Row(label=label, method=method.starred, clips=clips, cells=cells)
-
-
-def _not_run(printed: Printed, columns: Sequence[Column]) -> tuple[Cell, ...]:
-    return tuple(Cell(note=NOT_RUN, paper=paper) for _, paper in zip_longest(columns, printed))
-
-
-def _why_not(of: EvaluatedSet, method: Method, column: Column) -> str:
-    """What stands where there is no figure."""
-    if column.figure == "lpips" and method.makes_pictures:
-        return NO_WEIGHTS
-    return NOTHING if column.region in of.regions else "unknown"
+    clips = f"{len(method.records)} of {len(of.clips)}"
+    return Row(label=label, method=method.starred, clips=clips, cells=tuple(cells))
 
 
 def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
     """What stands below a table: its frames and clips, what brackets and stars mean, what is not known."""
-    told = frames_told(of, frames)
-    notes = [f"{told[0].upper()}{told[1:]} of {len(of.keys)} clips of {of.scenes} scenes. {_BRACKETS}"]
+    span = frames_told(of, frames)
+    notes = [f"{span[0].upper()}{span[1:]} of {len(of.clips)} clips of {of.scenes} scenes. {_BRACKETS}"]
     if any(column.of_classes for column in columns) and any(each.copies_classes for each in of.methods):
         notes.append(STAR_OF_FIGURE)
     if any(column.region not in of.regions for column in columns):
@@ -307,36 +276,34 @@ _REGION_COLUMNS = (
 def all_figures(of: EvaluatedSet) -> str:
     """Every figure of every method, frames and pixels with its interval, as CSV: one figure a line."""
     lines: list[list[str]] = []
-    for method, frames, region in product(of.methods, _SPANS, of.regions):
-        sums, clips = of.sums(method, Selection(frames=frames, region=region)), str(len(method.records))
-        cells = {name: Cell(figure=sums.interval(name)).numbers() for name in FIGURE_NAMES}
+    for method, frames, region in product(of.methods, SPANS, of.regions):
+        sums, clips = method.sums(frames, region), str(len(method.records))
+        cells: Mapping[FigureName, list[str]] = {name: numbers(sums.interval(name)) for name in FIGURE_NAMES}
         lines += [[method.name, frames, region, name, *cell, clips] for name, cell in cells.items() if cell[0]]
     return csv_text(["method", "frames", "pixels", "figure", "value", "low", "high", "clips"], lines)
-
-
-_BY_CLIP: tuple[FigureName, ...] = ("psnr_db", "ssim", "miou_full")
 
 
 def clips_csv(of: EvaluatedSet) -> str:
     """Every method on every clip: one line each, frames 2 to the last."""
     regions: tuple[Region, ...] = ("all", "occluded")
-    columns: list[tuple[FigureName, Region]] = [(name, region) for region in regions for name in _BY_CLIP]
+    by_clip: tuple[FigureName, ...] = ("psnr_db", "ssim", "miou_full")
     lines: list[list[str]] = []
     for method in of.methods:
-        by_clip = np.stack([of.by_clip(method, region, name) for name, region in columns], axis=1)
-        for record, values in zip(method.records, by_clip.tolist(), strict=True):
+        sums = [method.table.clip_sums(region=region) for region in regions]
+        values = np.stack([each.figure(name) for each in sums for name in by_clip], axis=1)
+        for record, row in zip(method.records, values.tolist(), strict=True):
             change = ("", "", "") if record.change is None else tuple(f"{part:g}" for part in record.change)
-            cells = ["" if np.isnan(value) else f"{value:.6g}" for value in values]
+            cells = ["" if isnan(value) else f"{value:.6g}" for value in row]
             lines.append([method.name, record.key, record.scene, *change, *cells, f"{record.seconds:.4g}"])
-    named = [f"{name} {region}" for name, region in columns]
+    named = [f"{name} {region}" for region in regions for name in by_clip]
     return csv_text(["method", "clip", "scene", "azimuth", "elevation", "radius", *named, "seconds"], lines)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Difference:
     """How far one method lies above another in one figure. clips: that both have.
 
-    starred: one of them was given more for this figure than for its others, see `Method.copies_classes`.
+    starred: one of them was given more for this figure than for its others, see `MethodRecords.copies_classes`.
     """
 
     first: str
@@ -354,45 +321,58 @@ class Difference:
             return "open"
         return "better" if (self.apart.value > 0) != (self.column.figure == "lpips") else "worse"
 
+    def __str__(self) -> str:
+        each = (self.apart.value, self.apart.low, self.apart.high)
+        value, low, high = (f"{number:+.{self.column.digits}f}" for number in each)
+        star = " *" if self.starred else ""
+        if isnan(self.apart.low):  # one scene tells nothing of it
+            return value + star
+        text = f"{value} [{low}, {high}]"
+        return (text if self.verdict == "open" else f"**{text}** {self.verdict}") + star
 
-def differences(of: EvaluatedSet, first: Method, frames: Span = "2-last") -> tuple[Difference, ...]:
-    """A method against every other one, in all columns that both have figures in, on the clips that both have."""
-    found: list[Difference] = []
-    for other in of.methods:
-        ours, theirs = common_clips(first.records, other.records)
-        for column in (*PICTURE_COLUMNS, *CLASS_COLUMNS) if ours and other.name != first.name else ():
-            chosen = Selection(frames=frames, region=column.region)
-            apart = difference(of.sums(first, chosen, ours), of.sums(other, chosen, theirs), column.figure)
-            starred = (first.copies_classes or other.copies_classes) and column.of_classes
-            if apart.known:
-                found.append(Difference(first.name, other.name, column, frames, len(ours), apart, starred))
+
+def differences(
+    first: MethodRecords,
+    other: MethodRecords,
+    frames: Span = "2-last",
+    *,
+    keys: Sequence[str] | None = None,
+    columns: Sequence[Column] = (*PICTURE_COLUMNS, *CLASS_COLUMNS),
+) -> tuple[Difference, ...]:
+    """One method against another, in the columns that both have figures in.
+
+    Args:
+        keys: of the clips; by default all that both were measured on.
+    """
+    keys, found = first.common_keys(other) if keys is None else keys, list[Difference]()
+    for column in columns if keys else ():
+        ours, theirs = (each.sums(frames, column.region, keys) for each in (first, other))
+        apart = difference(ours, theirs, column.figure)
+        if apart.known:
+            found.append(
+                Difference(
+                    first=first.name,
+                    other=other.name,
+                    column=column,
+                    frames=frames,
+                    clips=len(keys),
+                    apart=apart,
+                    starred=(first.copies_classes or other.copies_classes) and column.of_classes,
+                )
+            )
     return tuple(found)
 
 
 def differences_csv(found: Sequence[Difference]) -> str:
     """One difference a line."""
-    lines = [
-        [e.first, e.other, e.frames, e.column.heading, *Cell(figure=e.apart).numbers(), str(e.clips), e.verdict]
-        for e in found
-    ]
+    lines = [[e.first, e.other, e.frames, e.column.heading, *numbers(e.apart), str(e.clips), e.verdict] for e in found]
     return csv_text(["first", "other", "frames", "figure", "first ahead", "low", "high", "clips", "verdict"], lines)
 
 
 def differences_markdown(found: Sequence[Difference], of: EvaluatedSet) -> str:
     """A row for each other method, a column for each figure; bold where zero lies outside the interval."""
     headings = list(dict.fromkeys(each.column.heading for each in found))
-    cells = {(each.other, each.column.heading): _difference_told(each) for each in found}
+    cells = {(each.other, each.column.heading): str(each) for each in found}
     others = list(dict.fromkeys(each.other for each in found))
     rows = [[of.method(name).starred, *(cells.get((name, head), NOTHING) for head in headings)] for name in others]
     return "\n".join(markdown_rows(["", *headings], rows)) + "\n"
-
-
-def _difference_told(each: Difference) -> str:
-    value, low, high = (
-        f"{number:+.{each.column.digits}f}" for number in (each.apart.value, each.apart.low, each.apart.high)
-    )
-    star = " *" if each.starred else ""
-    if np.isnan(each.apart.low):  # one scene tells nothing of it
-        return value + star
-    text = f"{value} [{low}, {high}]"
-    return (text if each.verdict == "open" else f"**{text}** {each.verdict}") + star

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from gcd_train.evaluation.galleries import HOLD_S, Strip, beside, write_mp4
 from gcd_train.evaluation.galleries import write_sheet as write_rows
-from gcd_train.evaluation.plots import new_figure, save
 from gcd_train.look.clip import SKY_M, Bytes, Footage
+from gcd_train.pictures import new_figure, save
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
