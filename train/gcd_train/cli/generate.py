@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError
 from gcd_train.layouts.scene_writer import SceneFormat, SceneRun, generate_scenes
-from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
+from gcd_train.live.filming import LIVE_SCENES, WORLDS, ClipSettings, LiveWorld, TargetPath, generate_live
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, driving_world, orbit_world
 from gcd_train.scenes.pair_writer import generate
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld
@@ -137,12 +137,10 @@ def live(
 
     By default so many scenes of each world as `live-small` was trained on: over 3,000 clips, an hour of two cores.
     """
-    from gcd_train.live.clips import ClipSettings, generate_live
-
     with errors_shown():
         stop_as_by_ctrl_c()
         settings, console = ClipSettings(width=width, height=height, path=path), Console(stderr=True, highlight=False)
-        for each in worlds_of(path) if world is None else (world,):
+        for each in WORLDS[path] if world is None else (world,):
             seeds = range(first_seed, first_seed + (scenes or LIVE_SCENES[each]))
             there, failures = generate_live(out, each, seeds, settings, workers or os.cpu_count() or 1)
             for line in failures:
