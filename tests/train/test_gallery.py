@@ -35,8 +35,16 @@ from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError
-from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window
-from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, read_windows
+from gcd_train.look.gallery import (
+    ViewRecipe,
+    WindowChoice,
+    Windowed,
+    find_videos,
+    mounted,
+    paths,
+    read_windows,
+    view_window,
+)
 
 T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))

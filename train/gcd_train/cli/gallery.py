@@ -14,8 +14,7 @@ from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
     from gcd_model import Spherical, SphericalDelta, Trajectory, ViewSynthesizer
-    from gcd_train.look.gallery import Viewed, ViewRecipe
-    from gcd_train.look.real_video import RealVideo, WindowChoice
+    from gcd_train.look.gallery import RealVideo, Viewed, ViewRecipe, WindowChoice
 
 
 def gallery_command(
@@ -53,8 +52,7 @@ def gallery_command(
     """View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line."""
     with errors_shown():
         from gcd_model import load_synthesizer
-        from gcd_train.look.gallery import ViewRecipe, paths, write_page
-        from gcd_train.look.real_video import WindowChoice, find_videos
+        from gcd_train.look.gallery import ViewRecipe, WindowChoice, find_videos, paths, write_page
 
         found = find_videos(videos)
         recipe = ViewRecipe(
@@ -122,8 +120,7 @@ def _viewed(
     out: Path,
 ) -> "tuple[list[Viewed], list[str]]":
     """What was shown, and a line for each video that could not be."""
-    from gcd_train.look.gallery import view_window, write_viewed
-    from gcd_train.look.real_video import read_windows
+    from gcd_train.look.gallery import read_windows, view_window, write_viewed
 
     viewed: list[Viewed] = []
     faults: list[str] = []
