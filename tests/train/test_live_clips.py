@@ -12,7 +12,7 @@ from live_clips import HEIGHT, HFOV_DEG, WIDTH, cast, looking_ahead, write_clip
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError
 from gcd_train.live.clips import SKY_M, clip_paths, decode_depth, encode_depth, read_clip, tensor_of
-from gcd_train.live.filming import ClipSettings, generate_live, live_scene, visibility
+from gcd_train.live.filming import generate_live, live_scene, visibility
 from gcd_train.scenes.renderer import Rendering
 
 
@@ -74,9 +74,8 @@ def test_a_damaged_clip_and_a_folder_without_any_are_data_errors(tmp_path: Path)
 
 @needs_egl
 def test_the_seed_decides_all_of_a_clip(tmp_path: Path) -> None:
-    settings = ClipSettings(width=64, height=32)
     for folder in ("one", "two"):
-        there, failures = generate_live(tmp_path / folder, "driving", range(1), settings)
+        there, failures = generate_live(tmp_path / folder, "driving", range(1), size=(64, 32))
         assert (there, failures) == (1, [])
     one, two = (read_clip(clip_paths(tmp_path / folder)[0]) for folder in ("one", "two"))
     assert all((one.arrays[name] == two.arrays[name]).all() for name in one.arrays)
@@ -85,7 +84,7 @@ def test_the_seed_decides_all_of_a_clip(tmp_path: Path) -> None:
 @needs_egl
 def test_most_of_the_targets_pixels_are_explained(tmp_path: Path) -> None:
     """Where a pixel counts as seen now, the source shows nearly its colour there."""
-    generate_live(tmp_path, "driving", range(2), ClipSettings(width=64, height=32, path="paper"))
+    generate_live(tmp_path, "driving", range(2), path="paper", size=(64, 32))
     for path in clip_paths(tmp_path):
         first = read_clip(path, slice(0, 1))  # the paper's path begins at the source
         assert (first.arrays["target.visibility"] == 2).all()

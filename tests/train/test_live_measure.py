@@ -2,7 +2,9 @@
 
 import json
 import math
+import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -20,7 +22,7 @@ from gcd_model.live.synthesizer import save_live
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import gradient_map
-from gcd_train.live import measure, other_world
+from gcd_train.live import measure
 from gcd_train.live.clips import LiveClip
 from gcd_train.live.figures import (
     BEFORE,
@@ -37,6 +39,8 @@ from gcd_train.live.figures import (
     surface_motion,
 )
 
+sys.path.append(str(Path(__file__).parents[2] / "tools"))
+live_variants, other_world = import_module("live_variants"), import_module("other_world")
 FRAMES, HEIGHT, WIDTH = 4, 64, 96
 LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)
 
@@ -186,7 +190,7 @@ def _painted(rays: np.ndarray) -> np.ndarray:
 
 def test_the_homography_of_a_turn_is_exact() -> None:
     clip = turned_clip()
-    views = measure.BestHomography().views(clip)
+    views = live_variants.BestHomography().views(clip)
     seen = torch.from_numpy(clip.arrays["target.visibility"] == NOW)
     error = (views.video * 255 - torch.from_numpy(clip.arrays["target.rgb"]).permute(0, 3, 1, 2)).abs()
     assert float(error.permute(0, 2, 3, 1)[seen].mean()) < 1.0
@@ -207,10 +211,12 @@ def test_reports_hold_every_method_and_the_lead_of_the_live_one() -> None:
 
 def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError):
-        measure.methods_of(["telepathy"], "package:live-small", tmp_path)
+        measure.chosen_methods(["telepathy"], [measure.ExactSplat(training=tmp_path)])
     save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError):
-        measure.methods_of(["live"], str(tmp_path / "other.safetensors"), tmp_path)
+        measure.live_model(str(tmp_path / "other.safetensors"))
+    with pytest.raises(DataError, match="is no live model"):
+        measure.live_model("random:driving")
 
 
 # how unlike its training a camera looks to the live model
@@ -261,5 +267,3 @@ def test_clips_are_measured_and_videos_scored_by_the_commands(tmp_path: Path) ->
     known, other = (np.array(list(report[name].values())) for name in ("known", "other"))
     assert ((np.concatenate([known, other]) >= 0) & (np.concatenate([known, other]) <= 1)).all()
     assert report["auc"] == other_world.auc(known, other)
-    with pytest.raises(DataError, match="is no live model"):
-        other_world.main([str(each) for each in (*told, "--weights", "random:driving")])

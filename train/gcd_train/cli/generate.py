@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError
 from gcd_train.layouts.scene_writer import SceneFormat, SceneRun, generate_scenes
-from gcd_train.live.filming import LIVE_SCENES, WORLDS, ClipSettings, LiveWorld, TargetPath, generate_live
+from gcd_train.live.filming import LIVE_SCENES, WORLDS, LiveWorld, TargetPath, generate_live
 from gcd_train.scenes.pair_world import CameraWay, PairForm, World, WorldOptions, driving_world, orbit_world
 from gcd_train.scenes.pair_writer import generate
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld
@@ -139,10 +139,10 @@ def live(
     """
     with errors_shown():
         stop_as_by_ctrl_c()
-        settings, console = ClipSettings(width=width, height=height, path=path), Console(stderr=True, highlight=False)
+        console, processes = Console(stderr=True, highlight=False), workers or os.cpu_count() or 1
         for each in WORLDS[path] if world is None else (world,):
             seeds = range(first_seed, first_seed + (scenes or LIVE_SCENES[each]))
-            there, failures = generate_live(out, each, seeds, settings, workers or os.cpu_count() or 1)
+            there, failures = generate_live(out, each, seeds, path=path, size=(width, height), workers=processes)
             for line in failures:
                 console.print(line, markup=False, soft_wrap=True)
             console.print(f"{each}: {there} of {len(seeds)} scenes")

@@ -40,6 +40,9 @@ _COUNTED = 48  # clips that say how common classes are
 _HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.05, 0.7  # of the other mounts that are declared
 _NEWS = 200
 """Updates after which the folder is asked for clips that were added."""
+_AVERAGED = {"video", "earlier", "target", "coverage", "now_share", "age", "painted", "painted_coverage", "rays"}
+_WHOLE = {"ups", "heights_m", "earlier_from_camera", "compared", "camera", "poses"}
+"""Of a record of pictures or views: what is averaged at half the size, and what has no pixels."""
 _MIRRORED = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64))
 
 
@@ -192,19 +195,6 @@ def _slightly_turned(random: Random, n: int, like: Tensor) -> Tensor:
     return on_device(np.array([[one, -z, y], [z, one, -x], [-y, x, one]]).transpose(2, 0, 1), like)
 
 
-def halved(pictures: Pictures) -> Pictures:
-    """The same at half the size: colours are averages, what cannot be averaged is of one pixel of four."""
-    return replace(
-        pictures,
-        video=avg_pool2d(pictures.video, 2),
-        metres=pictures.metres[:, ::2, ::2],
-        labels=pictures.labels[:, ::2, ::2],
-        moves=pictures.moves[:, ::2, ::2],
-        lenses=tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in pictures.lenses),
-        earlier=avg_pool2d(pictures.earlier, 2),
-    )
-
-
 def augmented(pictures: Pictures, random: Random) -> Pictures:
     """Mirrored or not, and seen by a camera of another exposure, colour, noise and focus."""
     n, video = len(pictures.lenses), pictures.video
@@ -278,6 +268,20 @@ def _mapped(change: Callable[..., Any], *records: Any) -> Any:
         return change(*records)
     made = {f.name: _mapped(change, *(getattr(each, f.name) for each in records)) for f in fields(records[0])}
     return replace(records[0], **made)  # pyright: ignore[reportArgumentType]
+
+
+def halved(record: Record) -> Record:
+    """Pictures or views at half the size: what can be averaged is; the rest is of one pixel of four."""
+
+    def half(name: str, value: Any) -> Any:
+        if name == "lenses":
+            return tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in value)
+        if name in _AVERAGED:
+            return avg_pool2d(value, 2)
+        return halved(value) if is_dataclass(value) else value if name in _WHOLE else value[..., ::2, ::2]
+
+    source: Any = record
+    return replace(source, **{f.name: half(f.name, getattr(source, f.name)) for f in fields(source)})
 
 
 def on(device: torch.device, record: Record) -> Record:

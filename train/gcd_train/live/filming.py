@@ -67,21 +67,18 @@ _STANDS_M = 1e-3
 """A body whose pose changes by less than this a frame stands still, metres (and radians at a metre)."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClipSettings:
-    """How clips are filmed. oversample: pixels drawn per pixel and side, see Renderer."""
-
-    width: int = 192
-    height: int = 128
-    oversample: int = 2
-    path: TargetPath = "mixed"
-
-
 def generate_live(
-    out: Path, world: LiveWorld, seeds: range, settings: ClipSettings, workers: int = 1
+    out: Path,
+    world: LiveWorld,
+    seeds: range,
+    *,
+    path: TargetPath = "mixed",
+    size: tuple[int, int] = (192, 128),
+    workers: int = 1,
 ) -> tuple[int, list[str]]:
     """Film the scenes of `seeds`; those that are there are kept.
 
+    size: width and height, pixels.
     Returns:
         How many scenes are there now, and a line for each that cannot be filmed.
     """
@@ -89,17 +86,16 @@ def generate_live(
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not (folder / f"{seed:07d}-0.safetensors").exists()]
     one_thread_each()
-    outcomes = map_items(partial(_film_scene, folder, world, settings), missing, workers=workers)
+    outcomes = map_items(partial(_film_scene, folder, world, path, size), missing, workers=workers)
     failures = [str(outcome.error) for outcome in outcomes if outcome.error is not None]
     return len(seeds) - len(failures), failures
 
 
-def _film_scene(folder: Path, world: LiveWorld, settings: ClipSettings, seed: int) -> None:
+def _film_scene(folder: Path, world: LiveWorld, path: TargetPath, size: tuple[int, int], seed: int) -> None:
     """Film all clips of one scene; the first one's file appears last. Raises RenderError."""
-    scene, draws = live_scene(world, seed, settings.path)
-    renderer = _renderer(settings.width, settings.height, settings.oversample)
+    scene, draws = live_scene(world, seed, path)
     for number, draw in reversed(list(enumerate(draws))):
-        arrays = _film(renderer, scene, draw, world)
+        arrays = _film(_renderer(size), scene, draw, world)
         lenses = {f"{name}_hfov_deg": angle for name, angle in draw.hfov_deg.items()}
         facts = {**scene.facts, "world": world, "fps": draw.fps, **lenses, "floor_z_m": FLOOR_Z_M[world]}
         with whole(folder / f"{seed:07d}-{number}.safetensors") as unfinished:
@@ -107,8 +103,8 @@ def _film_scene(folder: Path, world: LiveWorld, settings: ClipSettings, seed: in
 
 
 @cache
-def _renderer(width: int, height: int, oversample: int) -> Renderer:
-    return Renderer(width, height, oversample=oversample)
+def _renderer(size: tuple[int, int]) -> Renderer:
+    return Renderer(*size, oversample=2)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

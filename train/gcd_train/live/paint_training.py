@@ -22,7 +22,7 @@ from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.painter import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import LiveTask, Random, autocast, class_weights, generator_on, on
-from gcd_train.live.views import ViewBatches, Views, carried_through, halved, mirrored, views_of
+from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of
 from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import gradient_l1, ssim
@@ -85,7 +85,7 @@ class PaintTask(_ViewTask):
         """Of one batch of views."""
         before, now, random = self._batches[progress.part].batch(progress.updates)
         if progress.share < self._small_share:
-            before, now = tuple(halved(each) for each in before), halved(now)
+            before, now = tuple(map(halved_views, before)), halved_views(now)
         later = progress.share >= _MEAN_ALONE
         if later:
             now = carried_through(partial(self._first_step, network=self._net), before, now, self._movable, random)

@@ -55,11 +55,11 @@ _DOUBT = 1.1
 
 
 def train_live(
-    recipe: LiveRecipe, places: DataPlaces, folder: RunFolder, stop: StopSignal, processes: Processes = ALONE
+    recipe: LiveRecipe, data: DataPlaces, folder: RunFolder, stop: StopSignal, processes: Processes = ALONE
 ) -> Path:
     """All stages, or what is left of them; returns the weight file.
 
-    Several processes share the updates of depth and paint; the first one does the rest. places: folders of
+    Several processes share the updates of depth and paint; the first one does the rest. data: folders of
     `gcd-train generate live`.
 
     Raises:
@@ -67,32 +67,30 @@ def train_live(
         RecipeError: no folder of held-out clips, or an update's parts cannot be shared.
         Interrupted: `stop` was set; the state is saved.
     """
-    if places.valid is None:
+    if data.valid is None:
         raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
-    held_out = clip_paths(places.valid)
-    _require_fit(recipe, training_paths(places.data), held_out)
+    held_out = clip_paths(data.valid)
+    _require_fit(recipe, training_paths(data.data), held_out)
     device = compute_device(ComputeRecipe(device=recipe.device))
     torch.manual_seed(recipe.seed)
     networks = _networks(recipe).to(device, memory_format=layout(device))  # pyright: ignore
-    clips, measured = TrainingClips(places.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
+    clips, measured = TrainingClips(data.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
     model, seed, out = recipe.model, recipe.seed, folder.path
     alone = partial(processes.by_the_first, stop=stop)
+
+    def save(path: Path) -> None:
+        alone(lambda: save_live(path, networks, recipe.name, overwrite=True))
 
     def run(name: LiveStageName, stage: LiveStage, task: Task, processes: Processes) -> None:
         """Train a stage, whose weights are then in a file of their own; one to be kept is kept."""
         if name not in recipe.keep:
             _train(recipe, folder, stop, name, stage, task, processes)
-            so_far = out / f"{recipe.name}-{name}.safetensors"
-            alone(lambda: save_live(so_far, networks, recipe.name, overwrite=True))
+            save(out / f"{recipe.name}-{name}.safetensors")
         task.module.eval().requires_grad_(False)
 
     depth = DepthTask(networks.depth, model, clips, measured, recipe.depth, seed)
     run("depth", recipe.depth, depth, processes)
-    memory = digest_of(model.memory, model.memory_frames, seed)
-    by_net = f"{memory}-{weights_digest(networks.depth.state_dict())}"
-    exact, learned, shown = (
-        out / "inputs" / place for place in (f"exact/{memory}", f"learned/{by_net}", f"held-out/{by_net}")
-    )
+    exact, learned, shown = _input_folders(out / "inputs", recipe, networks.depth)
     make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(recipe.workers, processes.count))
     alone(lambda: make(exact, clips.paths[:: recipe.exact_every], None))
     alone(lambda: make(learned, clips.paths[:: recipe.learned_every], networks.depth))
@@ -116,6 +114,13 @@ def train_live(
 
     alone(finish)
     return path
+
+
+def _input_folders(out: Path, recipe: LiveRecipe, depth: DepthNet) -> tuple[Path, Path, Path]:
+    """Of inputs by exact depth, by learned depth, and of held-out clips; named by all that decides what is seen."""
+    memory = digest_of(recipe.model.memory, recipe.model.memory_frames, recipe.seed)
+    by_net = f"{memory}-{weights_digest(depth.state_dict())}"
+    return out / "exact" / memory, out / "learned" / by_net, out / "held-out" / by_net
 
 
 def _networks(recipe: LiveRecipe) -> LiveNetworks:

@@ -28,6 +28,7 @@ from gcd_train.live.batches import (
     Pictures,
     Random,
     autocast,
+    halved,
     on,
     on_device,
     rays_of,
@@ -198,30 +199,12 @@ def _views(
     )
 
 
-def halved(views: Views) -> Views:
-    """The same at half the size: what can be averaged is; the rest is of one pixel of four."""
-    seen = views.seen
+def halved_views(views: Views) -> Views:
+    """See `halved`; the colours of what is seen count by how much of a pixel it covers."""
+    seen, half = views.seen, halved(views)
     covered = avg_pool2d(seen.coverage[:, None], 2)
-    names = ("coverage", "now_share", "age", "painted_coverage")
-    made = {name: avg_pool2d(getattr(seen, name)[:, None], 2)[:, 0] for name in names}
-    return replace(
-        views,
-        seen=replace(
-            seen,
-            **made,
-            colour=avg_pool2d(seen.colour * seen.coverage[:, None], 2) / covered.clamp(min=1e-6),
-            log_depth=seen.log_depth[:, ::2, ::2],
-            votes=seen.votes[..., ::2, ::2],
-            painted=avg_pool2d(seen.painted, 2),
-            rays=avg_pool2d(seen.rays, 2),
-            ground_m=seen.ground_m[:, ::2, ::2],
-        ),
-        target=avg_pool2d(views.target, 2),
-        labels=views.labels[:, ::2, ::2],
-        log_depth=views.log_depth[:, ::2, ::2],
-        visibility=views.visibility[:, ::2, ::2],
-        lenses=tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in views.lenses),
-    )
+    colour = avg_pool2d(seen.colour * seen.coverage[:, None], 2) / covered.clamp(min=1e-6)
+    return replace(half, seen=replace(half.seen, colour=colour))
 
 
 class InputShelf(Shelf):

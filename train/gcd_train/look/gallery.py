@@ -286,18 +286,6 @@ class ViewRecipe:
     tilt_deg: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Viewed:
-    """A window and what was made of it.
-
-    strips: rows of the sheet. notes: what a viewer should know, in words.
-    """
-
-    window: Windowed
-    strips: tuple[Strip, ...]
-    notes: tuple[str, ...]
-
-
 def paths(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None = None) -> tuple[tuple[str, Trajectory], ...]:
     """Name and camera path of each goal, or of a model's one view.
 
@@ -327,8 +315,8 @@ def mounted(traits: Traits, recipe: ViewRecipe, hfov_deg: float | None) -> Camer
     return replace(CameraMount(), **{name: number for name, number in given.items() if number is not None})
 
 
-def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewRecipe) -> Viewed:
-    """Encode a window once and render every goal. Raises: ModelError and its kind."""
+def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewRecipe) -> list[Strip]:
+    """Encode a window once and render every goal: the rows of its sheet. Raises: ModelError and its kind."""
     traits = synthesizer.traits
     mount = mounted(traits, recipe, window.hfov_deg)
     lens, (high, wide) = None, window.pictures.shape[1:3]
@@ -340,20 +328,13 @@ def view_window(synthesizer: ViewSynthesizer, window: Windowed, recipe: ViewReci
     for name, path in paths(traits, recipe, window.hfov_deg):
         (view,) = synthesizer.render(features, [path], options)
         strips += _view_strips(traits, name, view)
-    width, height = window.size
-    rate = "" if window.trained_rate else f", a rate {traits.name} was not trained with"
-    notes = (
-        f"from {window.start_s:.1f} s, {len(window.pictures)} frames at {window.fps:g} a second{rate}",
-        f"cut from {width} x {height} to {wide} x {high}",
-    )
-    return Viewed(window=window, strips=tuple(strips), notes=notes)
+    return strips
 
 
-def write_viewed(viewed: Viewed, folder: Path) -> None:
+def write_views(window: Windowed, strips: Sequence[Strip], folder: Path) -> None:
     """`NAME.png`, the sheet, and `NAME.mp4`, all rows side by side. Raises RunError if they cannot be written."""
-    window = viewed.window
-    write_sheet([(f"{window.video} from {window.start_s:.1f} s", viewed.strips)], folder / f"{window.name}.png")
-    write_video(viewed.strips, window.fps, folder / f"{window.name}.mp4")
+    write_sheet([(f"{window.video} from {window.start_s:.1f} s", strips)], folder / f"{window.name}.png")
+    write_video(strips, window.fps, folder / f"{window.name}.mp4")
 
 
 def _view_strips(traits: Traits, name: str, view: View) -> list[Strip]:
@@ -381,12 +362,12 @@ _STYLE = (
 )
 
 
-def write_page(viewed: Sequence[Viewed], faults: Sequence[str], facts: Sequence[tuple[str, str]], out: Path) -> None:
+def write_page(windows: Sequence[Windowed], faults: Sequence[str], facts: Sequence[tuple[str, str]], out: Path) -> None:
     """Write the page.
 
     Args:
-        viewed: windows in order, whose files lie beside the page. faults: what could not be shown, a line each. facts:
-            name and value of what holds for all: the command, the weights, the options.
+        windows: in order, whose files lie beside the page. faults: what could not be shown, a line each. facts: name
+            and value of what holds for all: the command, the weights, the options.
     Raises:
         RunError: it cannot be written.
     """
@@ -397,15 +378,17 @@ def write_page(viewed: Sequence[Viewed], faults: Sequence[str], facts: Sequence[
         "<p>Every pixel of a view is generated. Nobody knows what was really there: a view that looks right is no "
         f"evidence that it is.</p><table>{rows}</table>",
         *(f"<p class=fault>{escape(fault)}</p>" for fault in faults),
-        *map(_section, viewed),
+        *map(_section, windows),
     ]
     write_whole(out, ("\n".join(parts) + "</html>\n").encode())
 
 
-def _section(viewed: Viewed) -> str:
-    name = escape(viewed.window.name, quote=True)
-    notes = escape("; ".join(viewed.notes))
+def _section(window: Windowed) -> str:
+    name, (width, height), (high, wide) = escape(window.name, quote=True), window.size, window.pictures.shape[1:3]
+    rate = "" if window.trained_rate else ", a rate the model was not trained with"
+    cut = f"cut from {width} x {height} to {wide} x {high}"
     return (
-        f"<h2>{escape(viewed.window.video)}, window {viewed.window.number + 1}</h2><p class=note>{notes}; "
+        f"<h2>{escape(window.video)}, window {window.number + 1}</h2><p class=note>from {window.start_s:.1f} s, "
+        f"{len(window.pictures)} frames at {window.fps:g} a second{rate}; {cut}; "
         f'<a href="{name}.mp4">video</a></p><a href="{name}.png"><img src="{name}.png" alt="{name}"></a>'
     )

@@ -245,10 +245,7 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
     if seed is None and path.suffix == ".zip" and (number := path.stem.split("-")[1:2]) and number[0].isdecimal():
         seed = int(number[0])
     clips = PairedClips.open(folder)
-    seeds = list(clips.seeds)
-    if seed is not None and seed not in seeds:
-        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(seeds)}, {seeds[0]} to {seeds[-1]}")
-    index = 0 if seed is None else seeds.index(seed)
+    index = _clip_number(folder, clips, seed)
     clip, (shard, name), numbers = clips[index], clips.places[index], tuple(range(clips.frames))
     sources, targets = _pair_poses(shard, name)
     lens = Intrinsics.from_hfov(clips.world.hfov_deg, clips.width, clips.height)
@@ -298,6 +295,13 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
         look_at=LOOK_AT if clips.mount is None else DRIVING_GOAL_TARGET,
         world=_STAGE if clips.mount is None else _VEHICLE,
     )
+
+
+def _clip_number(folder: Path, clips: PairedClips, seed: int | None) -> int:
+    if seed is not None and seed not in clips.seeds:
+        low, high = clips.seeds[0], clips.seeds[-1]
+        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(clips)}, {low} to {high}")
+    return 0 if seed is None else clips.seeds.index(seed)
 
 
 def _pair_poses(shard: Path, name: str) -> tuple[Poses, Poses]:

@@ -1,6 +1,6 @@
 """Does a live model know that a camera shows another world? Its score on held-out clips beside that on real videos.
 
-python -m gcd_train.live.other_world --heldout DIR --videos DIR [FILE ...] --weights FILE --out OUT
+python tools/other_world.py --heldout DIR --videos DIR [FILE ...] --weights FILE --out OUT
 """
 
 import argparse
