@@ -7,10 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
+from gcd_model.live.config import DepthConfig, LiveConfig, PaintConfig
 from gcd_train.live.clips import encode_depth
 
 FRAMES, HEIGHT, WIDTH, HFOV_DEG = 14, 32, 64, 80.0
 FLOOR, BOX = 1, 8  # road, car
+TINY = LiveConfig(
+    height=HEIGHT,
+    width=WIDTH,
+    depth=DepthConfig(widths=(8, 16, 16), mixers=1, fine_width=8, half_width=8, bins=8),
+    paint=PaintConfig(widths=(8, 16, 16), fine_width=8, half_width=8, embedding_width=16),
+    memory=2000,
+)
 
 
 def looking_ahead(x: float, height: float, down_deg: float = 20.0) -> NDArray[np.float64]:
@@ -62,13 +70,8 @@ def write_clip(folder: Path, seed: int, world: str = "driving") -> Path:
             f"{name}.pose": poses,
         }
     arrays["target.visibility"] = np.full_like(arrays["target.labels"], 2)
-    facts = {
-        "world": world,
-        "fps": 10.0,
-        "source_hfov_deg": HFOV_DEG,
-        "target_hfov_deg": HFOV_DEG,
-        "floor_z_m": 0.0,
-    }
+    lenses = {"source_hfov_deg": HFOV_DEG, "target_hfov_deg": HFOV_DEG}
+    facts = {"world": world, "fps": 10.0, **lenses, "floor_z_m": 0.0}
     path = folder / world / f"{seed:07d}-0.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file(arrays, path, metadata={"facts": json.dumps(facts)})

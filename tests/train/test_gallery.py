@@ -35,8 +35,16 @@ from gcd_model.traits import ASSUMED_SOURCE
 from gcd_model.weights.families import FAMILIES
 from gcd_train.cli.gallery import gallery_command
 from gcd_train.errors import DataError
-from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window
-from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, read_windows
+from gcd_train.look.gallery import (
+    ViewRecipe,
+    WindowChoice,
+    Windowed,
+    find_videos,
+    mounted,
+    paths,
+    read_windows,
+    view_window,
+)
 
 T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
@@ -192,11 +200,11 @@ def a_window() -> Windowed:
 def test_each_angle_is_a_row_below_the_input_and_samples_come_with_their_uncertainty() -> None:
     model = Mirror(traits())
     angles = (SphericalDelta(azimuth_deg=40.0), SphericalDelta(elevation_deg=20.0, radius_m=1.0))
-    viewed = view_window(model, a_window(), ViewRecipe(angles=angles, samples=2))
+    strips = view_window(model, a_window(), ViewRecipe(angles=angles, samples=2))
     assert [path.goal_delta for path in model.paths] == list(angles)
-    assert all(len(strip.frames) == T for strip in viewed.strips)
-    assert np.array_equal(viewed.strips[1].frames[0], viewed.strips[0].frames[0])
-    names = [strip.name for strip in viewed.strips]
+    assert all(len(strip.frames) == T for strip in strips)
+    assert np.array_equal(strips[1].frames[0], strips[0].frames[0])
+    names = [strip.name for strip in strips]
     assert names[:3] == ["input", "az +40 el +0 r +0", "az +40 el +0 r +0 sample 2"]
     assert names[4:6] == ["az +0 el +20 r +1", "az +0 el +20 r +1 sample 2"]
     shown = re.fullmatch(r"uncertainty, white (\S+)", names[3])

@@ -2,22 +2,29 @@
 
 import json
 import math
+import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from live_clips import TINY, write_clip
 from safetensors.torch import save_file
 
 from gcd_model.errors import CheckpointError
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LiveConfig
+from gcd_model.live.depth_net import Familiarity, summary_of
+from gcd_model.live.synthesizer import save_live
+from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import gradient_map
+from gcd_train.live import measure
 from gcd_train.live.clips import LiveClip
-from gcd_train.live.measure import SetResult, differences, methods_of, to_json, to_markdown
-from gcd_train.live.measure_figures import (
+from gcd_train.live.figures import (
     BEFORE,
     NEVER,
     NOW,
@@ -29,11 +36,11 @@ from gcd_train.live.measure_figures import (
     cells,
     fit_spread,
     frechet_distance,
-    scene_interval,
     surface_motion,
 )
-from gcd_train.live.measure_methods import BestHomography
 
+sys.path.append(str(Path(__file__).parents[2] / "tools"))
+live_variants, other_world = import_module("live_variants"), import_module("other_world")
 FRAMES, HEIGHT, WIDTH = 4, 64, 96
 LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)
 
@@ -95,17 +102,14 @@ def test_fog_has_no_gradients_and_another_distribution() -> None:
     assert fog["psnr"] == pytest.approx(10 * math.log10(12.0), abs=0.1)  # noise in [0, 1] has a variance of 1/12
 
 
-def test_what_a_method_does_not_say_is_not_a_number() -> None:
-    made = figures(MethodViews(video=truth().video), truth())
-    assert all(math.isnan(made[name]) for name in ("miou", "iou_now", "inside_90_now"))
-
-
-def test_the_splat_has_an_error_ratio_of_one() -> None:
+def test_what_a_method_does_not_say_is_not_a_number_and_the_splat_errs_as_itself() -> None:
     of = truth()
     views = MethodViews(video=of.video.flip(-1))
     tally = Tally(LiveConfig().classes)
     tally.add("scene", of, views, views.video)
-    assert tally.figures()["error_ratio_seen"] == pytest.approx(1.0)
+    made = tally.figures()
+    assert made["error_ratio_seen"] == pytest.approx(1.0)
+    assert all(math.isnan(made[name]) for name in ("miou", "iou_now", "inside_90_now"))
 
 
 def test_fit_spread_holds_ninety_per_cent_of_gaussian_errors_in_every_state() -> None:
@@ -186,32 +190,80 @@ def _painted(rays: np.ndarray) -> np.ndarray:
 
 def test_the_homography_of_a_turn_is_exact() -> None:
     clip = turned_clip()
-    views = BestHomography().views(clip)
+    views = live_variants.BestHomography().views(clip)
     seen = torch.from_numpy(clip.arrays["target.visibility"] == NOW)
     error = (views.video * 255 - torch.from_numpy(clip.arrays["target.rgb"]).permute(0, 3, 1, 2)).abs()
     assert float(error.permute(0, 2, 3, 1)[seen].mean()) < 1.0
 
 
-def test_an_interval_over_scenes_holds_their_mean() -> None:
-    low, high = scene_interval([0.1, 0.4, 0.7, 0.2, 0.5])
-    assert low < 0.38 < high
-    assert all(math.isnan(bound) for bound in scene_interval([]))
-
-
 def test_reports_hold_every_method_and_the_lead_of_the_live_one() -> None:
     tallies = {name: Tally(LiveConfig().classes) for name in ("live", "old")}
-    of = truth()
-    tallies["live"].add("a", of, perfect(of), of.video)
-    tallies["old"].add("a", of, MethodViews(video=of.video * 0.9), of.video)
-    result = SetResult(name="tiny", clips=1, tallies=tallies)
-    assert differences(result)["live - old"]["psnr"] > 10
-    assert "|old|" in to_markdown([result])
-    assert set(json.loads(json.dumps(to_json([result])))["tiny"]["methods"]) == {"live", "old"}
+    for scene in ("a", "b", "c"):
+        of = truth(ord(scene))
+        tallies["live"].add(scene, of, perfect(of), of.video)
+        tallies["old"].add(scene, of, MethodViews(video=of.video * 0.9), of.video)
+    result = measure.SetResult(name="tiny", clips=3, tallies=tallies)
+    lead = measure.differences(result)["live - old"]
+    assert 10 < lead["low"] <= lead["psnr"] <= lead["high"]
+    assert "| old |" in measure.to_markdown([result])
+    assert set(json.loads(json.dumps(measure.to_json([result])))["tiny"]["methods"]) == {"live", "old"}
 
 
 def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError):
-        methods_of(["telepathy"], "package:live-small", tmp_path)
+        measure.chosen_methods(["telepathy"], [measure.ExactSplat(training=tmp_path)])
     save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError):
-        methods_of(["live"], str(tmp_path / "other.safetensors"), tmp_path)
+        measure.live_model(str(tmp_path / "other.safetensors"))
+    with pytest.raises(DataError, match="is no live model"):
+        measure.live_model("random:driving")
+
+
+# how unlike its training a camera looks to the live model
+
+
+def test_what_the_training_never_had_scores_higher_and_scale_does_not_matter() -> None:
+    generator = torch.Generator().manual_seed(0)
+    mix = torch.randn(6, 6, generator=generator) * torch.tensor([1e-3, 1.0, 1e3, 1.0, 1.0, 1.0])
+    known = torch.randn(500, 6, generator=generator) @ mix + 5.0
+    moved = known[:100] + 4.0 * known.std(0) * torch.tensor([1, -1, 1, 0, 0, 0])
+    familiar = Familiarity(3)
+    familiar.fit(known)
+    sure, unsure = (familiar.score(known[:100], torch.full((100,), entropy)) for entropy in (0.05, 0.5))
+    foreign = familiar.score(moved, torch.full((100,), 0.05))
+    assert 0.0 <= float(sure.min()) < float(sure.mean()) < float(unsure.mean())
+    assert float(foreign.mean()) > 3 * float(sure.mean())
+    assert float(torch.maximum(foreign, unsure).max()) <= 1.0
+    assert float(-(1 - familiar.score(known, torch.ones(500))).log().mean()) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_summary_is_of_the_picture_and_not_of_its_size() -> None:
+    features = torch.randn(2, 3, 4, 6)
+    twice = features.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
+    assert torch.allclose(summary_of(features), summary_of(twice), atol=1e-5)
+
+
+def test_auc_counts_ties_half() -> None:
+    assert other_world.auc(np.array([0.0, 1.0]), np.array([1.0, 2.0])) == 0.875
+
+
+def test_clips_are_measured_and_videos_scored_by_the_commands(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "sets" / "one", 1_000_000)
+    write_clip(tmp_path / "data", 0)
+    weights = ("--weights", tmp_path / "tiny.safetensors")
+    save_live(tmp_path / "tiny.safetensors", LiveNetworks(TINY), "tiny")
+    told = ("--heldout", tmp_path / "sets", "--training", tmp_path / "data", "--sets", "one", "--out", tmp_path)
+    measure.main([str(each) for each in (*told, *weights)])
+    report = json.loads((tmp_path / "report.json").read_text())["one"]
+    assert (report["clips"], set(report["methods"])) == (1, {"splat", "live"})
+    assert (tmp_path / "one.png").stat().st_size > 1000
+    writer = cv2.VideoWriter(str(tmp_path / "real.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
+    for value in range(20):
+        writer.write(np.full((48, 64, 3), value, np.uint8))
+    writer.release()
+    told = ("--heldout", clip.parents[1], "--videos", tmp_path / "real.mp4", "--out", tmp_path / "out.json")
+    other_world.main([str(each) for each in (*told, *weights)])
+    report = json.loads((tmp_path / "out.json").read_text())
+    known, other = (np.array(list(report[name].values())) for name in ("known", "other"))
+    assert ((np.concatenate([known, other]) >= 0) & (np.concatenate([known, other]) <= 1)).all()
+    assert report["auc"] == other_world.auc(known, other)

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from gcd_train.cli.generate import app
 from gcd_train.data.files import GEOMETRY, FileFault
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.look.clip import SKY_M, UNSEEN, Footage
-from gcd_train.look.open_scene import ShowOptions, open_scene
+from gcd_train.look.sheet import SKY_M, UNSEEN, Footage
+from gcd_train.look.show import ShowOptions, open_scene
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.scene_writer import SceneFormat, write_scene
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, World
@@ -115,8 +115,8 @@ def test_frames_are_those_asked_for(tmp_path: Path) -> None:
 def test_a_scene_that_is_too_short_is_shown_whole(drive: Path) -> None:
     footage = opened(drive)
     assert footage.frame_numbers == tuple(range(FRAMES))
-    assert footage.cameras == ("camera0", "yaw-0", "yaw-60")
-    assert footage.names[0].name == "Car"
+    assert footage.scene == "4 frames at 10 fps, 3 cameras"
+    assert next(iter(footage.names.values())).name == "Car"
     assert footage.kind_plural == "classes"
 
 

@@ -14,8 +14,7 @@ from gcd_train.errors import DataError, RecipeError
 
 if TYPE_CHECKING:
     from gcd_model import Spherical, SphericalDelta, Trajectory, ViewSynthesizer
-    from gcd_train.look.gallery import Viewed, ViewRecipe
-    from gcd_train.look.real_video import RealVideo, WindowChoice
+    from gcd_train.look.gallery import RealVideo, ViewRecipe, WindowChoice, Windowed
 
 
 def gallery_command(
@@ -53,8 +52,7 @@ def gallery_command(
     """View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line."""
     with errors_shown():
         from gcd_model import load_synthesizer
-        from gcd_train.look.gallery import ViewRecipe, paths, write_page
-        from gcd_train.look.real_video import WindowChoice, find_videos
+        from gcd_train.look.gallery import ViewRecipe, WindowChoice, find_videos, paths, write_page
 
         found = find_videos(videos)
         recipe = ViewRecipe(
@@ -120,12 +118,11 @@ def _viewed(
     choice: "WindowChoice",
     recipe: "ViewRecipe",
     out: Path,
-) -> "tuple[list[Viewed], list[str]]":
+) -> "tuple[list[Windowed], list[str]]":
     """What was shown, and a line for each video that could not be."""
-    from gcd_train.look.gallery import view_window, write_viewed
-    from gcd_train.look.real_video import read_windows
+    from gcd_train.look.gallery import read_windows, view_window, write_views
 
-    viewed: list[Viewed] = []
+    viewed: list[Windowed] = []
     faults: list[str] = []
     with progress_bar("videos", len(videos)) as show:
         for number, video in enumerate(videos, 1):
@@ -136,11 +133,11 @@ def _viewed(
                 windows = ()
             for window in windows:
                 try:
-                    viewed.append(view_window(model, window, recipe))
+                    write_views(window, view_window(model, window, recipe), out)
                 except NonFiniteError as error:
                     _leave_out(f"{video.path}: {error}", faults)
                     break
-                write_viewed(viewed[-1], out)
+                viewed.append(window)
             show(number)
     return viewed, faults
 

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
 from gcd_train.errors import RecipeError
-from gcd_train.live.draws import LIVE_SCENES, LiveWorld, TargetPath, worlds_of
+from gcd_train.live.filming import LIVE_SCENES, WORLDS, LiveWorld, TargetPath, generate_live
 from gcd_train.scenes.pair_writer import generate
 from gcd_train.scenes.scene_writer import SceneFormat, SceneRun, generate_scenes
 from gcd_train.scenes.worlds import (
@@ -145,14 +145,12 @@ def live(
 
     By default so many scenes of each world as `live-small` was trained on: over 3,000 clips, an hour of two cores.
     """
-    from gcd_train.live.clips import ClipSettings, generate_live
-
     with errors_shown():
         stop_as_by_ctrl_c()
-        settings, console = ClipSettings(width=width, height=height, path=path), Console(stderr=True, highlight=False)
-        for each in worlds_of(path) if world is None else (world,):
+        console, processes = Console(stderr=True, highlight=False), workers or os.cpu_count() or 1
+        for each in WORLDS[path] if world is None else (world,):
             seeds = range(first_seed, first_seed + (scenes or LIVE_SCENES[each]))
-            there, failures = generate_live(out, each, seeds, settings, workers or os.cpu_count() or 1)
+            there, failures = generate_live(out, each, seeds, path=path, size=(width, height), workers=processes)
             for line in failures:
                 console.print(line, markup=False, soft_wrap=True)
             console.print(f"{each}: {there} of {len(seeds)} scenes")

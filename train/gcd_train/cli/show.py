@@ -13,7 +13,7 @@ from gcd_train.cli.common import errors_shown
 from gcd_train.errors import RunError
 
 if TYPE_CHECKING:
-    from gcd_train.look.clip import Footage
+    from gcd_train.look.sheet import Footage
 
 SceneFolder: TypeAlias = Annotated[
     Path, Argument(metavar="SCENE", help="Folder scnNNNNN or scene_NNNNNN, or pair shards (folder or one zip).")
@@ -43,8 +43,8 @@ def show(
 ) -> None:
     """Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."""
     with errors_shown():
-        from gcd_train.look.open_scene import ShowOptions, open_scene
         from gcd_train.look.sheet import write_sheet, write_trajectory, write_video
+        from gcd_train.look.show import ShowOptions, open_scene
         from gcd_train.pictures import require_matplotlib
 
         require_matplotlib()
@@ -67,14 +67,9 @@ def _refuse_unwritable(folder: Path) -> None:
 
 
 def _print_facts(footage: "Footage") -> None:
-    from gcd_train.look.sheet import percent
-
     table = Table(title=footage.title, box=SIMPLE, show_header=False, title_justify="left")
     table.add_column(no_wrap=True)
     table.add_column()
-    for name, value in [("folder", footage.layout), *footage.facts(), ("axes", footage.world)]:
-        table.add_row(name, value.replace("\n(", " (").replace(",\n", ", ").replace("\n", ", "))
-    shares = [f"{label.name} {percent(share)}" for label, share in footage.shares()]
-    if shares:
-        table.add_row(footage.kind_plural, ", ".join(shares))
+    for fact in footage.facts():
+        table.add_row(*fact)
     Console(highlight=False).print(table)

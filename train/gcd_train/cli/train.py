@@ -16,7 +16,6 @@ from rich.table import Table
 from typer import Argument, BadParameter, Option
 
 from gcd_train.cli.common import command_line, errors_shown
-from gcd_train.errors import RecipeError
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, StageName
@@ -78,13 +77,12 @@ def train(
     from gcd_train.data.open import DataPlaces
 
     with errors_shown():
+        places = DataPlaces(data=data, valid=valid)
         if is_live(recipe):
-            _train_live(recipe, data, valid, out)
+            _train_live(recipe, places, out)
             return
         loaded = load_recipe(recipe, small=small, changes=changes or ())
-        _in_processes(
-            loaded, DataPlaces(data=data, valid=valid), out, latents, _stage_named(stage, get_args(StageName))
-        )
+        _in_processes(loaded, places, out, latents, _stage_named(stage, get_args(StageName)))
 
 
 def _stop_when_asked() -> threading.Event:
@@ -106,19 +104,17 @@ def _stage_named(name: str | None, known: Sequence[Name]) -> Name | None:
     return next((each for each in known if each == name), None)
 
 
-def _train_live(recipe: str, data: Path, valid: Path | None, out: Path) -> None:
-    from gcd_train.live.training import LivePlaces, train_live
+def _train_live(recipe: str, places: "DataPlaces", out: Path) -> None:
+    from gcd_train.live.training import train_live
     from gcd_train.training.distributed import processes_of
     from gcd_train.training.monitor import RunFolder
 
-    if valid is None:
-        raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
-    loaded, places = load_live_recipe(recipe), LivePlaces(data=data, valid=valid, out=out)
+    loaded, folder = load_live_recipe(recipe), RunFolder(out)
     with processes_of(ComputeRecipe(device=loaded.device, parallel="ddp")) as processes:
         if not processes.first:
             logging.getLogger().setLevel(logging.WARNING)
-        with RunFolder(out).begun(loaded, command_line()) if processes.first else nullcontext():
-            train_live(loaded, places, _stop_when_asked(), processes)
+        with folder.begun(loaded, command_line()) if processes.first else nullcontext():
+            train_live(loaded, places, folder, _stop_when_asked(), processes)
 
 
 def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:

@@ -14,7 +14,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, sampler_of, weights_path
+from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, weights_path
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_model.diffusion import Quality, SolverName

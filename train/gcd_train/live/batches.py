@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,9 +22,8 @@ from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
 from gcd_model.live.depth_net import pixel_rays, plane_depth, plane_sweep
 from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
-from gcd_train.live.clips import LiveClip, decode_depth, evenly, read_clip, tensor_of
-from gcd_train.live.draws import Poses
-from gcd_train.live.store import Camera, TrainingClips, camera_of
+from gcd_train.data.sample import to_network
+from gcd_train.live.clips import Camera, LiveClip, Poses, TrainingClips, decode_depth, evenly, read_clip, tensor_of
 from gcd_train.training.loop import Progress
 
 Random = np.random.Generator
@@ -41,6 +40,9 @@ _COUNTED = 48  # clips that say how common classes are
 _HEIGHT_SPREAD, _TILT_SPREAD_DEG = 0.05, 0.7  # of the other mounts that are declared
 _NEWS = 200
 """Updates after which the folder is asked for clips that were added."""
+_AVERAGED = {"video", "earlier", "target", "coverage", "now_share", "age", "painted", "painted_coverage", "rays"}
+_WHOLE = {"ups", "heights_m", "earlier_from_camera", "compared", "camera", "poses"}
+"""Of a record of pictures or views: what is averaged at half the size, and what has no pixels."""
 _MIRRORED = torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=torch.float64))
 
 
@@ -94,7 +96,7 @@ class Pictures:
         return made * on_device(drawn >= _NO_MOUNT, ups)[:, :, None]
 
 
-def on_device(array: NDArray[Any], like: Tensor) -> Tensor:
+def on_device(array: NDArray[Any] | Sequence[float], like: Tensor) -> Tensor:
     """Numbers of an array as `like` has them, and where."""
     return torch.from_numpy(np.asarray(array)).to(like)
 
@@ -109,18 +111,16 @@ def rays_of(lenses: Sequence[Intrinsics], device: torch.device) -> Tensor:
     return torch.stack([_rays(lens, device) for lens in lenses])
 
 
-def pictures_of(clip: LiveClip, camera: str) -> Pictures:
-    """All frames that were read of a clip, as "source" or "target" sees them, without earlier ones."""
-    arrays = {name: tensor_of(array) for name, array in clip.arrays.items() if name.startswith(camera)}
-    n, *size = arrays[f"{camera}.labels"].shape
-    cameras = [camera_of(clip, camera, size)] * n
-    return _pictures(arrays, camera, cameras, clip.arrays[f"{camera}.pose"])
+def pictures_of(clip: LiveClip) -> Pictures:
+    """All source frames that were read of a clip, without earlier ones."""
+    arrays = {name: tensor_of(array) for name, array in clip.arrays.items() if name.startswith("source")}
+    poses = clip.arrays["source.pose"]
+    return _pictures(arrays, "source", [clip.camera("source")] * len(poses), poses)
 
 
 def _pictures(arrays: dict[str, Tensor], name: str, cameras: Sequence[Camera], poses: Poses) -> Pictures:
     """arrays: as a clip has them, of frames of N cameras that stand at `poses`, [N, 4, 4]."""
-    video = to_video(arrays[f"{name}.rgb"])
-    heights = [pose[2, 3] - camera.floor_z_m for camera, pose in zip(cameras, poses, strict=True)]
+    video = to_network(arrays[f"{name}.rgb"])
     return Pictures(
         video=video,
         metres=decode_depth(arrays[f"{name}.depth"]),
@@ -128,30 +128,23 @@ def _pictures(arrays: dict[str, Tensor], name: str, cameras: Sequence[Camera], p
         moves=arrays[f"{name}.moves"].float(),
         lenses=tuple(camera.lens for camera in cameras),
         ups=on_device(poses[:, 2, :3].copy(), video),
-        heights_m=on_device(np.maximum(heights, 0.05), video),
+        heights_m=on_device([camera.height_m(pose) for camera, pose in zip(cameras, poses, strict=True)], video),
         earlier=video,
         earlier_from_camera=torch.eye(4, dtype=torch.float64, device=video.device).expand(len(video), 4, 4),
         compared=torch.zeros(len(video), dtype=torch.bool, device=video.device),
     )
 
 
-def to_video(rgb: Tensor | NDArray[np.uint8]) -> Tensor:
-    """u8 [N, H, W, 3] -> float32 [N, 3, H, W] in [-1, 1]."""
-    return torch.as_tensor(rgb).permute(0, 3, 1, 2).float() / 127.5 - 1
-
-
-def with_true_references(clip: LiveClip, camera: str) -> Pictures:
-    """All frames of a clip, each with the earlier one that a live view would compare it with, by true poses."""
-    pictures = pictures_of(clip, camera)
-    kept = References()
+def with_true_references(clip: LiveClip) -> Pictures:
+    """All source frames, each with the earlier one that a live view would compare it with, by true poses."""
+    pictures, kept = pictures_of(clip), References()
     earlier, moves = pictures.earlier.clone(), pictures.earlier_from_camera.clone()
     compared = pictures.compared.clone()
-    for t, (picture, pose) in enumerate(zip(pictures.video, clip.arrays[f"{camera}.pose"], strict=True)):
-        world_from_camera = torch.from_numpy(pose)
-        chosen = kept.chosen(world_from_camera)
+    for t, (picture, pose) in enumerate(zip(pictures.video, clip.poses("source"), strict=True)):
+        chosen = kept.chosen(pose)
         if chosen is not None:
             earlier[t], moves[t], compared[t] = chosen.picture, chosen.reference_from_camera, True
-        kept.add(picture, world_from_camera, pictures.metres[t])
+        kept.add(picture, pose, pictures.metres[t])
     return replace(pictures, earlier=earlier, earlier_from_camera=moves, compared=compared)
 
 
@@ -177,12 +170,9 @@ class FrameBatches:
         before = frames - random.integers(1, _MOST_GAP + 1, size=count)
         compared = (before >= 0) & (random.random(count) < _REFERENCE_SHARE)
         before = before.clip(0)
-        cameras = self._clips.cameras(name, chosen)
-        poses, poses_before = (
-            np.stack([camera.poses[t] for camera, t in zip(cameras, times, strict=True)]) for times in (frames, before)
-        )
+        poses, poses_before = (self._clips.poses(name, chosen, times) for times in (frames, before))
         names = [f"{name}.{array}" for array in ("rgb", "depth", "labels", "moves")]
-        pictures = _pictures(self._clips.take(chosen, frames, names), name, cameras, poses)
+        pictures = _pictures(self._clips.take(chosen, frames, names), name, self._clips.cameras(name, chosen), poses)
         far = torch.where(pictures.metres < SKY_M, pictures.metres, torch.nan).flatten(1)
         median = far.nanmedian(dim=1).values.nan_to_num(0.0).double()
         moves = on_device(np.linalg.inv(poses_before) @ poses, median)
@@ -192,7 +182,7 @@ class FrameBatches:
         moves[:, :3] = torch.cat([moves[:, :3, :3] @ turned, moves[:, :3, 3:] + shifted[..., None]], dim=2)
         return replace(
             pictures,
-            earlier=to_video(self._clips.take(chosen, before, names[:1])[names[0]]),
+            earlier=to_network(self._clips.take(chosen, before, names[:1])[names[0]]),
             earlier_from_camera=moves,
             compared=on_device(compared, near) & near,
         )
@@ -202,21 +192,7 @@ def _slightly_turned(random: Random, n: int, like: Tensor) -> Tensor:
     """Rotations by angles so small that their first order is enough: [N, 3, 3]."""
     x, y, z = random.normal(size=(3, n)) * np.radians(_TURN_NOISE_DEG)
     one = np.ones(n)
-    rows = [[one, -z, y], [z, one, -x], [-y, x, one]]
-    return on_device(np.moveaxis(np.array(rows), 2, 0), like)
-
-
-def halved(pictures: Pictures) -> Pictures:
-    """The same at half the size: colours are averages, what cannot be averaged is of one pixel of four."""
-    return replace(
-        pictures,
-        video=avg_pool2d(pictures.video, 2),
-        metres=pictures.metres[:, ::2, ::2],
-        labels=pictures.labels[:, ::2, ::2],
-        moves=pictures.moves[:, ::2, ::2],
-        lenses=tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in pictures.lenses),
-        earlier=avg_pool2d(pictures.earlier, 2),
-    )
+    return on_device(np.array([[one, -z, y], [z, one, -x], [-y, x, one]]).transpose(2, 0, 1), like)
 
 
 def augmented(pictures: Pictures, random: Random) -> Pictures:
@@ -256,12 +232,8 @@ def other_camera(random: Random, n: int, like: Tensor) -> Callable[[Tensor, torc
         wide = random.normal(size=(n, channels, 1, 1)) * spread * (random.random((n, 1, 1, 1)) < 0.75)
         return on_device(wide, like)
 
-    gamma, gain, offset, spread = (
-        drawn(0.25).exp(),
-        (drawn(0.15) + drawn(0.07, 3)).exp(),
-        drawn(0.03),
-        drawn(0.04).abs(),
-    )
+    gamma, gain = drawn(0.25).exp(), (drawn(0.15) + drawn(0.07, 3)).exp()
+    offset, spread = drawn(0.03), drawn(0.04).abs()
     blur = on_device(random.random((n, 1, 1, 1)) * (random.random((n, 1, 1, 1)) < 0.3), like)
 
     def look(video: Tensor, generator: torch.Generator) -> Tensor:
@@ -275,11 +247,10 @@ def other_camera(random: Random, n: int, like: Tensor) -> Callable[[Tensor, torc
 
 def class_weights(paths: Sequence[Path], config: LiveConfig, power: float) -> Tensor:
     """Weights of the classes in a loss, [K]: a power of how much of the pictures they fill, 1 for a mean pixel."""
-    classes = len(config.classes)
-    counts = np.ones(classes)
+    counts = np.ones(len(config.classes))
     for path in evenly(paths, _COUNTED):
-        labels: NDArray[Any] = read_clip(path, slice(0, 1)).arrays["source.labels"]
-        counts += np.bincount(labels.ravel(), minlength=classes)
+        labels = read_clip(path, slice(0, 1), ["source.labels"]).arrays["source.labels"]
+        counts += np.bincount(labels.ravel(), minlength=len(counts))
     shares = torch.from_numpy(counts / counts.sum()).float()
     weights = shares.clamp(min=1e-4) ** power
     return weights / (weights * shares).sum()
@@ -291,49 +262,54 @@ def autocast(device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=fast)
 
 
+def _mapped(change: Callable[..., Any], *records: Any) -> Any:
+    """A record of what becomes of the tensors and tuples in records of one kind, and in the records in them."""
+    if not is_dataclass(records[0]):
+        return change(*records)
+    made = {f.name: _mapped(change, *(getattr(each, f.name) for each in records)) for f in fields(records[0])}
+    return replace(records[0], **made)  # pyright: ignore[reportArgumentType]
+
+
+def halved(record: Record) -> Record:
+    """Pictures or views at half the size: what can be averaged is; the rest is of one pixel of four."""
+
+    def half(name: str, value: Any) -> Any:
+        if name == "lenses":
+            return tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in value)
+        if name in _AVERAGED:
+            return avg_pool2d(value, 2)
+        return halved(value) if is_dataclass(value) else value if name in _WHOLE else value[..., ::2, ::2]
+
+    source: Any = record
+    return replace(source, **{f.name: half(f.name, getattr(source, f.name)) for f in fields(source)})
+
+
 def on(device: torch.device, record: Record) -> Record:
-    """Records with their tensors, and those of the records in them, on a device."""
-    if isinstance(record, Tensor):
-        return cast("Record", record.to(device, non_blocking=True))
-    if isinstance(record, tuple):
-        return cast("Record", tuple(on(device, each) for each in cast("tuple[Any, ...]", record)))
-    if not is_dataclass(record):
-        return record
-    moved = {f.name: on(device, getattr(record, f.name)) for f in fields(record)}
-    return cast("Record", replace(record, **moved))  # pyright: ignore[reportArgumentType]
+    """A record with its tensors on a device."""
+    return _mapped(lambda x: x.to(device, non_blocking=True) if isinstance(x, Tensor) else x, record)
 
 
 def joined(parts: Sequence[Record]) -> Record:
-    """Records of pictures or views as one batch."""
-    first: Any = parts[0]
-    if isinstance(first, Tensor):
-        return cast("Record", torch.cat(cast("list[Tensor]", parts)))
-    if isinstance(first, tuple):
-        return cast("Record", tuple(chain(*cast("list[tuple[Any, ...]]", parts))))
-    together = {f.name: joined([getattr(part, f.name) for part in parts]) for f in fields(first)}
-    return replace(first, **together)
+    """Records of pictures as one batch."""
+    return _mapped(lambda *xs: torch.cat(xs) if isinstance(xs[0], Tensor) else tuple(chain(*xs)), *parts)
 
 
 def some_of(batch: Record, cut: slice) -> Record:
-    """Some pictures or views of a record of them."""
-    if isinstance(batch, Tensor | tuple):
-        return cast("Record", batch[cut])
-    taken = {f.name: some_of(getattr(batch, f.name), cut) for f in fields(cast("Any", batch))}
-    return replace(cast("Any", batch), **taken)
+    """Some pictures of a record of them."""
+    return _mapped(lambda x: x[cut], batch)
 
 
 class LiveTask:
     """What all stages' tasks have in common; see SharedTask."""
 
     def __init__(self, net: nn.Module, config: LiveConfig) -> None:
-        self.module = net
-        self._network, self._config, self._device = net, config, next(net.parameters()).device
+        self.module = self._network = net
+        self._config, self._device = config, next(net.parameters()).device
 
     def compute_through(self, network: nn.Module) -> None:
         """See SharedTask."""
         self._network = network
 
-    def after_update(self, progress: Progress) -> bool:
+    def after_update(self, _progress: Progress) -> bool:
         """Nothing to do."""
-        _ = progress
         return False

@@ -1,4 +1,4 @@
-"""Live clips on disk, and the exact visibility of every target pixel.
+"""Live clips on disk, and what the trainings draw from them by number.
 
 A data folder holds `<world>/<seed>-<clip>.safetensors`, one file a clip, whole or not there:
 
@@ -11,10 +11,9 @@ A data folder holds `<world>/<seed>-<clip>.safetensors`, one file a clip, whole 
 and in its metadata the lenses, the frame rate, the world, the height of its floor and the scene's facts.
 """
 
-import json
-from collections.abc import Collection, Sequence
+import logging
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,27 +21,28 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
-from safetensors.numpy import save_file
 from torch import Tensor
 
+from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LIVE_CLASSES, SKY_M
 from gcd_model.small_files import decode_json
-from gcd_train.errors import DataError, RenderError
-from gcd_train.files import whole
-from gcd_train.live.draws import FLOOR_Z_M, METRES_A_UNIT, LiveDraw, LiveWorld, Poses, TargetPath, live_scene
-from gcd_train.parallel import map_items, one_thread_each
-from gcd_train.scenes.description import Scene
-from gcd_train.scenes.frozen import freeze
-from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.errors import DataError
 
+_log = logging.getLogger(__name__)
+CAMERAS = ("source", "target")
+_HELD_OUT_SEED = 1_000_000
+"""Scenes from here on are not learned from."""
 _NEAREST_M, _CODES = 0.02, 65534
 _SPAN = float(np.log(SKY_M / _NEAREST_M))
-_SAME_SURFACE = 0.02
-"""Depths that differ by less than this share belong to one surface."""
-_STANDS_M = 1e-3
-"""A body whose pose changes by less than this a frame stands still, metres (and radians at a metre)."""
+_SHARE = 0.45
+"""Of the GPU's free memory, for one shelf."""
 Array = NDArray[Any]
+Poses = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 Item = TypeVar("Item")
+Read = Callable[[Path, slice, Sequence[str]], dict[str, Array]]
+Room = Callable[[int], int]
+"""How many files of so many bytes are kept."""
 
 
 def encode_depth(metres: Array) -> Array:
@@ -63,170 +63,17 @@ def decode_depth(code: Tensor) -> Tensor:
     return torch.where(code > 0, metres, SKY_M)
 
 
-_STAGE_LABELS = {
-    "drop": ("background", "object"),
-    "tabletop": ("sky", "background", "background", "table", "robot", "robot", "object", "object"),
-}
-"""What the live model calls the classes of the stage worlds, by their ids; the driving world's names are its own."""
-
-
-def live_labels(world: LiveWorld, labels: Array) -> Array:
-    """Class ids of a world as ids of LIVE_CLASSES."""
-    ids = {entry.name: number for number, entry in enumerate(LIVE_CLASSES)}
-    names = _STAGE_LABELS.get(world)
-    return labels if names is None else np.array([ids[name] for name in names], np.uint8)[labels]
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ClipSettings:
-    """How clips are filmed. oversample: pixels drawn per pixel and side, see Renderer."""
+class Camera:
+    """A clip's "source" or "target". poses: world_from_camera [T, 4, 4], metres. floor_z_m: of its world."""
 
-    width: int = 192
-    height: int = 128
-    oversample: int = 2
-    path: TargetPath = "mixed"
+    lens: Intrinsics
+    poses: Poses
+    floor_z_m: float
 
-
-def generate_live(
-    out: Path, world: LiveWorld, seeds: range, settings: ClipSettings, workers: int = 1
-) -> tuple[int, list[str]]:
-    """Film the scenes of `seeds`; those that are there are kept.
-
-    Returns:
-        How many scenes are there now, and a line for each that cannot be filmed.
-    """
-    folder = out / world
-    folder.mkdir(parents=True, exist_ok=True)
-    missing = [seed for seed in seeds if not (folder / f"{seed:07d}-0.safetensors").exists()]
-    one_thread_each()
-    outcomes = map_items(partial(film_scene, folder, world, settings), missing, workers=workers)
-    failures = [str(outcome.error) for outcome in outcomes if outcome.error is not None]
-    return len(seeds) - len(failures), failures
-
-
-def film_scene(folder: Path, world: LiveWorld, settings: ClipSettings, seed: int) -> None:
-    """Film all clips of one scene; the first one's file appears last. Raises RenderError."""
-    scene, draws = live_scene(world, seed, settings.path)
-    renderer = _renderer(settings.width, settings.height, settings.oversample)
-    for number, draw in reversed(list(enumerate(draws))):
-        arrays, facts = _film(renderer, scene, draw, world)
-        path = folder / f"{seed:07d}-{number}.safetensors"
-        with whole(path) as unfinished:
-            save_file(arrays, unfinished, metadata={"facts": json.dumps(facts)})
-
-
-@cache
-def _renderer(width: int, height: int, oversample: int) -> Renderer:
-    return Renderer(width, height, oversample=oversample)
-
-
-def _film(
-    renderer: Renderer, scene: Scene, draw: LiveDraw, world: LiveWorld
-) -> tuple[dict[str, Array], dict[str, Any]]:
-    steps, unit = list(draw.steps), METRES_A_UNIT[world]
-    frozen = freeze(scene)
-    cut = type(frozen)(
-        vertices=frozen.vertices,
-        poses=scene.poses[steps],
-        focus=scene.focus[steps],
-        hfov_deg=draw.source_hfov_deg,
-        light=frozen.light,
-        extent=frozen.extent,
-    )
-    cameras = {"source": draw.source, "target": draw.target}
-    lenses = {"source": draw.source_hfov_deg, "target": draw.target_hfov_deg}
-    views: dict[str, list[Rendering]] = {"source": [], "target": []}
-    for _, name, view in renderer.views(cut, cameras, lenses):
-        views[name].append(view)
-    moves = _moving_bodies(cut.poses)
-    arrays: dict[str, Array] = {}
-    for name, frames in views.items():
-        bodies = np.stack([frame.bodies for frame in frames])
-        metric = cameras[name].copy()
-        metric[:, :3, 3] *= unit
-        arrays |= {
-            f"{name}.rgb": np.stack([frame.rgb for frame in frames]),
-            f"{name}.depth": encode_depth(np.stack([frame.depth for frame in frames]) * unit),
-            f"{name}.labels": live_labels(world, np.stack([frame.classes for frame in frames])),
-            f"{name}.instances": np.stack([frame.instances for frame in frames]),
-            f"{name}.moves": moves[np.arange(len(frames))[:, None, None], bodies].astype(np.uint8),
-            f"{name}.pose": metric,
-        }
-    arrays["target.visibility"] = visibility(views, cameras, lenses, cut.poses, SKY_M / unit)
-    if (arrays["source.depth"] > 0).mean() < 0.05:
-        raise RenderError(f"{world}: the source sees nothing but sky; skip it")
-    facts = {
-        **scene.facts,
-        "world": world,
-        "fps": draw.fps,
-        "source_hfov_deg": draw.source_hfov_deg,
-        "target_hfov_deg": draw.target_hfov_deg,
-        "floor_z_m": FLOOR_Z_M[world],
-    }
-    return arrays, facts
-
-
-def _moving_bodies(poses: Array) -> Array:
-    """bool [T, B]: bodies [T, B, 3, 4] that move between a frame and the one before or after it."""
-    step = np.abs(np.diff(poses, axis=0)).max((-1, -2)) > _STANDS_M  # [T-1, B]
-    moves = np.zeros(poses.shape[:2], bool)
-    moves[:-1] |= step
-    moves[1:] |= step
-    return moves
-
-
-def visibility(
-    views: dict[str, list[Rendering]], cameras: dict[str, Poses], hfov_deg: dict[str, float], bodies: Array, sky: float
-) -> Array:
-    """What the source knows of each target pixel: u8 [T, H, W]; 2 seen now, 1 seen before and not moved since, 0 never.
-
-    A point counts as seen where the source's depth at its place is no nearer than the point itself.
-    """
-    frames = len(views["target"])
-    rays = _rays(hfov_deg["target"], *views["target"][0].depth.shape)  # [HW, 3], z = 1
-    states = np.zeros((frames, len(rays)), np.uint8)
-    source_depths = [np.where(view.depth > 0, view.depth, np.float32(sky)) for view in views["source"]]
-    world_points = [
-        _transformed(cameras["target"][t], rays * np.where(view.depth > 0, view.depth, sky).reshape(-1, 1))
-        for t, view in enumerate(views["target"])
-    ]
-    for t in range(frames):
-        states[t] = 2 * _seen(world_points[t], cameras["source"][t], hfov_deg["source"], source_depths[t])
-        owner = views["target"][t].bodies.reshape(-1)
-        for before in range(t - 1, -1, -1):
-            still = np.abs(bodies[before : t + 1] - bodies[t]).max((0, 2, 3)) <= _STANDS_M  # [B]
-            asked = np.flatnonzero((states[t] == 0) & still[owner])
-            seen = _seen(world_points[t][asked], cameras["source"][before], hfov_deg["source"], source_depths[before])
-            states[t, asked[seen]] = 1
-    return states.reshape(frames, *views["target"][0].depth.shape)
-
-
-def _seen(points: Array, world_from_camera: Poses, hfov_deg: float, depth: Array) -> Array:
-    """bool [N]: whether a camera with this depth picture sees the points [N, 3]."""
-    height, width = depth.shape
-    local = _transformed(np.linalg.inv(world_from_camera), points)
-    ahead = local[:, 2] > 1e-3
-    z = np.where(ahead, local[:, 2], 1.0)
-    focal = width / 2 / np.tan(np.radians(hfov_deg) / 2)
-    u, v = local[:, 0] / z * focal + width / 2 - 0.5, local[:, 1] / z * focal + height / 2 - 0.5
-    inside = ahead & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
-    left, top = np.floor(u[inside]).astype(int), np.floor(v[inside]).astype(int)
-    left0, left1 = left.clip(0), (left + 1).clip(max=width - 1)
-    top0, top1 = top.clip(0), (top + 1).clip(max=height - 1)
-    farthest = np.maximum.reduce([depth[a, b] for a in (top0, top1) for b in (left0, left1)])
-    seen = np.zeros(len(points), bool)
-    seen[inside] = z[inside] <= farthest * (1 + _SAME_SURFACE)
-    return seen
-
-
-def _rays(hfov_deg: float, height: int, width: int) -> Array:
-    focal = width / 2 / np.tan(np.radians(hfov_deg) / 2)
-    v, u = np.mgrid[:height, :width] + 0.5
-    return np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1).reshape(-1, 3)
-
-
-def _transformed(a_from_b: Array, points: Array) -> Array:
-    return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+    def height_m(self, pose: Poses) -> float:
+        """Over the floor, at a pose [4, 4]; at least 5 cm."""
+        return max(float(pose[2, 3]) - self.floor_z_m, 0.05)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -238,17 +85,28 @@ class LiveClip:
     facts: dict[str, Any]
 
     @property
-    def frames(self) -> int:
-        """T."""
-        return self.arrays["source.rgb"].shape[0]
+    def world(self) -> str:
+        """Its name."""
+        return str(self.facts["world"])
 
-    def hfov_deg(self, camera: str) -> float:
-        """Of "source" or "target"."""
-        return float(self.facts[f"{camera}_hfov_deg"])
+    def lens(self, camera: str) -> Intrinsics:
+        """Of "source" or "target"; its pictures or labels have to be read."""
+        pictures = self.arrays[f"{camera}.rgb"] if f"{camera}.rgb" in self.arrays else self.arrays[f"{camera}.labels"]
+        height, width = pictures.shape[1:3]
+        return Intrinsics.from_hfov(float(self.facts[f"{camera}_hfov_deg"]), width, height)
 
-    def depth(self, camera: str) -> Array:
+    def camera(self, name: str) -> Camera:
+        """ "source" or "target", as `lens`."""
+        poses, floor_z_m = self.arrays[f"{name}.pose"], float(self.facts["floor_z_m"])
+        return Camera(lens=self.lens(name), poses=poses, floor_z_m=floor_z_m)
+
+    def poses(self, camera: str) -> Tensor:
+        """world_from_camera, float64 [T, 4, 4]."""
+        return torch.from_numpy(self.arrays[f"{camera}.pose"])
+
+    def depth(self, camera: str) -> Tensor:
         """float32 [T, H, W], metres; SKY_M for the sky."""
-        return decode_depth(tensor_of(self.arrays[f"{camera}.depth"])).numpy()
+        return decode_depth(tensor_of(self.arrays[f"{camera}.depth"]))
 
 
 def clip_paths(folder: Path) -> list[Path]:
@@ -256,6 +114,14 @@ def clip_paths(folder: Path) -> list[Path]:
     paths = sorted(folder.glob("*/*.safetensors"))
     if not paths:
         raise DataError(f"{folder} holds no live clips; make some with `gcd-train generate live {folder}`")
+    return paths
+
+
+def training_paths(folder: Path) -> list[Path]:
+    """The clips of a data folder that may be learned from: scenes below a million. Raises DataError."""
+    paths = [path for path in clip_paths(folder) if int(path.stem.split("-")[0]) < _HELD_OUT_SEED]
+    if not paths:
+        raise DataError(f"{folder} holds held-out scenes alone; film some below seed {_HELD_OUT_SEED} to learn from")
     return paths
 
 
@@ -278,3 +144,102 @@ def read_clip(path: Path, frames: slice = slice(None), names: Collection[str] | 
     if any(int(array.max()) >= len(LIVE_CLASSES) for name, array in arrays.items() if name.endswith("labels")):
         raise DataError(f"{path} holds class ids beyond {len(LIVE_CLASSES) - 1}; film it again with this version")
     return LiveClip(name=f"{path.parent.name}/{path.stem}", arrays=arrays, facts=facts)
+
+
+# --- what batches are drawn from -------------------------------------------------------------------------------------
+
+
+def room_on(device: torch.device) -> Room | None:
+    """In a GPU's memory; None for other devices: there files are read from disk."""
+    if device.type != "cuda":
+        return None
+    return lambda size: int(torch.cuda.mem_get_info(device)[0] * _SHARE) // size
+
+
+class Shelf:
+    """Arrays [T, ...] of files that all have the same shapes, by number of file and frame.
+
+    Without a GPU frames are read from disk as they are drawn. With one every file is read once and stays in the GPU's
+    memory as bytes, 5 MB a clip: for a batch nothing but numbers goes there.
+    """
+
+    def __init__(self, read: Read, names: Sequence[str], device: torch.device, room: Room | None) -> None:
+        """read: some frames of some arrays of a file. names: of all that will be asked for. room: None to keep none."""
+        self._read, self._names, self._device, self._room = read, names, device, room
+        self._paths: list[Path] = []
+        self._kept: dict[str, Tensor] = {}
+        self._most = 0
+
+    def add(self, path: Path) -> bool:
+        """Take in a file, as the next number; False where there is no room for it."""
+        if self._room is not None:
+            arrays = {name: tensor_of(array) for name, array in self._read(path, slice(None), self._names).items()}
+            if not self._kept:
+                self._most = self._room(sum(array.nbytes for array in arrays.values()))
+                self._kept = {
+                    name: torch.empty(self._most, *array.shape, dtype=array.dtype, device=self._device)
+                    for name, array in arrays.items()
+                }
+            if len(self._paths) >= self._most:
+                return False
+            for name, array in arrays.items():
+                self._kept[name][len(self._paths)] = array
+        self._paths.append(path)
+        return True
+
+    def take(self, files: Numbers, frames: Numbers, names: Sequence[str]) -> dict[str, Tensor]:
+        """A frame of each of N files, on the device: [N, ...] by name, see `tensor_of`."""
+        if self._kept:
+            at = tuple(torch.from_numpy(each).to(self._device) for each in (files, frames))
+            return {name: self._kept[name][at] for name in names}
+        rows = [self._read(self._paths[i], slice(t, t + 1), names) for i, t in zip(files, frames, strict=True)]
+        return {name: torch.cat([tensor_of(row[name]) for row in rows]).to(self._device) for name in names}
+
+
+class TrainingClips:
+    """The clips of a folder that may be learned from, by number, on a device."""
+
+    def __init__(self, folder: Path, device: torch.device) -> None:
+        """Raises DataError if there are none."""
+        self._folder, self.device, self._full = folder, device, False
+        names = [f"{camera}.{name}" for camera in CAMERAS for name in ("rgb", "depth", "labels", "moves")]
+
+        def read(path: Path, frames: slice, names: Sequence[str]) -> dict[str, Array]:
+            return read_clip(path, frames, names).arrays
+
+        self._shelf = Shelf(read, [*names, "target.visibility"], device, room_on(device))
+        self.take = self._shelf.take
+        self.paths: list[Path] = []
+        self._cameras: list[dict[str, Camera]] = []
+        self.grow()
+
+    def grow(self) -> None:
+        """Take in what was added to the folder since."""
+        known = set(self.paths)
+        for path in training_paths(self._folder):
+            if path in known or self._full:
+                continue
+            if not self._shelf.add(path):
+                _log.warning("the GPU's memory is full with %d clips; the others are left out", len(self.paths))
+                self._full = True
+                continue
+            clip = read_clip(path, names=[f"{name}.pose" for name in CAMERAS])
+            clip.arrays.update(read_clip(path, slice(0, 1), [f"{name}.labels" for name in CAMERAS]).arrays)
+            self._cameras.append({name: clip.camera(name) for name in CAMERAS})
+            self.paths.append(path)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return len(self._cameras[0]["source"].poses)
+
+    def cameras(self, name: str, clips: Numbers) -> list[Camera]:
+        """ "source" or "target" of each of N clips."""
+        return [self._cameras[i][name] for i in clips]
+
+    def poses(self, name: str, clips: Numbers, frames: Numbers) -> Poses:
+        """Of a camera of each of N clips, each at a frame: [N, 4, 4]."""
+        return np.stack([camera.poses[t] for camera, t in zip(self.cameras(name, clips), frames, strict=True)])

@@ -1,6 +1,7 @@
 """How the depth network learns: the bin, the place within it, the class, and what moves."""
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -9,15 +10,7 @@ from torch import Tensor
 
 from gcd_model.clip import palette
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.depth_net import (
-    SKY_M,
-    DepthNet,
-    DepthOutput,
-    bin_width,
-    depth_inputs,
-    first_bin,
-    read_depth,
-)
+from gcd_model.live.depth_net import SKY_M, DepthNet, DepthOutput, bin_width, depth_inputs, first_bin, read_depth
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import (
     PART_SEED,
@@ -32,9 +25,8 @@ from gcd_train.live.batches import (
     some_of,
     with_true_references,
 )
-from gcd_train.live.clips import evenly, read_clip
+from gcd_train.live.clips import TrainingClips, evenly, read_clip
 from gcd_train.live.recipe import LiveStage
-from gcd_train.live.store import TrainingClips
 from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.optimiser import ParameterGroup
@@ -46,6 +38,7 @@ _PIXEL_SHARE = 0.2
 """How many draws of a pixel a frame's loss is computed from: the fine head is what costs time at full size."""
 THIN = ("person", "pole", "cyclist", "object")
 """Small things, which are drawn more often."""
+_MEASURED_FRAMES, _JUMP = (3, 10), 0.15
 
 
 class DepthTask(LiveTask):
@@ -107,9 +100,8 @@ class DepthTask(LiveTask):
         label = torch.where(sky, config.bins - 1, nearest)
         bin_loss = F.cross_entropy(output.logits, label)
         # the neighbours' offsets count where the peak is read
-        around = (nearest[:, None] + torch.arange(-1, 2, device=self._device).view(1, 3, 1, 1)).clamp(
-            0, config.bins - 2
-        )
+        beside = torch.arange(-1, 2, device=self._device).view(1, 3, 1, 1)
+        around = (nearest[:, None] + beside).clamp(0, config.bins - 2)
         wanted = (place[:, None] - around).clamp(-1.45, 1.45)
         distance = (output.offsets(around) - wanted).abs() * torch.tensor([0.5, 2.0, 0.5]).to(wanted).view(1, 3, 1, 1)
         offset = (distance.sum(dim=1) * ~sky).mean()
@@ -120,12 +112,9 @@ class DepthTask(LiveTask):
     def _pixel_weights(self, pictures: Pictures) -> Tensor:
         """How often a pixel is drawn, beside others: edges and thin things more often; [N, H, W]."""
         log = pictures.metres.log()[:, None]
-        highest = F.max_pool2d(log, 3, 1, 1)
-        lowest = -F.max_pool2d(-log, 3, 1, 1)
-        edge = ((highest - lowest)[:, 0] > 2 * _EDGE).float()
+        edge = ((F.max_pool2d(log, 3, 1, 1) + F.max_pool2d(-log, 3, 1, 1))[:, 0] > 2 * _EDGE).float()
         return 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()
 
-    @torch.no_grad()
     def measure(self, picture: Path) -> dict[str, float]:
         """Of held-out clips, see `measure_depth`."""
         self._net.eval()
@@ -134,38 +123,34 @@ class DepthTask(LiveTask):
 
 @torch.no_grad()
 def measure_depth(
-    net: DepthNet, config: LiveConfig, paths: Sequence[Path], sheet: Path | None = None, frames: Sequence[int] = (3, 10)
+    net: DepthNet, config: LiveConfig, paths: Sequence[Path], sheet: Path | None = None
 ) -> dict[str, float]:
     """Errors of depth, edges and classes on the source frames of held-out clips.
 
     mean_relative, median_relative: of depth nearer than the farthest bin. thin_within_10: share of person and pole
     pixels within 10 %. edge_f1: depth edges within one pixel. miou: of classes that occur.
     """
-    errors: list[Tensor] = []
-    thin: list[Tensor] = []
-    edges = torch.zeros(3)
-    count = len(config.classes)
+    errors, thin, rows = list[Tensor](), list[Tensor](), list[list[Tensor]]()
+    edges, count = torch.zeros(3), len(config.classes)
     confusion = torch.zeros(count, count, dtype=torch.int64)
     names = [entry.name for entry in config.classes]
     is_thin = torch.tensor([name in ("person", "pole") for name in names])
-    rows: list[list[Tensor]] = []
-    for path in paths:
-        for frame in frames:
-            truth = some_of(with_true_references(read_clip(path, slice(frame + 1)), "source"), slice(-1, None))
-            inputs = depth_inputs(truth.video, truth.rays, truth.ground())
-            device = next(net.parameters()).device
-            output = on(torch.device("cpu"), net(*on(device, (inputs, truth.sweeps(config.depth)))))
-            metres, true = read_depth(output, config.depth).metres, truth.metres
-            near = true < config.depth.farthest_m
-            relative = (metres.clamp(max=SKY_M) - true).abs() / true
-            errors.append(relative[near].clamp(max=2.0))
-            thin.append(relative[is_thin[truth.labels] & near])
-            edges += edge_matches(metres, true)
-            classes = output.classes.argmax(1)
-            confusion += confusion_matrix(classes, truth.labels, count)
-            if frame == frames[0]:
-                colours = palette(config.classes)[classes[0]].permute(2, 0, 1) / 127.5 - 1
-                rows.append([truth.video[0], _shaded(true[0]), _shaded(metres[0]), colours])
+    cpu, device = torch.device("cpu"), next(net.parameters()).device
+    for path, frame in product(paths, _MEASURED_FRAMES):
+        truth = some_of(with_true_references(read_clip(path, slice(frame + 1))), slice(-1, None))
+        inputs = depth_inputs(truth.video, truth.rays, truth.ground())
+        output = on(cpu, net(inputs.to(device), truth.sweeps(config.depth).to(device)))
+        metres, true = read_depth(output, config.depth).metres, truth.metres
+        near = true < config.depth.farthest_m
+        relative = (metres.clamp(max=SKY_M) - true).abs() / true
+        errors.append(relative[near].clamp(max=2.0))
+        thin.append(relative[is_thin[truth.labels] & near])
+        edges += edge_matches(metres, true)
+        classes = output.classes.argmax(1)
+        confusion += confusion_matrix(classes, truth.labels, count)
+        if frame == _MEASURED_FRAMES[0]:
+            colours = palette(config.classes)[classes[0]].permute(2, 0, 1) / 127.5 - 1
+            rows.append([truth.video[0], _shaded(true[0]), _shaded(metres[0]), colours])
     together, small = torch.cat(errors), torch.cat(thin)
     if sheet is not None:
         write_sheet(sheet, evenly(rows, 8))
@@ -186,18 +171,16 @@ def _shaded(metres: Tensor) -> Tensor:
 
 
 def edge_matches(metres: Tensor, true: Tensor) -> Tensor:
-    """Matched and all edges, for F1 with a pixel's slack: (matched, edges of `metres`, edges of `true`)."""
-    made, wanted = depth_edges(metres), depth_edges(true)
-    near_wanted = F.max_pool2d(wanted[:, None].float(), 3, 1, 1)[:, 0] > 0
-    near_made = F.max_pool2d(made[:, None].float(), 3, 1, 1)[:, 0] > 0
+    """Matched and all edges, for F1 with a pixel's slack: (matched, edges of `metres`, edges of `true`).
+
+    An edge is a pixel from which depth jumps by more than 15 % to the right or down.
+    """
+    made, wanted = (_edges(each.log()) for each in (metres, true))
+    near_made, near_wanted = (F.max_pool2d(each[:, None].float(), 3, 1, 1)[:, 0] > 0 for each in (made, wanted))
     matched = ((made & near_wanted).sum() + (wanted & near_made).sum()) / 2
     return torch.stack([matched, made.sum(), wanted.sum()]).float()
 
 
-def depth_edges(metres: Tensor) -> Tensor:
-    """Pixels from which depth jumps by more than 15 % to the right or down: bool [N, H, W]."""
-    log = metres.log()
-    edges = torch.zeros_like(log, dtype=torch.bool)
-    edges[..., :-1] |= (log[..., 1:] - log[..., :-1]).abs() > 0.15
-    edges[..., :-1, :] |= (log[..., 1:, :] - log[..., :-1, :]).abs() > 0.15
-    return edges
+def _edges(log: Tensor) -> Tensor:
+    right, down = (F.pad(log.diff(dim=axis).abs() > _JUMP, pad) for axis, pad in ((-1, (0, 1)), (-2, (0, 0, 0, 1))))
+    return right | down

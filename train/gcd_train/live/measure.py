@@ -1,4 +1,4 @@
-"""The live view measured beside splats by exact depth and homographies.
+"""The live view measured beside the splat by exact depth.
 
     python -m gcd_train.live.measure --heldout DIR --training DIR --weights FILE --sets paper,orbit \
         --methods splat,live --out DIR
@@ -9,39 +9,41 @@ Same clips, same run; writes report.md, report.json and a sheet of pictures for 
 import argparse
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model import hatched
 from gcd_model.errors import ModelError
+from gcd_model.geometry import invert_rigid
 from gcd_model.live.config import LiveConfig
+from gcd_model.live.depth_net import pixel_rays
+from gcd_model.live.eyes import Eyes, Floor
+from gcd_model.live.paint_net import filled, seen_of
+from gcd_model.live.painter import COVERED, LiveView
+from gcd_model.live.splat import splat, unproject
+from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.loading import load_synthesizer
+from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError, TrainError
-from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip
-from gcd_train.live.measure_figures import (
-    NAMED_CLASSES,
-    STATES,
-    MethodViews,
-    Tally,
-    fit_spread,
-    scene_interval,
-    truth_of,
-)
-from gcd_train.live.measure_methods import BestHomography, ExactSplat, Method, live_methods, live_model
+from gcd_train.evaluation.galleries import Strip, to_bytes, write_sheet
+from gcd_train.evaluation.statistics import scene_weights
+from gcd_train.evaluation.tables import markdown_rows
+from gcd_train.live.batches import Pictures, pictures_of
+from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip, training_paths
+from gcd_train.live.figures import NAMED_CLASSES, NEVER, NOW, STATES, MethodViews, Tally, fit_spread, truth_of
 
+_SAMPLE = 60
+"""Training clips that the fill of holes is read off."""
 _SHEET_FRAMES, _SHEET_CLIPS = (5, 9, 13), 4
 _TABLES: dict[str, dict[str, tuple[str, int]]] = {
-    "Pictures": {
-        "PSNR": ("psnr", 2),
-        "SSIM": ("ssim", 3),
-    },
+    "Pictures": {"PSNR": ("psnr", 2), "SSIM": ("ssim", 3)},
     "Seen pixels": {
         "share": ("share_seen", 3),
         "PSNR": ("psnr_seen", 2),
@@ -63,6 +65,114 @@ _TABLES: dict[str, dict[str, tuple[str, int]]] = {
 }
 
 
+class Method(Protocol):
+    """Shows a clip as its target camera would have seen it."""
+
+    @property
+    def name(self) -> str: ...
+    def views(self, clip: LiveClip) -> MethodViews:
+        """All frames of it."""
+        ...
+
+
+@lru_cache
+def commonest_class(training: Path, world: str) -> int:
+    """Of target pixels of a world's training clips. Raises DataError if there are none."""
+    paths = [path for path in training_paths(training) if path.parent.name == world]
+    if not paths:
+        raise DataError(f"{training} holds no training clips of {world!r}; holes are filled as they are on average")
+    counts = np.zeros(256)
+    for path in evenly(paths, _SAMPLE):
+        labels = read_clip(path, slice(6, 7), ["target.labels"]).arrays["target.labels"]
+        counts += np.bincount(labels.ravel(), minlength=256)
+    return int(counts.argmax())
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ExactSplat:
+    """This frame's pixels by their exact depth, as surfels; holes have the colours around and the commonest class."""
+
+    training: Path
+    name: str = "splat"
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        source, lens, classes = pictures_of(clip), clip.lens("target"), len(LiveConfig().classes)
+        rays, nothing, labels = pixel_rays(lens), torch.zeros(lens.height, lens.width), source.labels.to(torch.uint8)
+        made, video = [], []
+        for t, (pose, target) in enumerate(zip(clip.poses("source"), clip.poses("target"), strict=True)):
+            surfels = unproject(source.metres[t], source.video[t], labels[t], source.lenses[t], pose, 1.0)
+            made.append(splat(surfels, target, lens, classes, 1.0))
+            seen = seen_of(made[-1], None, rays, nothing, torch.zeros(12))
+            video.append((filled(seen)[0].clamp(-1, 1) + 1) / 2)
+        covered, votes = (
+            torch.stack(each) for each in zip(*((s.coverage, s.votes.argmax(0)) for s in made), strict=True)
+        )
+        label = commonest_class(self.training, clip.world)
+        return MethodViews(
+            video=torch.stack(video),
+            classes=torch.where(covered > 0, votes, label).to(torch.uint8),
+            visibility=torch.where(covered >= COVERED, NOW, NEVER).to(torch.uint8),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LiveModel:
+    """The live model, frame by frame as a node runs it.
+
+    floor_higher_m, floor_tilt_deg: how far the declared floor is off. steps: of the paint sampler, None as shipped.
+    eyes: what looks at the source.
+    """
+
+    networks: LiveNetworks
+    name: str = "live"
+    floor_higher_m: float = 0.0
+    floor_tilt_deg: float = 0.0
+    steps: int | None = None
+    eyes: Callable[[LiveNetworks], Eyes] = Eyes
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        view = LiveView(self.networks, steps=self.steps)
+        view.eyes = self.eyes(self.networks)
+        source, moves = pictures_of(clip), invert_rigid(clip.poses("source")) @ clip.poses("target")
+        lens, target_lens = source.lenses[0], clip.lens("target")
+        frames = [
+            view.step(source.video[t], [move], lens=lens, floor=self._floor(source, t), target_lens=target_lens).views[
+                0
+            ]
+            for t, move in enumerate(moves)
+        ]
+        return MethodViews(
+            video=torch.stack([(frame.picture.clamp(-1, 1) + 1) / 2 for frame in frames]),
+            classes=torch.stack([frame.classes for frame in frames]),
+            visibility=torch.stack([frame.visibility for frame in frames]),
+            log_variance=torch.stack([frame.log_variance for frame in frames]),
+        )
+
+    def _floor(self, source: Pictures, t: int) -> Floor:
+        tilt = torch.tensor(np.radians(self.floor_tilt_deg)).float()
+        x, y, z = source.ups[t]
+        up = torch.stack([x, y * tilt.cos() - z * tilt.sin(), y * tilt.sin() + z * tilt.cos()])
+        return Floor(up=up, height_m=float(source.heights_m[t]) + self.floor_higher_m)
+
+
+def live_model(weights: str, *, device: str = "auto", dtype: str | None = None) -> LiveSynthesizer:
+    """A live model. Raises DataError for weights of another."""
+    loaded = load_synthesizer(weights, device=device, dtype=dtype)
+    if not isinstance(loaded, LiveSynthesizer):
+        raise DataError(f"{weights} is no live model; give the weights of one")
+    return loaded
+
+
+def chosen_methods(names: Sequence[str], known: Sequence[Method]) -> list[Method]:
+    """By name, the first one in any case, as all are compared to it. Raises DataError for a name that is none."""
+    by_name = {method.name: method for method in known}
+    if unknown := [name for name in names if name not in by_name]:
+        raise DataError(f"no method is called {unknown[0]!r}; there are {', '.join(by_name)}")
+    return [by_name[name] for name in dict.fromkeys((known[0].name, *names))]
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SetResult:
     """What became of one set: a tally for each method."""
@@ -75,8 +185,8 @@ class SetResult:
 def measure_set(name: str, paths: Sequence[Path], methods: Sequence[Method], sheet: Path) -> SetResult:
     """All methods on all clips of a set; seen pixels of all are compared to the first one's."""
     tallies = {method.name: Tally(LiveConfig().classes) for method in methods}
-    rows: list[NDArray[np.uint8]] = []
     shown = set(np.linspace(0, len(paths) - 1, min(_SHEET_CLIPS, len(paths))).round().astype(int).tolist())
+    rows: list[tuple[str, list[Strip]]] = []
     for index, path in enumerate(paths):
         clip = read_clip(path)
         truth, scene = truth_of(clip), clip.name.rsplit("-", 1)[0]
@@ -84,33 +194,21 @@ def measure_set(name: str, paths: Sequence[Path], methods: Sequence[Method], she
         for each, views in made.items():
             tallies[each].add(scene, truth, views, made[methods[0].name].video)
         if index in shown:
-            rows += _sheet_rows(clip, made, truth.video)
+            rows.append((clip.name, _strips(clip, made, truth.video)))
         print(f"{name}: clip {index + 1} of {len(paths)}", flush=True)
-    cv2.imwrite(str(sheet), np.ascontiguousarray(np.concatenate(rows)[..., ::-1]))
+    write_sheet(rows, sheet)
     return SetResult(name=name, clips=len(paths), tallies=tallies)
 
 
-def _sheet_rows(clip: LiveClip, made: dict[str, MethodViews], truth: Tensor) -> list[NDArray[np.uint8]]:
-    """One row a frame: the source, every method, the first live one with what it painted hatched, the truth."""
-    columns = {"source": torch.from_numpy(clip.arrays["source.rgb"]).permute(0, 3, 1, 2) / 255}
-    columns |= {name: views.video for name, views in made.items()}
-    says = next((views for views in made.values() if views.log_variance is not None), None)
-    if says is not None and says.visibility is not None:
-        told = (says.video.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()
-        painted = hatched(told, says.visibility.numpy())
-        columns["painted: hatched"] = torch.from_numpy(painted).permute(0, 3, 1, 2) / 255
-    columns["truth"] = truth
-    rows: list[NDArray[np.uint8]] = []
-    for t in _SHEET_FRAMES:
-        tiles = []
-        for name, video in columns.items():
-            tile = np.ascontiguousarray((video[t].clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy())
-            for level, thickness in ((0, 2), (255, 1)):
-                told = (f"{name}, frame {t + 1}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (level,) * 3, thickness)
-                cv2.putText(tile, *told, cv2.LINE_AA)
-            tiles.append(tile)
-        rows.append(np.concatenate(tiles, axis=1).astype(np.uint8))
-    return rows
+def _strips(clip: LiveClip, made: dict[str, MethodViews], truth: Tensor) -> list[Strip]:
+    """Some frames of the source, of every method, of the first live one with what it painted hatched, of the truth."""
+    videos = {"source": clip.arrays["source.rgb"], **{name: to_bytes(views.video) for name, views in made.items()}}
+    for name, views in made.items():
+        if views.log_variance is not None and views.visibility is not None:
+            videos["painted: hatched"] = hatched(videos[name], views.visibility.numpy())
+            break
+    videos["truth"] = to_bytes(truth)
+    return [Strip(name=name, frames={t: video[t] for t in _SHEET_FRAMES}) for name, video in videos.items()]
 
 
 def to_markdown(results: Sequence[SetResult]) -> str:
@@ -120,18 +218,24 @@ def to_markdown(results: Sequence[SetResult]) -> str:
         lines += [f"## {result.name}: {result.clips} clips", ""]
         figures = {name: tally.figures() for name, tally in result.tallies.items()}
         for title, columns in _TABLES.items():
-            lines += [f"### {title}", "", *_table(columns, figures), ""]
-        lines += [*_differences(result), *_spreads(result), ""]
+            rows = [
+                [name, *(_cell(each[figure], digits) for figure, digits in columns.values())]
+                for name, each in figures.items()
+            ]
+            said = [row for row in rows if any(cell != "-" for cell in row[1:])]
+            lines += [f"### {title}", "", *markdown_rows(["", *columns], said), ""]
+        lines += [
+            f"- PSNR, {name}: {each['psnr']:+.2f} dB [{each['low']:+.2f}, {each['high']:+.2f}] "
+            f"over {each['scenes']:.0f} scenes"
+            for name, each in differences(result).items()
+        ]
+        for name, tally in result.tallies.items():
+            if bool(tally.spread.counts.sum() > 0):
+                shifts = zip(STATES, fit_spread(tally.spread), strict=True)
+                told = ", ".join(f"{shift:+.2f} ({state})" for state, shift in shifts)
+                lines.append(f"- {name}: 90 % would lie inside with {told} added to the log-variance")
+        lines.append("")
     return "\n".join(lines)
-
-
-def _table(columns: dict[str, tuple[str, int]], figures: dict[str, dict[str, float]]) -> list[str]:
-    lines = ["| |" + "|".join(columns) + "|", "|---|" + "---:|" * len(columns)]
-    for name, each in figures.items():
-        cells = [_cell(each.get(figure, math.nan), digits) for figure, digits in columns.values()]
-        if any(cell != "-" for cell in cells):
-            lines.append(f"|{name}|" + "|".join(cells) + "|")
-    return lines
 
 
 def _cell(value: float, digits: int) -> str:
@@ -146,29 +250,10 @@ def differences(result: SetResult) -> dict[str, dict[str, float]]:
         if first is None or other == first:
             continue
         ours = result.tallies[first].psnr
-        apart = [float(np.mean(ours[scene]) - np.mean(each)) for scene, each in theirs.psnr.items()]
-        low, high = scene_interval(apart)
-        made[f"{first} - {other}"] = {"scenes": len(apart), "psnr": float(np.mean(apart)), "low": low, "high": high}
+        apart = np.array([np.mean(ours[scene]) - np.mean(each) for scene, each in theirs.psnr.items()])
+        low, high = np.quantile(scene_weights(len(apart)) @ apart / len(apart), [0.025, 0.975]).tolist()
+        made[f"{first} - {other}"] = {"scenes": len(apart), "psnr": float(apart.mean()), "low": low, "high": high}
     return made
-
-
-def _differences(result: SetResult) -> list[str]:
-    return [
-        f"- PSNR, {name}: {each['psnr']:+.2f} dB [{each['low']:+.2f}, {each['high']:+.2f}] "
-        f"over {each['scenes']:.0f} scenes"
-        for name, each in differences(result).items()
-    ]
-
-
-def _spreads(result: SetResult) -> list[str]:
-    """What would calibrate the methods that state their spread, on these very clips."""
-    lines: list[str] = []
-    for name, tally in result.tallies.items():
-        if bool(tally.spread.counts.sum() > 0):
-            shifts = zip(STATES, fit_spread(tally.spread), strict=True)
-            told = ", ".join(f"{shift:+.2f} ({state})" for state, shift in shifts)
-            lines.append(f"- {name}: 90 % would lie inside with {told} added to the log-variance")
-    return lines
 
 
 def to_json(results: Sequence[SetResult]) -> dict[str, Any]:
@@ -190,20 +275,9 @@ def to_json(results: Sequence[SetResult]) -> dict[str, Any]:
     }
 
 
-def methods_of(names: Sequence[str], weights: str, training: Path) -> list[Method]:
-    """By name, the exact splat first, as all are compared to it. Raises DataError for a name that is none."""
-    others: list[Method] = [ExactSplat(training=training), BestHomography()]
-    known: dict[str, Method] = {method.name: method for method in others}
-    if any(name.startswith("live") for name in names):
-        known |= live_methods(live_model(weights, device="cpu").networks)
-    if unknown := [name for name in names if name not in known]:
-        raise DataError(f"no method is called {unknown[0]!r}; there are {', '.join(known)}")
-    return [known[name] for name in dict.fromkeys((others[0].name, *names))]
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """See the module."""
-    parser = argparse.ArgumentParser(description="Measure the live view beside splats and homographies.")
+def main(arguments: Sequence[str] | None = None, more: Callable[[LiveModel], Sequence[Method]] = lambda _: ()) -> None:
+    """See the module. more: methods beside the splat and the live model."""
+    parser = argparse.ArgumentParser(description="Measure the live view beside the exact splat.")
     parser.add_argument("--heldout", type=Path, required=True, help="folder of the sets")
     parser.add_argument("--training", type=Path, required=True, help="clips that fill holes as they are on average")
     parser.add_argument("--weights", default="package:live-small", help="a live model's")
@@ -212,22 +286,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--clips", type=int, help="at most so many a set, evenly chosen")
     options = parser.parse_args(arguments)
+    results: list[SetResult] = []
     try:
-        _measured(options)
+        live = LiveModel(networks=live_model(options.weights, device="cpu").networks)
+        known = [ExactSplat(training=options.training), live, *more(live)]
+        methods = chosen_methods(options.methods.split(","), known)
+        options.out.mkdir(parents=True, exist_ok=True)
+        for name in options.sets.split(","):
+            paths = clip_paths(options.heldout / name)
+            paths = paths if options.clips is None else evenly(paths, options.clips)
+            results.append(measure_set(name, paths, methods, options.out / f"{name}.png"))
+            (options.out / "report.md").write_text(to_markdown(results))
+            (options.out / "report.json").write_text(json.dumps(to_json(results), indent=1))
     except (TrainError, ModelError) as error:
         raise SystemExit(f"error: {error}") from error
-
-
-def _measured(options: argparse.Namespace) -> None:
-    methods = methods_of(options.methods.split(","), options.weights, options.training)
-    options.out.mkdir(parents=True, exist_ok=True)
-    results: list[SetResult] = []
-    for name in options.sets.split(","):
-        paths = clip_paths(options.heldout / name)
-        paths = paths if options.clips is None else evenly(paths, options.clips)
-        results.append(measure_set(name, paths, methods, options.out / f"{name}.png"))
-        (options.out / "report.md").write_text(to_markdown(results))
-        (options.out / "report.json").write_text(json.dumps(to_json(results), indent=1))
 
 
 if __name__ == "__main__":

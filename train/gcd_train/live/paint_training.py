@@ -4,7 +4,7 @@ In the detail stage a critic looks at patches of whole pictures and learns to te
 head learns to pass. It alone learns there, on features that are held fixed: all else stays as it was, to the last bit.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -22,17 +22,7 @@ from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.painter import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import LiveTask, Random, autocast, class_weights, generator_on, on
-from gcd_train.live.clips import read_clip
-from gcd_train.live.views import (
-    VIEW_ARRAYS,
-    ViewBatches,
-    Views,
-    carried_through,
-    halved,
-    mirrored,
-    read_inputs,
-    views_of,
-)
+from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of
 from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import gradient_l1, ssim
@@ -55,7 +45,21 @@ _FEATURES, _CRITIC, _ENERGY, _KEEP, _CLOSE = 1.0, 0.1, 0.5, 1.0, 0.3
 _CRITIC_WIDTHS = (32, 64, 96)
 
 
-class PaintTask(LiveTask):
+class _ViewTask(LiveTask):
+    """Trains some weights of a PaintNet, which is measured on held-out views without what was painted before."""
+
+    def __init__(self, net: PaintNet, trained: nn.Module, config: LiveConfig, held_out: "HeldOutViews") -> None:
+        super().__init__(trained, config)
+        self._net, self._held_out = net, held_out
+        self._movable = movable_classes(config).to(self._device)
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        """See `HeldOutViews.measure`."""
+        self._net.eval()
+        return self._held_out.measure(self._net, self._config, picture)
+
+
+class PaintTask(_ViewTask):
     """Trains a PaintNet's first step on target views."""
 
     def __init__(
@@ -68,10 +72,9 @@ class PaintTask(LiveTask):
         small_share: float,
     ) -> None:
         """batches: of the parts of an update. small_share: see LiveStage."""
-        super().__init__(net, config)
-        self._net, self._held_out, self._small_share, self._batches = net, held_out, small_share, batches
+        super().__init__(net, net, config, held_out)
+        self._small_share, self._batches = small_share, batches
         self.class_weights = class_weights(paths, config, _CLASS_POWER).to(self._device)
-        self._movable = movable_classes(config).to(self._device)
 
     def parameter_groups(self) -> Sequence[ParameterGroup]:
         """All weights but those of the detail."""
@@ -82,7 +85,7 @@ class PaintTask(LiveTask):
         """Of one batch of views."""
         before, now, random = self._batches[progress.part].batch(progress.updates)
         if progress.share < self._small_share:
-            before, now = tuple(halved(each) for each in before), halved(now)
+            before, now = tuple(map(halved_views, before)), halved_views(now)
         later = progress.share >= _MEAN_ALONE
         if later:
             now = carried_through(partial(self._first_step, network=self._net), before, now, self._movable, random)
@@ -140,12 +143,6 @@ class PaintTask(LiveTask):
             "seen": _SEEN * F.cross_entropy(made.seen[some], views.visibility[some]),
         }
 
-    @torch.no_grad()
-    def measure(self, picture: Path) -> dict[str, float]:
-        """On held-out views, without what was painted before."""
-        self._net.eval()
-        return self._held_out.measure(self._net, self._config, picture)
-
 
 class Critic(nn.Module):
     """Patches of 34 pixels: true or made. Sees the picture and where it is painted."""
@@ -166,7 +163,7 @@ class Critic(nn.Module):
         return self.last(x)
 
 
-class DetailTask(LiveTask):
+class DetailTask(_ViewTask):
     """Trains a PaintNet's detail head against a critic; both take a step an update."""
 
     def __init__(
@@ -181,10 +178,8 @@ class DetailTask(LiveTask):
         net.detail.requires_grad_(True)
         self._critic = Critic()
         trained = nn.ModuleDict({"detail": net.detail, "critic": self._critic}).to(next(net.parameters()).device)
-        super().__init__(trained, config)
-        self._net, self._depth = net, depth.eval().requires_grad_(False)
-        self._held_out, self._batches = held_out, batches
-        self._movable = movable_classes(config).to(self._device)
+        super().__init__(net, trained, config, held_out)
+        self._depth, self._batches = depth.eval().requires_grad_(False), batches
         torch.manual_seed(0)
         self._random = nn.Sequential(
             nn.Conv2d(3, 32, 5, stride=2, padding=2), nn.LeakyReLU(0.2), nn.Conv2d(32, 48, 3, stride=2, padding=1),
@@ -249,12 +244,6 @@ class DetailTask(LiveTask):
             distance = distance + ((a.float() - b.float()).abs() / scale * share).mean()
         return distance
 
-    @torch.no_grad()
-    def measure(self, picture: Path) -> dict[str, float]:
-        """As in the stage before, with the detail in the sheet."""
-        self._net.eval()
-        return self._held_out.measure(self._net, self._config, picture)
-
 
 def _energy(x: Tensor) -> Tensor:
     """How much is drawn in cells of 8 pixels: [N, 3, H / 8, W / 8]."""
@@ -267,56 +256,42 @@ class HeldOutViews:
     """Some frames of held-out clips, opened once."""
 
     def __init__(self, paths: Sequence[Path], inputs: Path, frames: Sequence[int] = (5, 9, 13)) -> None:
-        self._views: list[Views] = []
-        for path in paths:
-            place = inputs / path.parent.name / path.name
-            for t in frames:
-                cut = slice(t, t + 1)
-                self._views.append(views_of(read_clip(path, cut, VIEW_ARRAYS), read_inputs(place, cut), ground=True))
-
-    def on(self, device: torch.device) -> Iterator[Views]:
-        """One by one."""
-        return (on(device, views) for views in self._views)
+        places = [(path, inputs / path.parent.name / path.name) for path in paths]
+        self.views = [views_of(*place, slice(t, t + 1)) for place in places for t in frames]
 
     def measure(self, net: PaintNet, config: LiveConfig, sheet: Path) -> dict[str, float]:
         """PSNR of base and mean, of seen and never-seen pixels, mIoU, and IoU of the three states."""
-        sums = {"base": 0.0, "mean": 0.0, "seen": 0.0, "never": 0.0}
-        counts = {"seen": 0.0, "never": 0.0}
-        k = len(config.classes)
+        errors = {name: list[Tensor]() for name in ("psnr_base", "psnr", "psnr_seen", "psnr_never")}
+        k, cpu, device = len(config.classes), torch.device("cpu"), next(net.parameters()).device
         confusion, states = torch.zeros(k, k, dtype=torch.int64), torch.zeros(3, 3, dtype=torch.int64)
         rows: list[list[Tensor]] = []
-        device = next(net.parameters()).device
-        for i, held in enumerate(self._views):
-            views = on(device, held)
-            base = filled(views.seen)
-            cpu = torch.device("cpu")
-            made = on(cpu, net.first_step(views.seen, base, config.sigma_max))
-            views, base = held, base.cpu()
-            square = ((made.mean.clamp(-1, 1) - views.target) / 2).square().mean(dim=1)
+        for i, views in enumerate(self.views):
+            there = on(device, views)
+            base = filled(there.seen)
+            made, base = on(cpu, net.first_step(there.seen, base, config.sigma_max)), base.cpu()
+            of_base, square = (_square_error(each, views.target) for each in (base, made.mean))
             never = views.visibility == 0
-            sums["base"] += float(((base.clamp(-1, 1) - views.target) / 2).square().mean())
-            sums["mean"] += float(square.mean())
-            for name, mask in (("seen", ~never), ("never", never)):
-                sums[name] += float(square[mask].sum())
-                counts[name] += float(mask.sum())
+            for each, values in zip(errors.values(), (of_base, square, square[~never], square[never]), strict=True):
+                each.append(values.flatten())
             confusion += confusion_matrix(made.classes.argmax(1), views.labels, k)
             states += confusion_matrix(made.seen.argmax(1), views.visibility, 3)
-            if i % max(len(self._views) // 10, 1) == 0:
+            if i % max(len(self.views) // 10, 1) == 0:
                 rows.append([x[0] for x in (views.seen.colour, base, made.mean, made.picture, views.target)])
         write_sheet(sheet, rows)
-        n = len(self._views)
         iou, occurs, state_iou = class_iou(confusion), confusion.sum(1) > 0, class_iou(states)
         names = [entry.name for entry in config.classes]
         return {
-            "psnr_base": _psnr(sums["base"] / n),
-            "psnr": _psnr(sums["mean"] / n),
-            "psnr_seen": _psnr(sums["seen"] / max(counts["seen"], 1.0)),
-            "psnr_never": _psnr(sums["never"] / max(counts["never"], 1.0)),
+            **{name: _psnr(torch.cat(each)) for name, each in errors.items()},
             "miou": float(iou[occurs].mean()),
             **{f"iou_{names[c]}": float(iou[c]) for c in (7, 8, 10, 11) if occurs[c]},
             **{f"iou_{name}": float(state_iou[s]) for s, name in enumerate(("painted", "before", "now"))},
         }
 
 
-def _psnr(square: float) -> float:
-    return -10 * float(np.log10(max(square, 1e-10)))
+def _square_error(made: Tensor, true: Tensor) -> Tensor:
+    """Of pictures in [0, 1], mean over colours: [N, H, W]."""
+    return ((made.clamp(-1, 1) - true) / 2).square().mean(dim=1)
+
+
+def _psnr(squares: Tensor) -> float:
+    return -10 * float(np.log10(max(float(squares.sum()) / max(len(squares), 1), 1e-10)))

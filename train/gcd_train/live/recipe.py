@@ -1,20 +1,17 @@
 """What a live model is trained from and for how long: `kind = "live"` in a TOML file."""
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from gcd_model.errors import FileError
+from gcd_model import explain_settings_error
 from gcd_model.live.config import LiveConfig
-from gcd_model.small_files import decode_toml, read_small
+from gcd_model.small_files import read_small
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe_data import Budget, LiveStageName, LogRecipe
-
-PACKAGED = Path(__file__).parent.parent / "recipes" / "live"
-"""Recipes that ship."""
+from gcd_train.recipe_files import PACKAGED, read_merged, recipe_path
 
 
 class LiveStage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -66,35 +63,31 @@ class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 def is_live(source: str) -> bool:
     """Whether a recipe, by `package:NAME` or path, is a live model's."""
     try:
-        return _table(source).get("kind") == "live"
-    except FileError:
+        return read_merged(_placed(source)).table.get("kind") == "live"
+    except RecipeError:
         return False
 
 
 def load_live_recipe(source: str) -> LiveRecipe:
     """A recipe by `package:NAME` or path. Raises RecipeError for one that cannot be read or has unknown keys."""
+    read = read_merged(_placed(source))
     try:
-        return msgspec.convert(_table(source), LiveRecipe)
-    except FileError as error:
-        raise RecipeError(f"the recipe {source} {error}") from error
+        return msgspec.convert(read.table, LiveRecipe)
     except msgspec.ValidationError as error:
-        raise RecipeError(f"the recipe {source} cannot be used: {error}") from error
+        raise RecipeError(f"{read.place}: {explain_settings_error(str(error), LiveRecipe)}") from error
 
 
 def live_recipes() -> list[str]:
     """Names of those that ship."""
-    return sorted(path.stem for path in PACKAGED.glob("*.toml"))
+    return sorted(path.stem for path in (PACKAGED / "live").glob("*.toml"))
 
 
 def live_toml(source: str) -> str:
     """The recipe's text, once it was found to be sound. Raises RecipeError."""
     load_live_recipe(source)
-    return read_small(_path(source))
+    return read_small(recipe_path(_placed(source)))
 
 
-def _table(source: str) -> dict[str, object]:
-    return decode_toml(read_small(_path(source)))
-
-
-def _path(source: str) -> Path:
-    return PACKAGED / f"{source.removeprefix('package:')}.toml" if source.startswith("package:") else Path(source)
+def _placed(source: str) -> str:
+    """What ships lies in a folder of its own."""
+    return source.replace("package:", "package:live/", 1) if source.startswith("package:") else source

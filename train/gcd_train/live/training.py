@@ -3,30 +3,33 @@
 clips -> depth network -> what it shows of every target (inputs) -> paint network -> detail -> weights
 """
 
-import hashlib
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
+import numpy as np
 import torch
+from torch import Tensor, nn
 
 from gcd_model.live.blocks import layout
-from gcd_model.live.depth_net import DepthNet
-from gcd_model.live.synthesizer import LiveSynthesizer, save_live
-from gcd_model.loading import load_synthesizer
-from gcd_model.networks import LiveNetworks
-from gcd_train.errors import DataError
-from gcd_train.live.batches import PART_SEED
-from gcd_train.live.calibration import calibrate
-from gcd_train.live.clips import clip_paths, read_clip
+from gcd_model.live.depth_net import DepthNet, DepthOutput, depth_inputs, read_depth
+from gcd_model.live.paint_net import filled
+from gcd_model.live.synthesizer import save_live
+from gcd_model.networks import LiveNetworks, weights_digest
+from gcd_train.data.open import DataPlaces
+from gcd_train.data.sample import to_network
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.metrics import class_iou, confusion_matrix
+from gcd_train.live.batches import PART_SEED, some_of, with_true_references
+from gcd_train.live.clips import TrainingClips, clip_paths, read_clip, training_paths
 from gcd_train.live.depth_training import DepthTask
+from gcd_train.live.figures import SpreadHistogram, fit_spread
+from gcd_train.live.measure import LiveModel, live_model
 from gcd_train.live.paint_training import DetailTask, HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
-from gcd_train.live.store import TrainingClips, training_paths
 from gcd_train.live.views import InputShelf, ViewBatches, make_inputs
 from gcd_train.parallel import map_items
 from gcd_train.recipe_data import ComputeRecipe, LiveStageName
@@ -34,72 +37,73 @@ from gcd_train.stop import StopSignal
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.loop import Loop, LoopOptions, Task
 from gcd_train.training.monitor import RunFolder
+from gcd_train.training.setup import compute_device, digest_of
 
 _log = logging.getLogger(__name__)
 _MEASURED = 8
 """About so many held-out clips are measured while training."""
 _CARRIED = {"paint": 0.35, "detail": 0.6}
 """Share of the views that see what was painted a frame before, of a model that carries that."""
-_SHARE = 4
+_CLIPS_A_TURN = 4
 """Clips whose inputs a process works out at a time."""
+_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_FRAMES = slice(1, 14, 4)
+_FAMILIAR = 400
+"""So many clips of the training say what is familiar."""
+_DOUBT = 1.1
+"""A source counts as another world's from so many times the highest score of a held-out clip."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LivePlaces:
-    """Where a training reads and writes. data, valid: folders of `gcd-train generate live`; out: the run's folder."""
-
-    data: Path
-    valid: Path
-    out: Path
-
-
-def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, processes: Processes = ALONE) -> Path:
+def train_live(
+    recipe: LiveRecipe, data: DataPlaces, folder: RunFolder, stop: StopSignal, processes: Processes = ALONE
+) -> Path:
     """All stages, or what is left of them; returns the weight file.
 
-    Several processes share the updates of depth and paint; the first one does the rest.
+    Several processes share the updates of depth and paint; the first one does the rest. data: folders of
+    `gcd-train generate live`.
 
     Raises:
         DataError: no clips, clips of another shape than the recipe's, or held-out clips among the training's.
-        RecipeError: an update's parts cannot be shared. Interrupted: `stop` was set; the state is saved.
+        RecipeError: no folder of held-out clips, or an update's parts cannot be shared.
+        Interrupted: `stop` was set; the state is saved.
     """
-    _require_apart(places)
-    _require_shape(recipe, places)
-    folder, device, held_out = RunFolder(places.out), _device(recipe.device), clip_paths(places.valid)
+    if data.valid is None:
+        raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
+    held_out = clip_paths(data.valid)
+    _require_fit(recipe, training_paths(data.data), held_out)
+    device = compute_device(ComputeRecipe(device=recipe.device))
     torch.manual_seed(recipe.seed)
     networks = _networks(recipe).to(device, memory_format=layout(device))  # pyright: ignore
-    clips, measured = TrainingClips(places.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
-    model, seed = recipe.model, recipe.seed
+    clips, measured = TrainingClips(data.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
+    model, seed, out = recipe.model, recipe.seed, folder.path
     alone = partial(processes.by_the_first, stop=stop)
+
+    def save(path: Path) -> None:
+        alone(lambda: save_live(path, networks, recipe.name, overwrite=True))
 
     def run(name: LiveStageName, stage: LiveStage, task: Task, processes: Processes) -> None:
         """Train a stage, whose weights are then in a file of their own; one to be kept is kept."""
-        if name in recipe.keep:
-            task.module.eval().requires_grad_(False)
-            return
-        _stage(recipe, folder, stop, name, stage, task, processes)
-        so_far = places.out / f"{recipe.name}-{name}.safetensors"
-        alone(lambda: save_live(so_far, networks, recipe.name, overwrite=True))
+        if name not in recipe.keep:
+            _train(recipe, folder, stop, name, stage, task, processes)
+            save(out / f"{recipe.name}-{name}.safetensors")
+        task.module.eval().requires_grad_(False)
 
     depth = DepthTask(networks.depth, model, clips, measured, recipe.depth, seed)
     run("depth", recipe.depth, depth, processes)
-    exact, learned, shown = (
-        places.out / "inputs" / name / _digest(net, recipe)
-        for name, net in (("exact", None), ("learned", networks.depth), ("held-out", networks.depth))
-    )
+    exact, learned, shown = _input_folders(out / "inputs", recipe, networks.depth)
     make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(recipe.workers, processes.count))
     alone(lambda: make(exact, clips.paths[:: recipe.exact_every], None))
     alone(lambda: make(learned, clips.paths[:: recipe.learned_every], networks.depth))
     alone(lambda: make(shown, measured, networks.depth))
     carried = _CARRIED if model.carry_painted else {"paint": 0.0, "detail": 0.0}
-    inputs = InputShelf(clips, [exact, learned])
+    inputs, views = InputShelf(clips, [exact, learned]), HeldOutViews(measured, shown)
     batches = [
         ViewBatches(clips, inputs, model, recipe.paint.batch, seed + part * PART_SEED, carried["paint"])
         for part in range(recipe.paint.parts)
     ]
-    views = HeldOutViews(measured, shown)
     paint = PaintTask(networks.paint, model, batches, clips.paths, views, recipe.paint.small_share)
     run("paint", recipe.paint, paint, processes)
-    path = places.out / f"{recipe.name}.safetensors"
+    path = out / f"{recipe.name}.safetensors"
 
     def finish() -> None:
         seen = ViewBatches(clips, inputs, model, recipe.detail.batch, seed + 1, carried["detail"])
@@ -112,49 +116,40 @@ def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, process
     return path
 
 
+def _input_folders(out: Path, recipe: LiveRecipe, depth: DepthNet) -> tuple[Path, Path, Path]:
+    """Of inputs by exact depth, by learned depth, and of held-out clips; named by all that decides what is seen."""
+    memory = digest_of(recipe.model.memory, recipe.model.memory_frames, recipe.seed)
+    by_net = f"{memory}-{weights_digest(depth.state_dict())}"
+    return out / "exact" / memory, out / "learned" / by_net, out / "held-out" / by_net
+
+
 def _networks(recipe: LiveRecipe) -> LiveNetworks:
     """At random, or as a weight file has them. Raises DataError if that is another model."""
     networks = LiveNetworks(recipe.model)
     if recipe.weights is not None:
-        begun = load_synthesizer(recipe.weights, device="cpu", dtype="float32")
-        if not isinstance(begun, LiveSynthesizer):
-            raise DataError(f"a live model's training begins from a live model, {recipe.weights} is another")
-        found, wanted = ((c.depth, c.paint, c.classes) for c in (begun.networks.config, recipe.model))
+        begun = live_model(recipe.weights, device="cpu", dtype="float32").networks
+        found, wanted = ((c.depth, c.paint, c.classes) for c in (begun.config, recipe.model))
         if found != wanted:
             raise DataError(f"{recipe.weights} has other networks or classes than the recipe: {found}, wanted {wanted}")
-        networks.load_state_dict(begun.networks.state_dict())
+        networks.load_state_dict(begun.state_dict())
     return networks
 
 
-def _device(name: str) -> torch.device:
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def _require_apart(places: LivePlaces) -> None:
-    """Raises DataError if a scene is in both folders."""
-    trained = {_scene(path) for path in training_paths(places.data)}
-    both = sorted(trained & {_scene(path) for path in clip_paths(places.valid)})
-    if both:
+def _require_fit(recipe: LiveRecipe, learned: Sequence[Path], held_out: Sequence[Path]) -> None:
+    """Raises DataError if a scene is in both, or clips have another size or number of frames than the model."""
+    scenes, measured = ({f"{p.parent.name}/{p.stem.split('-')[0]}" for p in paths} for paths in (learned, held_out))
+    if both := sorted(scenes & measured):
         raise DataError(
             f"{len(both)} held-out scenes are among the training's, first: {both[0]}; give --valid scenes of their own"
         )
-
-
-def _require_shape(recipe: LiveRecipe, places: LivePlaces) -> None:
-    """Raises DataError if the clips have another size or number of frames than the model."""
     wanted = (recipe.model.frames, recipe.model.height, recipe.model.width)
-    for folder in (places.data, places.valid):
-        path = clip_paths(folder)[0]
+    for path in (learned[0], held_out[0]):
         found = read_clip(path, names=["target.labels"]).arrays["target.labels"].shape
         if found != wanted:
             raise DataError(f"the recipe's model takes clips of [T, H, W] {wanted}, {path} has {found}")
 
 
-def _scene(path: Path) -> str:
-    return f"{path.parent.name}/{path.stem.split('-')[0]}"
-
-
-def _stage(
+def _train(
     recipe: LiveRecipe,
     folder: RunFolder,
     stop: StopSignal,
@@ -164,10 +159,9 @@ def _stage(
     processes: Processes,
 ) -> None:
     """Train a stage to the end of its budget; its module then has the averaged weights."""
-    told = msgspec.json.encode([recipe.model.depth, recipe.model.paint, recipe.seed, name])
     options = LoopOptions(
         stage=name,
-        identity=hashlib.sha256(told).hexdigest()[:12],
+        identity=digest_of(recipe.model.depth, recipe.model.paint, recipe.seed, name),
         budget=stage.budget,
         optimiser=stage.optimiser,
         ema=stage.ema,
@@ -180,7 +174,6 @@ def _stage(
     loop = Loop(task, folder, options)
     loop.run()
     loop.adopt_average()
-    task.module.eval().requires_grad_(False)
 
 
 def _make_all_inputs(
@@ -191,31 +184,123 @@ def _make_all_inputs(
     if not missing:
         return
     _log.info("working out what is seen of %d clips (%s)", len(missing), out.parent.name)
-    state = None if net is None else {name: value.cpu().clone() for name, value in net.state_dict().items()}
-    shares = [missing[first : first + _SHARE] for first in range(0, len(missing), _SHARE)]
-    for outcome in map_items(partial(_inputs_of, out, state, recipe), shares, workers=workers):
+    work = partial(_inputs_of, out, None if net is None else deepcopy(net).cpu(), recipe)
+    turns = [missing[first : first + _CLIPS_A_TURN] for first in range(0, len(missing), _CLIPS_A_TURN)]
+    for outcome in map_items(work, turns, workers=workers):
         outcome.unwrap()
         if stop.is_set():
             break
 
 
-def _digest(net: DepthNet | None, recipe: LiveRecipe) -> str:
-    """Of all that decides what is seen of a clip."""
-    told = hashlib.sha256(msgspec.json.encode([recipe.model.memory, recipe.model.memory_frames, recipe.seed]))
-    for name, value in {} if net is None else net.state_dict().items():
-        told.update(name.encode() + value.cpu().numpy().tobytes())
-    return told.hexdigest()[:12]
-
-
-def _inputs_of(out: Path, state: dict[str, Any] | None, recipe: LiveRecipe, paths: list[Path]) -> None:
-    net: DepthNet | None = None
-    if state is not None:
-        net = DepthNet(recipe.model.depth, len(recipe.model.classes)).to(_device(recipe.device))
-        net.load_state_dict(state)
-        net.eval()
+def _inputs_of(out: Path, net: DepthNet | None, recipe: LiveRecipe, paths: list[Path]) -> None:
+    if net is not None:
+        net.to(compute_device(ComputeRecipe(device=recipe.device))).eval()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         make_inputs(out, paths, net, recipe.model, recipe.seed)
     finally:
         torch.set_num_threads(threads)
+
+
+# --- calibration -----------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def calibrate(
+    networks: LiveNetworks,
+    learned: Sequence[Path],
+    paths: Sequence[Path],
+    views: HeldOutViews,
+    depth_weights: Tensor,
+    paint_weights: Tensor,
+) -> None:
+    """After the last stage, on the CPU: how likely a class is, how wide the spread, and what is another world's.
+
+    The losses make rare classes count for more, so their logits are too high by the logarithm of that; a share of it is
+    taken back. All is read off held-out clips, and written into the class biases of both networks and into the config.
+
+    learned: clips of the training. paths, views: of held-out clips. depth_weights, paint_weights: [K], how much the
+    losses made of each class.
+    """
+    networks.eval()
+    config = networks.config
+    depth_head, paint_head = networks.depth.head.out, networks.paint.head.out
+    _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, lambda: _source_classes(networks, paths))
+    _take_back(paint_head, 3, paint_weights, lambda: _view_classes(networks, views))
+    _learn_familiar(networks, learned, np.random.default_rng(0))
+    networks.config = msgspec.structs.replace(
+        config, spread_shift=_spread_shift(networks, paths), ood_threshold=_threshold(networks, paths)
+    )
+
+
+def _take_back(
+    head: nn.Conv2d, first: int, weights: Tensor, classes: Callable[[], Iterator[tuple[Tensor, Tensor]]]
+) -> None:
+    """Lower the biases of the classes, which begin at `first`, by that share of the weights with the best mean IoU.
+
+    classes: pairs of logits [N, K, H, W] and labels [N, H, W].
+    """
+    assert head.bias is not None
+    count, excess = len(weights), weights.log().cpu()  # of a training on the GPU
+    confusions = torch.zeros(len(_SHARES), count, count, dtype=torch.int64)
+    for logits, labels in classes():
+        for confusion, share in zip(confusions, _SHARES, strict=True):
+            confusion += confusion_matrix((logits - share * excess[:, None, None]).argmax(1), labels, count)
+    means = [class_iou(each)[each.sum(1) > 0].mean() for each in confusions]
+    best = _SHARES[int(torch.stack(means).argmax())]
+    head.bias[first : first + count] -= (best * excess).to(head.bias)
+
+
+def _source_classes(networks: LiveNetworks, paths: Sequence[Path]) -> Iterator[tuple[Tensor, Tensor]]:
+    for path in paths:
+        source = with_true_references(read_clip(path))
+        inputs = depth_inputs(source.video, source.rays, source.ground())
+        output = networks.depth(inputs, source.sweeps(networks.config.depth))
+        yield output.classes[_FRAMES], source.labels[_FRAMES]
+
+
+def _view_classes(networks: LiveNetworks, held_out: HeldOutViews) -> Iterator[tuple[Tensor, Tensor]]:
+    for views in held_out.views:
+        made = networks.paint.first_step(views.seen, filled(views.seen), networks.config.sigma_max, detail=False)
+        yield made.classes, views.labels
+
+
+def _spread_shift(networks: LiveNetworks, paths: Sequence[Path]) -> tuple[float, float, float]:
+    """Of painted, seen before and seen now, so that the 90 % interval holds 90 %."""
+    networks.config = msgspec.structs.replace(networks.config, spread_shift=(0.0, 0.0, 0.0))
+    model, histogram = LiveModel(networks=networks), SpreadHistogram()
+    for path in paths:
+        clip = read_clip(path)
+        views, truth = model.views(clip), (to_network(clip.arrays["target.rgb"]) + 1) / 2
+        assert views.log_variance is not None
+        assert views.visibility is not None
+        histogram.add((views.video - truth)[1:], views.log_variance[1:], views.visibility[1:])
+    return fit_spread(histogram)
+
+
+def _threshold(networks: LiveNetworks, paths: Sequence[Path]) -> float:
+    def score(output: DepthOutput) -> float:
+        return float(networks.familiarity.score(output.summary, read_depth(output, networks.config.depth).entropy))
+
+    frames = range(14)[_FRAMES]
+    means = [
+        np.mean([[score(output) for output in _outputs(networks, path, t)] for t in frames], axis=0).max()
+        for path in paths
+    ]
+    return min(_DOUBT * float(max(means)), 1.0)
+
+
+def _learn_familiar(networks: LiveNetworks, paths: Sequence[Path], random: np.random.Generator) -> None:
+    """From a frame of each of some clips that were learned from."""
+    some = [paths[i] for i in random.permutation(len(paths))[:_FAMILIAR]]
+    outputs = (each for path in some for each in _outputs(networks, path, int(random.integers(14))))
+    networks.familiarity.fit(torch.cat([each.summary for each in outputs]))
+
+
+def _outputs(networks: LiveNetworks, path: Path, t: int) -> Iterator[DepthOutput]:
+    """Of a frame of a clip's source: with its mount and an earlier frame, and without."""
+    frame = some_of(with_true_references(read_clip(path, slice(t + 1))), slice(-1, None))
+    ground = frame.ground()
+    yield networks.depth(depth_inputs(frame.video, frame.rays, ground), frame.sweeps(networks.config.depth))
+    yield networks.depth(depth_inputs(frame.video, frame.rays, torch.zeros_like(ground)))

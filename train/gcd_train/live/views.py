@@ -8,11 +8,9 @@ clips' own names holds of T frames: colour u8 [T, H, W, 3], coverage, now_share,
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 from torch import Tensor
@@ -21,81 +19,75 @@ from torch.nn.functional import avg_pool2d, interpolate
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LIVE_CLASSES, SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, plane_depth, read_depth
-from gcd_model.live.memory import SeenWorld
+from gcd_model.live.memory import seen_world
 from gcd_model.live.paint_net import Painted, Seen, camera_features
 from gcd_model.live.splat import Splat, splat, unproject
+from gcd_train.data.sample import to_network
 from gcd_train.files import whole
 from gcd_train.live.batches import (
     Pictures,
     Random,
     autocast,
+    halved,
     on,
     on_device,
-    pictures_of,
     rays_of,
-    to_video,
     with_true_references,
 )
-from gcd_train.live.clips import LiveClip, decode_depth, encode_depth, read_clip, tensor_of
-from gcd_train.live.draws import Poses
-from gcd_train.live.store import CAMERAS, Camera, Numbers, Shelf, TrainingClips, camera_of, room_on
+from gcd_train.live.clips import (
+    CAMERAS,
+    Array,
+    Camera,
+    LiveClip,
+    Numbers,
+    Poses,
+    Shelf,
+    TrainingClips,
+    decode_depth,
+    encode_depth,
+    read_clip,
+    room_on,
+    tensor_of,
+)
 
-Array = NDArray[Any]
 _DEPTH_NOISE = 0.03
-VIEW_ARRAYS = ("source.pose", *(f"target.{name}" for name in ("pose", "rgb", "depth", "labels", "visibility")))
-"""What is read of a clip."""
 INPUTS = ("colour", "coverage", "now_share", "age", "log_depth", "label", "label_share")
-"""What is read of its inputs."""
-_PIXELS = ("target.rgb", "target.depth", "target.labels", "target.visibility")
+"""What is read of a clip's inputs."""
+PIXELS = ("target.rgb", "target.depth", "target.labels", "target.visibility")
+"""What is read of a clip, beside poses."""
 _MOST_CARRIED = 3
 """Frames in a row of which each sees what was painted in the one before."""
 _DRIFT = 0.15
 """Largest standard deviation of the colours' drift, for colours in [-1, 1]."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Geometry:
-    """What is known of a clip's source frames: metres [T, H, W], labels uint8 [T, H, W], static bool [T, H, W]."""
-
-    metres: Tensor
-    labels: Tensor
-    static: Tensor
-
-
 @torch.inference_mode()
-def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Geometry:
-    """By the depth network, where that is."""
+def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Pictures:
+    """Source frames with depth, classes and motion as the depth network has them, computed where that is."""
     device = next(net.parameters()).device
-    source, inputs = on(device, (source, depth_inputs(source.video, source.rays, ground)))
+    there = on(device, source)
     with autocast(device):
-        output = net(inputs, source.sweeps(config.depth))
-    metres = read_depth(output, config.depth).metres
-    return on(
-        torch.device("cpu"),
-        Geometry(metres=metres, labels=output.classes.argmax(1).to(torch.uint8), static=output.moves < 0),
-    )
+        output = net(depth_inputs(there.video, there.rays, ground.to(device)), there.sweeps(config.depth))
+    made = {"labels": output.classes.argmax(1), "moves": (output.moves >= 0).float()}
+    return on(torch.device("cpu"), replace(there, metres=read_depth(output, config.depth).metres, **made))
 
 
-def exact_geometry(source: Pictures, random: Random | None = None) -> Geometry:
-    """The truth; with `random`, off by a few per cent in wide patches, as depth from anywhere is."""
+def roughened(source: Pictures, random: Random) -> Pictures:
+    """Source frames whose depth is off by a few per cent in wide patches, as depth from anywhere is."""
     metres = source.metres
-    if random is not None:
-        rough = torch.from_numpy(random.normal(size=(len(metres), 1, 4, 6)) * _DEPTH_NOISE).float()
-        smooth = torch.nn.functional.interpolate(rough, size=metres.shape[-2:], mode="bilinear")[:, 0]
-        metres = torch.where(metres < SKY_M, metres * smooth.exp(), metres)
-    return Geometry(metres=metres, labels=source.labels.to(torch.uint8), static=source.moves < 0.5)
+    rough = torch.from_numpy(random.normal(size=(len(metres), 1, 4, 6)) * _DEPTH_NOISE).float()
+    smooth = interpolate(rough, size=metres.shape[-2:], mode="bilinear")[:, 0]
+    return replace(source, metres=torch.where(metres < SKY_M, metres * smooth.exp(), metres))
 
 
-def splats_of(clip: LiveClip, geometry: Geometry, config: LiveConfig) -> list[Splat]:
-    """What the target camera of every frame sees of what the source has shown so far."""
-    world = SeenWorld(classes=len(config.classes), capacity=config.memory, oldest_frames=config.memory_frames)
-    source = pictures_of(clip, "source")
-    target_lens = Intrinsics.from_hfov(clip.hfov_deg("target"), source.lenses[0].width, source.lenses[0].height)
+def splats_of(clip: LiveClip, source: Pictures, config: LiveConfig) -> list[Splat]:
+    """What the target camera of every frame sees of what the source has shown so far. source: see the two above."""
+    world, lens = seen_world(config, torch.device("cpu")), clip.lens("target")
+    labels, static = source.labels.to(torch.uint8), source.moves < 0.5
     made: list[Splat] = []
-    for t, lens in enumerate(source.lenses):
-        pose, target = (torch.from_numpy(clip.arrays[f"{camera}.pose"][t]) for camera in ("source", "target"))
-        world.look(source.video[t], geometry.metres[t], geometry.labels[t], geometry.static[t], lens, pose)
-        made.append(world.splat(target, target_lens))
+    for t, (own, pose, target) in enumerate(zip(source.lenses, *map(clip.poses, CAMERAS), strict=True)):
+        world.look(source.video[t], source.metres[t], labels[t], static[t], own, pose)
+        made.append(world.splat(target, lens))
     return made
 
 
@@ -129,13 +121,12 @@ def make_inputs(out: Path, paths: Sequence[Path], net: DepthNet | None, config: 
     """Inputs of clips; net: None for exact depth."""
     for path in paths:
         clip = read_clip(path)
-        source = with_true_references(clip, "source")
-        random = np.random.default_rng([seed, int(path.stem.replace("-", ""))])
+        source, random = with_true_references(clip), np.random.default_rng([seed, int(path.stem.replace("-", ""))])
         if net is None:
-            geometry = exact_geometry(source, random)
+            source = roughened(source, random)
         else:
-            geometry = learned_geometry(net, config, source, source.ground(random, whole=True))
-        write_inputs(out / path.parent.name / path.name, splats_of(clip, geometry, config))
+            source = learned_geometry(net, config, source, source.ground(random, whole=True))
+        write_inputs(out / path.parent.name / path.name, splats_of(clip, source, config))
 
 
 def read_inputs(path: Path, frames: slice, names: Sequence[str] = INPUTS) -> dict[str, Array]:
@@ -148,8 +139,8 @@ def read_inputs(path: Path, frames: slice, names: Sequence[str] = INPUTS) -> dic
 class Views:
     """N target views: what is seen of them and the truth.
 
-    target: [N, 3, H, W] in [-1, 1]. labels: int64, log_depth: float32, visibility: int64, [N, H, W]. poses: N of
-    world_from_target [4, 4]. lenses: N.
+    target: [N, 3, H, W] in [-1, 1]. labels: int64, log_depth: float32, visibility: int64, [N, H, W]. poses:
+    float64 [N, 4, 4], world_from_target. lenses: N.
     """
 
     seen: Seen
@@ -157,16 +148,17 @@ class Views:
     labels: Tensor
     log_depth: Tensor
     visibility: Tensor
-    poses: tuple[Tensor, ...]
+    poses: Tensor
     lenses: tuple[Intrinsics, ...]
 
 
-def views_of(clip: LiveClip, inputs: dict[str, Array], *, ground: bool) -> Views:
-    """The frames that were read of a clip, with what is seen of them."""
-    arrays = {name: tensor_of(array) for name, array in {**clip.arrays, **inputs}.items()}
+def views_of(path: Path, inputs: Path, frames: slice) -> Views:
+    """Some frames of a clip, with what is seen of them as it is stored there, and with a declared floor."""
+    clip = read_clip(path, frames, [*(f"{name}.pose" for name in CAMERAS), *PIXELS])
+    arrays = {name: tensor_of(array) for name, array in (clip.arrays | read_inputs(inputs, frames)).items()}
     sources, targets = (clip.arrays[f"{name}.pose"] for name in CAMERAS)
-    n, *size = clip.arrays["target.labels"].shape
-    return _views(arrays, [camera_of(clip, "target", size)] * n, sources, targets, np.full(n, ground))
+    n = len(targets)
+    return _views(arrays, [clip.camera("target")] * n, sources, targets, np.full(n, True))
 
 
 def _views(
@@ -175,8 +167,8 @@ def _views(
     """arrays: as clips and inputs have them, of N frames. cameras: the targets'; their poses and the sources',
     [N, 4, 4]. ground: bool [N], where it is told.
     """
-    target, lenses = to_video(arrays["target.rgb"]), tuple(camera.lens for camera in cameras)
-    heights = np.maximum([pose[2, 3] - each.floor_z_m for pose, each in zip(targets, cameras, strict=True)], 0.05)
+    target, lenses = to_network(arrays["target.rgb"]), tuple(camera.lens for camera in cameras)
+    heights = [camera.height_m(pose) for camera, pose in zip(cameras, targets, strict=True)]
     rays = rays_of(lenses, target.device)
     floor = plane_depth(rays, on_device(targets[:, 2, :3].copy(), target), on_device(heights, target))
     coverage = arrays["coverage"].float() / 255
@@ -184,7 +176,7 @@ def _views(
     share = (arrays["label_share"].float() / 255 * covered)[:, None]
     votes = torch.zeros(len(target), len(LIVE_CLASSES), *coverage.shape[1:], device=target.device)
     seen = Seen(
-        colour=to_video(arrays["colour"]) * covered[:, None],
+        colour=to_network(arrays["colour"]) * covered[:, None],
         coverage=coverage,
         now_share=arrays["now_share"].float() / 255,
         age=arrays["age"].float() / 10,
@@ -202,35 +194,17 @@ def _views(
         labels=arrays["target.labels"].long(),
         log_depth=decode_depth(arrays["target.depth"]).log(),
         visibility=arrays["target.visibility"].long(),
-        poses=tuple(torch.from_numpy(pose) for pose in targets),
+        poses=torch.from_numpy(targets),
         lenses=lenses,
     )
 
 
-def halved(views: Views) -> Views:
-    """The same at half the size: what can be averaged is; the rest is of one pixel of four."""
-    seen = views.seen
+def halved_views(views: Views) -> Views:
+    """See `halved`; the colours of what is seen count by how much of a pixel it covers."""
+    seen, half = views.seen, halved(views)
     covered = avg_pool2d(seen.coverage[:, None], 2)
-    names = ("coverage", "now_share", "age", "painted_coverage")
-    made = {name: avg_pool2d(getattr(seen, name)[:, None], 2)[:, 0] for name in names}
-    return replace(
-        views,
-        seen=replace(
-            seen,
-            **made,
-            colour=avg_pool2d(seen.colour * seen.coverage[:, None], 2) / covered.clamp(min=1e-6),
-            log_depth=seen.log_depth[:, ::2, ::2],
-            votes=seen.votes[..., ::2, ::2],
-            painted=avg_pool2d(seen.painted, 2),
-            rays=avg_pool2d(seen.rays, 2),
-            ground_m=seen.ground_m[:, ::2, ::2],
-        ),
-        target=avg_pool2d(views.target, 2),
-        labels=views.labels[:, ::2, ::2],
-        log_depth=views.log_depth[:, ::2, ::2],
-        visibility=views.visibility[:, ::2, ::2],
-        lenses=tuple(lens.resized(lens.width // 2, lens.height // 2) for lens in views.lenses),
-    )
+    colour = avg_pool2d(seen.colour * seen.coverage[:, None], 2) / covered.clamp(min=1e-6)
+    return replace(half, seen=replace(half.seen, colour=colour))
 
 
 class InputShelf(Shelf):
@@ -282,11 +256,8 @@ class ViewBatches:
         def views(back: int, count: int) -> Views:
             """The first so many, some frames earlier."""
             times, some = frames[:count] - back, clips[:count]
-            arrays = self._clips.take(some, times, _PIXELS) | self._inputs.take(inputs[:count], times, INPUTS)
-            sources, targets = (
-                np.stack([each.poses[t] for each, t in zip(self._clips.cameras(name, some), times, strict=True)])
-                for name in CAMERAS
-            )
+            arrays = self._clips.take(some, times, PIXELS) | self._inputs.take(inputs[:count], times, INPUTS)
+            sources, targets = (self._clips.poses(name, some, times) for name in CAMERAS)
             return look(_views(arrays, self._clips.cameras("target", some), sources, targets, ground[:count]))
 
         return tuple(views(back, carried) for back in range(run, 0, -1)), views(0, self._size), random
@@ -358,16 +329,8 @@ def carry(painted: Painted, before: Views, now: Views, movable: Tensor) -> Views
     labels = painted.classes.argmax(1)
     for i, (pose, lens) in enumerate(zip(before.poses, before.lenses, strict=True)):
         keep = (before.seen.coverage[i] < 0.5) & ~movable[labels[i]]
-        surfels = unproject(
-            painted.log_depth[i].exp(),
-            painted.picture[i].clamp(-1, 1),
-            labels[i].to(torch.uint8),
-            lens,
-            pose,
-            0.0,
-            painted=True,
-            keep=keep,
-        )
+        metres, picture, label = painted.log_depth[i].exp(), painted.picture[i].clamp(-1, 1), labels[i].to(torch.uint8)
+        surfels = unproject(metres, picture, label, lens, pose, 0.0, painted=True, keep=keep)
         moved = splat(surfels, now.poses[i], now.lenses[i], painted.classes.shape[1], 0.0)
         colours[i], coverages[i] = moved.colour, moved.coverage
     return replace(now, seen=replace(now.seen, painted=colours, painted_coverage=coverages))

@@ -1,27 +1,202 @@
-"""The contact sheet, the camera path in space, and the side-by-side video of a clip."""
+"""A clip as it is shown: what is known of it, its contact sheet, the camera path in space, the side-by-side video."""
 
+import colorsys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from gcd_model.geometry import Intrinsics
+from gcd_train.data.dataset4d import OntologyItem
+from gcd_train.data.pictures import trained_picture
+from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.evaluation.clips import nearest_resized
 from gcd_train.evaluation.galleries import HOLD_S, Strip, beside, write_mp4
 from gcd_train.evaluation.galleries import write_sheet as write_rows
-from gcd_train.look.clip import SKY_M, Bytes, Footage
+from gcd_train.evaluation.predictors import pixel_rays
 from gcd_train.pictures import new_figure, save
+from gcd_train.pointcloud import splat
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 Doubles = NDArray[np.float64]
+Poses = NDArray[np.float64]
+SKY_M = 250.0
+"""Beyond this it is sky: everything that scenes have is nearer."""
+UNSEEN = (255, 106, 0)
+"""Colour of what the input camera did not see."""
+_GOLDEN = 0.61803398875
 _SOURCE_COLOUR, _TARGET_COLOUR, _POINT_COLOUR = "#12873f", "#1c4fd8", "#d42a2a"
 _SHOWN = 6  # frusta along the path
 _POINTS, _CELLS = 6000, 84
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """A clip of T frames, H x W each, from the source camera and from a camera on a path.
+
+    title: layout and scene. folder, path, scene: in words. frame_numbers: of the scene. fps: of the clip. lens: of the
+    pictures shown. views: of the source, of any size, and poses: f64 [T, 4, 4] of the target in their world.
+    target: u8 [T, H, W, 3]. target_is: how it was made, in words. target_depth: f32 [T, H, W] metres, None for a target
+    that was made from points. visible: bool [T, H, W], target pixels that the source camera saw. classes: of the
+    labels, empty where those are instances. instances: their names, as far as known.
+    world_from_source, world_from_target: f64 [T, 4, 4], as they are drawn. look_at: the point the path turns about or
+    ends looking at, or None. world: what the axes x, y, z mean.
+    """
+
+    title: str
+    folder: str
+    path: str
+    scene: str
+    frame_numbers: tuple[int, ...]
+    fps: float
+    source_camera: str
+    lens: Intrinsics
+    views: list[SceneView]
+    poses: Poses
+    target: Bytes
+    target_is: str
+    target_depth: NDArray[np.float32] | None
+    visible: NDArray[np.bool_]
+    classes: tuple[OntologyItem, ...]
+    instances: dict[int, str]
+    world_from_source: Poses
+    world_from_target: Poses
+    look_at: tuple[float, float, float] | None
+    world: str
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.lens.width, self.lens.height
+
+    @cached_property
+    def source(self) -> Bytes:
+        """u8 [T, H, W, 3]."""
+        return np.stack([trained_picture(view.rgb, *self.size) for view in self.views])
+
+    @cached_property
+    def depth(self) -> NDArray[np.float32]:
+        """f32 [T, H, W] metres along the optical axis of the source, 0 where nothing is known."""
+        return np.stack([nearest_resized(view.depth, *self.size) for view in self.views])
+
+    @cached_property
+    def splat(self) -> Bytes:
+        """The source's points alone as the target camera sees them, black where there are none: u8 [T, H, W, 3]."""
+        drawn = [splat([view], at, self.lens).colour for view, at in zip(self.views, self.poses, strict=True)]
+        return (torch.stack(drawn) * 255).round().byte().numpy()
+
+    @cached_property
+    def labels(self) -> NDArray[np.int32] | None:
+        """Ids in the source picture, i32 [T, H, W]; None without any."""
+        ids = [view.classes if self.classes else view.instances for view in self.views]
+        known = [nearest_resized(each, *self.size) for each in ids if each is not None]
+        return np.stack(known).astype(np.int32) if len(known) == len(ids) else None
+
+    @cached_property
+    def names(self) -> dict[int, OntologyItem]:
+        """Of the ids: all classes, or the instances that are seen; 0 is the background of these."""
+        if self.classes or self.labels is None:
+            return {item.id: item for item in self.classes}
+        told = {0: "background"} | self.instances
+        return {
+            i: OntologyItem(id=i, name=told.get(i, f"instance {i}"), colour=_instance_colour(i))
+            for i in np.unique(self.labels).tolist()
+        }
+
+    @property
+    def kind_plural(self) -> str:
+        """The labels in words: classes, instances."""
+        return "classes" if self.classes else "instances"
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Time of each frame since the first, f64 [T]."""
+        return np.arange(len(self.views)) / self.fps
+
+    @property
+    def depth_range_m(self) -> tuple[float, float]:
+        """Nearest and farthest depth but for a hundredth at either end; without sky."""
+        known = self.depth[(self.depth > 0) & (self.depth < SKY_M)]
+        if not known.size:
+            return 0.0, 0.0
+        near, far = np.percentile(known, (1, 99))
+        return float(near), float(far)
+
+    @property
+    def surface(self) -> NDArray[np.bool_]:
+        """Target pixels that show anything but sky, bool [T, H, W]; all where that is unknown."""
+        depth = self.target_depth
+        return np.ones_like(self.visible) if depth is None else (depth > 0) & (depth < SKY_M)
+
+    @property
+    def seen_shares(self) -> NDArray[np.float64]:
+        """Of the target's surfaces, the share that the source camera saw: f64 [T]."""
+        shown = np.maximum(self.surface.sum(axis=(1, 2)), 1)
+        return (self.visible & self.surface).sum(axis=(1, 2)) / shown
+
+    def painted(self) -> Bytes | None:
+        """The labels in their colours, u8 [T, H, W, 3]; None without labels."""
+        if self.labels is None:
+            return None
+        table = np.zeros((max(int(self.labels.max()), *self.names) + 1, 3), np.uint8)
+        for item in self.names.values():
+            table[item.id] = item.colour
+        return table[self.labels]
+
+    def seen(self) -> Bytes:
+        """The target with what the source never saw in orange, u8 [T, H, W, 3]."""
+        grey = self.target.mean(-1, keepdims=True)
+        unseen = (0.35 * grey + 0.65 * np.array(UNSEEN)).astype(np.uint8)
+        return np.where((self.visible | ~self.surface)[..., None], self.target, unseen)
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Name and value with its unit, for the terminal; of labels the share of the source's pixels, largest first."""
+        near, far = self.depth_range_m
+        way = np.linalg.norm(np.diff(self.world_from_target[:, :3, 3], axis=0), axis=1).sum()
+        seen, rule = self.seen_shares, "published rule" if self.target_depth is None else "depths agree within 2 %"
+        facts = [
+            ("folder", self.folder),
+            ("scene", self.scene),
+            (
+                "clip",
+                f"{len(self.views)} frames at {self.fps:g} fps, {self.frame_numbers[0]} to {self.frame_numbers[-1]}",
+            ),
+            ("pictures", f"{self.lens.width} x {self.lens.height} px, hfov {self.lens.hfov_deg:.1f}°"),
+            ("path", self.path),
+            ("path length", f"{way:.1f} m in {self.seconds[-1]:.2f} s"),
+            ("depth", f"{near:.1f} to {far:.1f} m (1st to 99th percentile)"),
+            ("seen", f"{100 * seen.mean():.0f} % of all surfaces, {100 * seen[-1]:.0f} % at the end ({rule})"),
+            ("axes", self.world),
+        ]
+        if self.labels is None:
+            return facts
+        ids, counts = np.unique(self.labels, return_counts=True)
+        shares = sorted(zip(counts / self.labels.size, ids.tolist(), strict=True), key=lambda each: -each[0])
+        told = [f"{self.names[i].name if i in self.names else f'class {i}'} {_percent(share)}" for share, i in shares]
+        return [*facts, (self.kind_plural, ", ".join(told))]
+
+
+def _percent(share: float) -> str:
+    """A share of 0 to 1 in words; what is there is never told as nothing."""
+    return f"{100 * share:.1f} %" if share >= 0.0005 else "< 0.1 %"
+
+
+def _instance_colour(number: int) -> tuple[int, int, int]:
+    """A colour for an instance that its neighbours in number do not have; 0, the background, is light grey."""
+    if number == 0:
+        return (224, 224, 224)
+    lightness = (0.5, 0.62, 0.4)[number % 3]
+    red, green, blue = colorsys.hls_to_rgb((number * _GOLDEN) % 1.0, lightness, 0.75)
+    return round(255 * red), round(255 * green), round(255 * blue)
 
 
 def _draw_trajectory(axes: "Axes3D", footage: Footage) -> None:
@@ -29,12 +204,12 @@ def _draw_trajectory(axes: "Axes3D", footage: Footage) -> None:
     low, high = _box(footage)
     size = 0.085 * float((high - low)[:2].max())
     _points(axes, footage, low, high)
-    for number in np.unique(np.linspace(0, footage.frames - 1, _SHOWN).round().astype(int)):
-        strength = 0.35 + 0.65 * number / max(footage.frames - 1, 1)
+    for number in np.unique(np.linspace(0, len(footage.views) - 1, _SHOWN).round().astype(int)):
+        strength = 0.35 + 0.65 * number / max(len(footage.views) - 1, 1)
         _frustum(axes, footage, footage.world_from_target[number], size, _TARGET_COLOUR, strength)
     _frustum(axes, footage, footage.world_from_source[0], size, _SOURCE_COLOUR, 1.0)
     x, y, z = footage.world_from_target[:, :3, 3].T
-    axes.plot(x, y, z, color=_TARGET_COLOUR, linewidth=2.0, label=f"target, {footage.frames} frames", zorder=5)
+    axes.plot(x, y, z, color=_TARGET_COLOUR, linewidth=2.0, label=f"target, {len(footage.views)} frames", zorder=5)
     axes.scatter(*footage.world_from_target[-1, :3, 3], color=_TARGET_COLOUR, s=20, zorder=5)
     source = footage.world_from_source[0, :3, 3]
     axes.scatter(*source, color=_SOURCE_COLOUR, s=20, label=f"source ({footage.source_camera})", zorder=5)
@@ -50,8 +225,7 @@ def _frustum(
     axes: "Axes3D", footage: Footage, world_from_camera: Doubles, size: float, colour: str, strength: float
 ) -> None:
     """A camera as a pyramid with a roof that says which edge is the upper one."""
-    half_width = np.tan(np.radians(footage.hfov_deg) / 2)
-    half_height = half_width * footage.source.shape[1] / footage.source.shape[2]
+    half_width, half_height = footage.lens.width / 2 / footage.lens.fx, footage.lens.height / 2 / footage.lens.fy
     scale = size / max(half_width, 1.0)  # wide lenses get no larger pyramids
     corners = np.column_stack([_CORNERS * (half_width, half_height), np.ones(4)])
     points = np.vstack([corners, [(0.0, -1.45 * half_height, 1.0)]]) * scale
@@ -65,15 +239,10 @@ def _frustum(
 
 def _points(axes: "Axes3D", footage: Footage, low: Doubles, high: Doubles) -> None:
     """Some of the first frame's points in their colours, those inside the axes."""
-    depth, colour = footage.depth[0], footage.source[0]
-    height, width = depth.shape
-    focal = width / 2 / np.tan(np.radians(footage.hfov_deg) / 2)
-    v, u = np.mgrid[:height, :width] + 0.5
-    rays = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], axis=-1)
-    pose = footage.world_from_source[0]
-    world = (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+    depth, pose = footage.depth[0], footage.world_from_source[0]
+    world = (pixel_rays(footage.lens).numpy() * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
     shown = (depth > 0) & (depth < SKY_M) & ((world >= low) & (world <= high)).all(-1)
-    points, colours = world[shown], colour[shown] / 255.0
+    points, colours = world[shown], footage.source[0][shown] / 255.0
     cells = ((points - low) / (high - low).max() * _CELLS).astype(np.int64) @ (1, _CELLS, _CELLS**2)
     chosen = np.unique(cells, return_index=True)[1]  # one a cell, or near surfaces hide the rest
     chosen = chosen[np.random.default_rng(0).permutation(len(chosen))[:_POINTS]]
@@ -122,29 +291,19 @@ _TURBO = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP
 """RGB of 256 steps from far to near."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Row:
-    """One kind of picture. name, told: what it is. pictures: u8 [T, H, W, 3]."""
-
-    name: str
-    told: str
-    pictures: Bytes
-
-
-def _rows(footage: Footage) -> list[_Row]:
-    """Everything there is to see of a clip, in the order of the sheet."""
-    depth = _depth_colours(footage.depth, *footage.depth_range_m)
+def _rows(footage: Footage) -> list[tuple[str, Strip]]:
+    """Everything there is to see of a clip, in the order of the sheet, each with what it is."""
     rows = [
-        _Row(name="input", told=footage.source_camera, pictures=footage.source),
-        _Row(name="target", told=footage.target_is, pictures=footage.target),
-        _Row(name="splat", told="points of the input", pictures=footage.splat),
-        _Row(name="visibility", told="orange: never seen", pictures=footage.seen()),
-        _Row(name="depth", told="near is red", pictures=depth),
+        (footage.source_camera, Strip.of("input", footage.source)),
+        (footage.target_is, Strip.of("target", footage.target)),
+        ("points of the input", Strip.of("splat", footage.splat)),
+        ("orange: never seen", Strip.of("visibility", footage.seen())),
     ]
     painted = footage.painted()
     if painted is not None:
-        rows.insert(4, _Row(name=footage.kind_plural, told="of the input", pictures=painted))
-    return rows
+        rows.append(("of the input", Strip.of(footage.kind_plural, painted)))
+    depth = _depth_colours(footage.depth, *footage.depth_range_m)
+    return [*rows, ("near is red", Strip.of("depth", depth))]
 
 
 def _depth_colours(depth: NDArray[np.float32], near_m: float, far_m: float) -> Bytes:
@@ -158,7 +317,7 @@ def _depth_colours(depth: NDArray[np.float32], near_m: float, far_m: float) -> B
 
 def write_sheet(footage: Footage, out: Path) -> None:
     """All kinds of pictures, one below the other, as PNG. Raises RunError where it cannot be written."""
-    write_rows([(row.told, [Strip.of(row.name, row.pictures)]) for row in _rows(footage)], out)
+    write_rows([(told, [strip]) for told, strip in _rows(footage)], out)
 
 
 def write_trajectory(footage: Footage, out: Path) -> None:
@@ -168,20 +327,15 @@ def write_trajectory(footage: Footage, out: Path) -> None:
     _draw_trajectory(axes, footage)
     axes.legend(loc="upper left", fontsize=8, frameon=False)
     figure.text(0.03, 0.95, f"{footage.title}: camera path", fontsize=12, fontweight="bold", color=_INK)
-    figure.text(0.03, 0.92, footage.path.replace(",\n", ", ").replace("\n", ", "), fontsize=8.5, color=_FAINT)
+    figure.text(0.03, 0.92, footage.path, fontsize=8.5, color=_FAINT)
     figure.text(0.03, 0.89, footage.world, fontsize=8.5, color=_FAINT)
     save(figure, out)
 
 
-def percent(share: float) -> str:
-    """A share of 0 to 1 in words; what is there is never told as nothing."""
-    return f"{100 * share:.1f} %" if share >= 0.0005 else "< 0.1 %"
-
-
 def write_video(footage: Footage, out: Path) -> None:
     """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2). Raises RunError if it cannot be written."""
-    strips = [Strip.of(row.name, row.pictures) for row in _rows(footage)]
-    moments = [*range(footage.frames), *[footage.frames - 1] * round(HOLD_S * footage.fps)] * 2
+    strips = [strip for _, strip in _rows(footage)]
+    moments = [*range(len(footage.views)), *[len(footage.views) - 1] * round(HOLD_S * footage.fps)] * 2
     write_mp4((_video_frame(footage, strips, moment) for moment in moments), footage.fps, out)
 
 

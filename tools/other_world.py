@@ -1,6 +1,6 @@
 """Does a live model know that a camera shows another world? Its score on held-out clips beside that on real videos.
 
-python -m gcd_train.live.other_world --heldout DIR --videos DIR [FILE ...] --weights FILE --out OUT
+python tools/other_world.py --heldout DIR --videos DIR [FILE ...] --weights FILE --out OUT
 """
 
 import argparse
@@ -9,15 +9,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.eyes import Eyes
 from gcd_model.live.synthesizer import LiveSynthesizer
-from gcd_train.live.batches import to_video
+from gcd_train.data.sample import to_network
 from gcd_train.live.clips import clip_paths, evenly, read_clip
-from gcd_train.live.measure_methods import live_model
-from gcd_train.look.real_video import WindowChoice, find_videos, read_windows
+from gcd_train.live.measure import live_model
+from gcd_train.look.gallery import WindowChoice, find_videos, read_windows
 
 _ASSUMED_HFOV_DEG = 70.0
 """Of a video whose lens nobody knows."""
@@ -29,9 +30,9 @@ def score(synthesizer: LiveSynthesizer, video: Tensor, lens: Intrinsics) -> floa
     return float(np.mean([eyes.see(frame, lens=lens).geometry.ood for frame in video]))
 
 
-def auc(known: Sequence[float], other: Sequence[float]) -> float:
+def auc(known: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """How often a score of another world is above one of the known world; ties count half."""
-    wins = np.subtract.outer(np.asarray(other), np.asarray(known))
+    wins = np.subtract.outer(other, known)
     return float(((wins > 0) + 0.5 * (wins == 0)).mean())
 
 
@@ -41,9 +42,7 @@ def known_scores(synthesizer: LiveSynthesizer, folder: Path, clips: int) -> Iter
         paths = sorted(world.glob("*.safetensors"))
         for path in evenly(paths, clips):
             clip = read_clip(path, names=["source.rgb"])
-            video = to_video(clip.arrays["source.rgb"])
-            lens = Intrinsics.from_hfov(clip.hfov_deg("source"), video.shape[-1], video.shape[-2])
-            yield f"{world.name}/{path.stem}", score(synthesizer, video, lens)
+            yield clip.name, score(synthesizer, to_network(clip.arrays["source.rgb"]), clip.lens("source"))
 
 
 def other_scores(synthesizer: LiveSynthesizer, paths: Sequence[Path], windows: int) -> Iterator[tuple[str, float]]:
@@ -52,7 +51,7 @@ def other_scores(synthesizer: LiveSynthesizer, paths: Sequence[Path], windows: i
     lens = Intrinsics.from_hfov(_ASSUMED_HFOV_DEG, traits.config.width, traits.config.height)
     for video in find_videos(paths):
         for window in read_windows(video, traits, WindowChoice(count=windows)):
-            yield f"{window.name} at {window.start_s:.1f} s", score(synthesizer, to_video(window.pictures), lens)
+            yield f"{window.name} at {window.start_s:.1f} s", score(synthesizer, to_network(window.pictures), lens)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -69,17 +68,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     model = live_model(options.weights)
     known = dict(known_scores(model, options.heldout, options.clips))
     other = dict(other_scores(model, options.videos, options.windows))
+    of_known, of_other = np.array(list(known.values())), np.array(list(other.values()))
     threshold = model.networks.config.ood_threshold
-    told = {
-        "auc": auc(list(known.values()), list(other.values())),
+    figures = {
+        "auc": auc(of_known, of_other),
         "threshold": threshold,
-        "known_above": float(np.mean(np.asarray(list(known.values())) > threshold)),
-        "other_above": float(np.mean(np.asarray(list(other.values())) > threshold)),
-        "known": known,
-        "other": other,
+        "known_above": float((of_known > threshold).mean()),
+        "other_above": float((of_other > threshold).mean()),
     }
-    options.out.write_text(json.dumps(told, indent=1))
-    print(json.dumps({name: value for name, value in told.items() if isinstance(value, float)}))
+    options.out.write_text(json.dumps({**figures, "known": known, "other": other}, indent=1))
+    print(json.dumps(figures))
 
 
 if __name__ == "__main__":

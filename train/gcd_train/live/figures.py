@@ -5,6 +5,7 @@ judged by a network of random weights: pictures need not agree pixel by pixel, b
 that its features, averaged over cells of 16 x 16 pixels, are as in the truth.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +19,9 @@ from torch import Tensor, nn
 
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import Intrinsics, invert_rigid
+from gcd_train.data.sample import to_network
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix, gradient_map, psnr, ssim_map, window_mask
-from gcd_train.evaluation.predictors import pixel_rays
-from gcd_train.live.batches import to_video
+from gcd_train.evaluation.predictors import pixel_rays, to_pixels
 from gcd_train.live.clips import LiveClip
 
 NEVER, BEFORE, NOW = 0, 1, 2
@@ -75,20 +76,13 @@ class MethodViews:
 
 def truth_of(clip: LiveClip) -> Truth:
     """Of a whole clip."""
-    arrays = clip.arrays
-    height, width = arrays["target.labels"].shape[1:]
-    lens = Intrinsics.from_hfov(clip.hfov_deg("target"), width, height)
-    before, static = surface_motion(
-        torch.from_numpy(clip.depth("target")),
-        torch.from_numpy(arrays["target.moves"] > 0),
-        torch.from_numpy(arrays["target.pose"]),
-        lens,
-    )
-    video = (to_video(arrays["target.rgb"]) + 1) / 2
+    moves = torch.from_numpy(clip.arrays["target.moves"] > 0)
+    before, static = surface_motion(clip.depth("target"), moves, clip.poses("target"), clip.lens("target"))
+    video = (to_network(clip.arrays["target.rgb"]) + 1) / 2
     return Truth(
         video=video,
-        labels=torch.from_numpy(arrays["target.labels"]),
-        visibility=torch.from_numpy(arrays["target.visibility"]),
+        labels=torch.from_numpy(clip.arrays["target.labels"]),
+        visibility=torch.from_numpy(clip.arrays["target.visibility"]),
         before=before,
         static=static,
         gradient=gradient_map(video[1:]),
@@ -106,13 +100,8 @@ def surface_motion(metres: Tensor, moves: Tensor, poses: Tensor, lens: Intrinsic
     points = pixel_rays(lens) * metres[1:, ..., None].double()  # [T-1, H, W, 3]
     turned = torch.einsum("tij,thwj->thwi", then_from_now[:, :3, :3], points) + then_from_now[:, None, None, :3, 3]
     z = turned[..., 2].clamp(min=1e-3)
-    place = torch.stack(
-        [
-            (turned[..., 0] / z * lens.fx + lens.cx) * 2 / lens.width - 1,
-            (turned[..., 1] / z * lens.fy + lens.cy) * 2 / lens.height - 1,
-        ],
-        dim=-1,
-    ).float()
+    size = torch.tensor([lens.width, lens.height], dtype=torch.float64)
+    place = (to_pixels(torch.cat([turned[..., :2], z[..., None]], dim=-1), lens) * 2 / size - 1).float()
     facts = torch.stack([metres[:-1], moves[:-1].float()], dim=1)
     there = F.grid_sample(facts, place, mode="nearest", align_corners=False)
     same = (there[:, 0] / turned[..., 2] - 1).abs() < _SAME_SURFACE
@@ -155,7 +144,8 @@ class Tally:
 
     def __init__(self, classes: Sequence[SemanticClass]) -> None:
         self._names = [entry.name for entry in classes]
-        self._sums: defaultdict[str, float] = defaultdict(float)
+        self._sums: defaultdict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
+        """What is summed up, and of how many, by figure."""
         self._confusion = torch.zeros(len(classes), len(classes), dtype=torch.int64)
         self._states = torch.zeros(3, 3, dtype=torch.int64)
         self._views, self._truths = Moments(), Moments()
@@ -168,17 +158,25 @@ class Tally:
 
         splat: [T, 3, H, W], the exact splat's video, whose error seen pixels are compared to.
         """
-        never = truth.visibility[1:] == NEVER
-        made, true = views.video[1:], truth.video[1:]
-        quality = psnr(made, true)
+        never, made, true = truth.visibility[1:] == NEVER, views.video[1:], truth.video[1:]
+        quality, likeness = psnr(made, true), ssim_map(made, true)
         self.psnr[scene].append(float(quality.mean()))
         self._mean("psnr", quality)
-        likeness = ssim_map(made, true)
         self._mean("ssim", likeness)
         self._mean("ssim_seen", likeness, window_mask(~never))
-        self._add_errors(made, true, splat[1:], never)
-        self._add_never(made, truth, never)
-        self._add_time(views.video, truth)
+        for name, mask in (("seen", ~never), ("never", never)):
+            self._mean(f"share_{name}", mask.float())
+            self._mean(f"square_{name}", (made - true).square().mean(dim=1), mask)
+            self._mean(f"splat_{name}", (splat[1:] - true).square().mean(dim=1), mask)
+        inside = F.max_pool2d((~never).float(), 3, 1, 1) == 0  # pixels whose eight neighbours were not seen, either
+        self._mean("gradient_made", gradient_map(made), inside)
+        self._mean("gradient_true", truth.gradient, inside)
+        judged = F.avg_pool2d(never.float(), _CELL) >= _FULL_CELL
+        self._views.add(cells(made)[judged])
+        self._truths.add(truth.features[judged])
+        for name, video in (("made", views.video), ("true", truth.video)):
+            self._mean(f"flicker_{name}", _flicker(video, truth)[1:], truth.static[1:])
+            self._mean(f"jump_{name}", (video[2:] - video[1:-1]).abs())
         if views.classes is not None:
             self._confusion += confusion_matrix(views.classes[1:], truth.labels[1:], len(self._names))
         if views.visibility is not None:
@@ -188,77 +186,41 @@ class Tally:
 
     def _mean(self, name: str, values: Tensor, weights: Tensor | None = None) -> None:
         """Count values into the mean of a figure."""
-        self._sums[f"{name}/sum"] += float((values if weights is None else values * weights).sum())
-        self._sums[f"{name}/count"] += float(values.numel() if weights is None else weights.sum())
-
-    def _read(self, name: str) -> float:
-        count = self._sums[f"{name}/count"]
-        return self._sums[f"{name}/sum"] / count if count else float("nan")
-
-    def _add_errors(self, made: Tensor, true: Tensor, splat: Tensor, never: Tensor) -> None:
-        for name, mask in (("seen", ~never), ("never", never)):
-            self._mean(f"share_{name}", mask.float())
-            self._mean(f"square_{name}", (made - true).square().mean(dim=1), mask)
-            self._mean(f"splat_{name}", (splat - true).square().mean(dim=1), mask)
-
-    def _add_never(self, made: Tensor, truth: Truth, never: Tensor) -> None:
-        inside = _eroded(never)
-        self._mean("gradient_made", gradient_map(made), inside)
-        self._mean("gradient_true", truth.gradient, inside)
-        judged = F.avg_pool2d(never.float(), _CELL) >= _FULL_CELL
-        self._views.add(cells(made)[judged])
-        self._truths.add(truth.features[judged])
-
-    def _add_time(self, video: Tensor, truth: Truth) -> None:
-        self._mean("flicker_made", _flicker(video, truth)[1:], truth.static[1:])
-        self._mean("flicker_true", _flicker(truth.video, truth)[1:], truth.static[1:])
-        for name, pictures in (("jump_made", video), ("jump_true", truth.video)):
-            self._mean(name, (pictures[2:] - pictures[1:-1]).abs())
+        sums = self._sums[name]
+        sums[0] += float((values if weights is None else values * weights).sum())
+        sums[1] += float(values.numel() if weights is None else weights.sum())
 
     def figures(self) -> dict[str, float]:
         """All of them by name; NaN for what the method does not say, or what does not occur in the set."""
-        read = self._read
-        made = {name: read(name) for name in ("psnr", "ssim", "ssim_seen")}
+        means = {name: total / count if count else math.nan for name, (total, count) in self._sums.items()}
+        made = {name: means[name] for name in ("psnr", "ssim", "ssim_seen", "share_seen", "share_never")}
         for name in ("seen", "never"):
-            made[f"share_{name}"] = read(f"share_{name}")
-            made[f"psnr_{name}"] = -10 * float(np.log10(max(read(f"square_{name}"), 1e-10)))
-        made["error_ratio_seen"] = read("square_seen") / max(read("splat_seen"), 1e-10)
-        made["gradient_energy"] = read("gradient_made") / max(read("gradient_true"), 1e-10)
+            made[f"psnr_{name}"] = -10 * math.log10(max(means[f"square_{name}"], 1e-10))
+        for name, of, by in (
+            ("error_ratio_seen", "square_seen", "splat_seen"),
+            ("gradient_energy", "gradient_made", "gradient_true"),
+            ("flicker", "flicker_made", "flicker_true"),
+            ("jump", "jump_made", "jump_true"),
+        ):
+            made[name] = means[of] / max(means[by], 1e-10)
         made["frechet_random"] = frechet_distance(self._views, self._truths)
         iou = np.array(_occurring_iou(self._confusion))
-        made["miou"] = float(np.nanmean(iou)) if np.isfinite(iou).any() else float("nan")
+        made["miou"] = float(np.nanmean(iou)) if np.isfinite(iou).any() else math.nan
         made |= {name: float(iou[self._names.index(name)]) for name in NAMED_CLASSES}
         made |= {f"iou_{name}": iou for name, iou in zip(STATES, _occurring_iou(self._states), strict=True)}
         made |= {f"inside_90_{name}": share for name, share in zip(STATES, self.spread.coverage, strict=True)}
-        for name in ("flicker", "jump"):
-            made[name] = read(f"{name}_made") / max(read(f"{name}_true"), 1e-10)
         return made
 
 
 def _occurring_iou(confusion: Tensor) -> list[float]:
     """IoU of each class that occurs in the truth, NaN for others; all NaN where nothing was said."""
-    return torch.where(confusion.sum(1) > 0, class_iou(confusion), float("nan")).tolist()
-
-
-def _eroded(mask: Tensor) -> Tensor:
-    """Pixels of a mask [T, H, W] whose eight neighbours are in it, too."""
-    return F.max_pool2d((~mask).float(), 3, 1, 1) == 0
+    return torch.where(confusion.sum(1) > 0, class_iou(confusion), math.nan).tolist()
 
 
 def _flicker(video: Tensor, truth: Truth) -> Tensor:
     """How much each pixel's surface has changed its colour since the frame before: [T-1, H, W]."""
     then = F.grid_sample(video[:-1], truth.before, mode="bilinear", padding_mode="border", align_corners=False)
     return (video[1:] - then).abs().mean(dim=1)
-
-
-def scene_interval(differences: Sequence[float], draws: int = 4000, seed: int = 0) -> tuple[float, float]:
-    """The 95 % interval of the mean over scenes, by drawing scenes anew; NaN for none."""
-    if not differences:
-        return float("nan"), float("nan")
-    values, random = np.array(differences), np.random.default_rng(seed)
-    means = values[random.integers(len(values), size=(draws, len(values)))].mean(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)
 
 
 @cache
@@ -307,7 +269,7 @@ def frechet_distance(views: Moments, truths: Moments) -> float:
     Source: Dowson and Landau 1982; Heusel et al. 2017, with features of our own.
     """
     if min(views.count, truths.count) < 2 * _FEATURES:
-        return float("nan")
+        return math.nan
     mean, covariance = views.gaussian
     true_mean, true_covariance = truths.gaussian
     scale = true_covariance.diagonal().clamp(min=1e-12).rsqrt()

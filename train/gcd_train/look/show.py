@@ -1,4 +1,4 @@
-"""From a path to the clip that is shown: of a scene in one of the published layouts, or of pair shards."""
+"""`gcd-train show`: from a path to the clip that is shown, of a scene in a published layout or of pair shards."""
 
 import os
 import zipfile
@@ -21,12 +21,11 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
-from gcd_train.data.pictures import frames_of, geometry_poses, renderer_kind, trained_picture
-from gcd_train.data.sample import SceneView
+from gcd_train.data.pictures import frames_of, geometry_poses, renderer_kind
+from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.errors import DataError, RecipeError, RenderError
-from gcd_train.evaluation.clips import nearest_resized
-from gcd_train.look.clip import Bytes, Footage, Poses, instance_colour
-from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, splat, visibility
+from gcd_train.look.sheet import Footage, Poses
+from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, visibility
 
 _WIDTH = 384
 _SHAPE = 1.5  # of the trained pictures
@@ -96,37 +95,31 @@ def _data_set(path: Path) -> Dataset4D:
 
 def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     """A clip of a scene. Raises: FileFault naming the file that cannot be read, RecipeError for frames that are not."""
-    on_sphere = isinstance(data, Kubric4D)
-    numbers, stride = _frame_numbers(data.frames(scene), KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, options)
+    on_sphere, folder, every = isinstance(data, Kubric4D), data.folder(scene), data.frames(scene)
+    numbers, stride = _frame_numbers(every, KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, options)
     views = [data.views(scene, number, [data.source_camera])[0] for number in numbers]
     width = min(_WIDTH, views[0].lens.width)
-    size = (width, round(width / _SHAPE))
-    lens = render_lens(views[0].lens, *size)
-    pose = views[0].world_from_camera
+    lens, pose = render_lens(views[0].lens, width, round(width / _SHAPE)), views[0].world_from_camera
     still, poses, path = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
     target, target_depth, target_is = _target(data, scene, numbers, poses, lens, exact=options.exact)
-    labels, kind, names = _labels(data, scene, views, size)
+    classed = data.ontology is not None and all(view.classes is not None for view in views)
     return Footage(
-        title=_title(data.folder(scene), "Kubric-4D" if on_sphere else "ParallelDomain-4D"),
-        layout=str(data.folder(scene)),
+        title=_title(folder, "Kubric-4D" if on_sphere else "ParallelDomain-4D"),
+        folder=str(folder),
         path=path,
+        scene=f"{every} frames at {data.fps:g} fps, {len(data.cameras)} cameras",
         frame_numbers=numbers,
         fps=data.fps / stride,
-        scene_frames=data.frames(scene),
-        scene_fps=data.fps,
-        cameras=tuple(data.cameras),
         source_camera=data.source_camera,
-        hfov_deg=lens.hfov_deg,
-        source=np.stack([trained_picture(view.rgb, *size) for view in views]),
+        lens=lens,
+        views=views,
+        poses=poses,
         target=target,
         target_is=target_is,
         target_depth=target_depth,
-        splat=_splatted(views, poses, lens),
         visible=_visible(views, target_depth, poses, lens),
-        labels=labels,
-        kind=kind,
-        names=names,
-        depth=np.stack([nearest_resized(view.depth, *size) for view in views]),
+        classes=data.ontology.items if classed and data.ontology is not None else (),
+        instances={} if classed else _asset_names(data, folder),
         world_from_source=np.repeat(still[None], len(numbers), axis=0),
         world_from_target=poses,
         look_at=LOOK_AT if on_sphere else DRIVING_GOAL_TARGET,
@@ -159,7 +152,7 @@ def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> tu
     change = MAX90.change(generator(seed, 1), start)
     path = spherical_trajectory(start, change, frames=frames, move_time=frames - 1)
     words = (
-        f"azimuth {change.azimuth_deg:+.1f}°, elevation {change.elevation_deg:+.1f}°,\n"
+        f"azimuth {change.azimuth_deg:+.1f}°, elevation {change.elevation_deg:+.1f}°, "
         f"radius {change.radius_m:+.1f} m, from {start.azimuth_deg:.0f}°, {start.elevation_deg:.0f}°, "
         f"{start.radius_m:.1f} m"
     )
@@ -171,7 +164,7 @@ def _drive(frames: int) -> tuple[Poses, Poses, str]:
     draw = replace(DRIVING, frames=FrameSampling(clip=frames, reach_last=True)).draw(generator(0, 0), frames, 1.0)
     from_x, _, from_z = draw.world_from_target[0, :3, 3]
     to_x, _, to_z = draw.world_from_target[-1, :3, 3]
-    words = f"up and back at a sine pace\nx {from_x:.1f} to {to_x:.1f} m, z {from_z:.2f} to {to_z:.2f} m"
+    words = f"up and back at a sine pace, x {from_x:.1f} to {to_x:.1f} m, z {from_z:.2f} to {to_z:.2f} m"
     return draw.world_from_source, draw.world_from_target, words
 
 
@@ -187,20 +180,14 @@ def _target(
             with renderer_kind()(lens.width, lens.height, oversample=1) as renderer:
                 views = [view for _, _, view in renderer.views(still, cameras)]
             colour, depth = np.stack([view.rgb for view in views]), np.stack([view.depth for view in views])
-            return colour, depth, "rendered from the\nscene's geometry"
+            return colour, depth, "rendered from the scene's geometry"
         except RenderError:
             pass  # no renderer on this machine; points need none
     every = [
         published_picture(data.views(scene, number), at, lens, width=lens.width, height=lens.height)
         for number, at in zip(numbers, poses, strict=True)
     ]
-    return np.stack(every), None, f"points of all\n{len(data.cameras)} cameras"
-
-
-def _splatted(views: list[SceneView], poses: Poses, lens: Intrinsics) -> Bytes:
-    """Each view's points alone as the target camera sees them, u8 [T, H, W, 3]."""
-    drawn = [splat([view], at, lens).colour for view, at in zip(views, poses, strict=True)]
-    return (torch.stack(drawn) * 255).round().byte().numpy()
+    return np.stack(every), None, f"points of all {len(data.cameras)} cameras"
 
 
 def _visible(
@@ -237,32 +224,14 @@ class _Assets(msgspec.Struct, frozen=True):
     instances: tuple[_Asset, ...] = ()
 
 
-def _labels(
-    data: Dataset4D, scene: str, views: list[SceneView], size: tuple[int, int]
-) -> tuple[NDArray[np.int32] | None, str, tuple[OntologyItem, ...]]:
-    """Ids over time, whether they are classes or instances, and their names."""
-    classes = [view.classes for view in views if view.classes is not None]
-    if data.ontology is not None and len(classes) == len(views):
-        return np.stack([nearest_resized(ids, *size) for ids in classes]).astype(np.int32), "class", data.ontology.items
-    found = [view.instances for view in views if view.instances is not None]
-    if len(found) < len(views):
-        return None, "class", ()
-    labels = np.stack([nearest_resized(ids, *size) for ids in found]).astype(np.int32)
-    path = kubric4d.metadata_path(data.folder(scene), data.source_camera)
+def _asset_names(data: Dataset4D, folder: Path) -> dict[int, str]:
+    """What a Kubric scene calls its instances."""
+    path = kubric4d.metadata_path(folder, int(data.source_camera.removeprefix("view") or 0))
     try:
         assets = read_json(path, _Assets, MOST_TEXT).instances
     except FileError:
-        assets = ()  # names are decoration; the reader has checked what matters in this file
-    names = {i: f"{asset.asset_id} ({i})" for i, asset in enumerate(assets, 1) if asset.asset_id}
-    return labels, "instance", _instances(labels, {0: "background"} | names)
-
-
-def _instances(labels: NDArray[Any], names: dict[int, str]) -> tuple[OntologyItem, ...]:
-    """Those that are seen; 0 is the background."""
-    return tuple(
-        OntologyItem(id=i, name=names.get(i, f"instance {i}"), colour=instance_colour(i))
-        for i in np.unique(labels).tolist()
-    )
+        return {}  # names are decoration; the reader has checked what matters in this file
+    return {i: f"{asset.asset_id} ({i})" for i, asset in enumerate(assets, 1) if asset.asset_id}
 
 
 def _pair_clip(path: Path, seed: int | None) -> Footage:
@@ -274,56 +243,63 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
     if seed is None and path.suffix == ".zip" and (number := path.stem.split("-")[1:2]) and number[0].isdecimal():
         seed = int(number[0])
     clips = PairedClips.open(folder)
-    seeds = list(clips.seeds)
-    if seed is not None and seed not in seeds:
-        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(seeds)}, {seeds[0]} to {seeds[-1]}")
-    index = 0 if seed is None else seeds.index(seed)
-    clip, shard, steps = clips[index], clips.places[index][0], tuple(range(clips.frames))
-    sources, targets = _pair_poses(*clips.places[index])
+    index = _clip_number(folder, clips, seed)
+    clip, (shard, name), numbers = clips[index], clips.places[index], tuple(range(clips.frames))
+    sources, targets = _pair_poses(shard, name)
     lens = Intrinsics.from_hfov(clips.world.hfov_deg, clips.width, clips.height)
     views = [
-        SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=pose, lens=lens)
-        for rgb, depth, pose in zip(clip.source, clip.source_depth, sources, strict=True)
+        SceneView(
+            rgb=clip.source[t],
+            depth=clip.source_depth[t],
+            classes=clip.source_classes[t] if clips.classes else None,
+            instances=clip.source_instances[t].astype(np.uint16),
+            world_from_camera=sources[t],
+            lens=lens,
+        )
+        for t in numbers
     ]
-    labels = (clip.source_classes if clips.classes else clip.source_instances).astype(np.int32)
-    classes = (OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes))
-    shown = Footage(
+    world_from_source, world_from_target = sources, targets
+    if clips.mount is None:
+        orbit = clips.orbit(index)
+        azimuth_deg, elevation_deg, radius_m = orbit.change
+        path = f"{azimuth_deg:+.1f}° azimuth, {elevation_deg:+.1f}° elevation, {radius_m:+.1f} m radius, gradual"
+        numbers = orbit.frame_numbers
+    else:
+        path, vehicle_from_source = (
+            "the driving path, up and back at a sine pace",
+            clips.mount.vehicle_from_camera.numpy(),
+        )
+        world_from_source = np.repeat(vehicle_from_source[None], clips.frames, axis=0)
+        world_from_target = vehicle_from_source @ np.linalg.inv(sources) @ targets
+    return Footage(
         title=f"pair shard, {_world_name(clips.world.name)}, seed {clip.seed}",
-        layout=str(shard),
-        path="the driving path, up and back\nat a sine pace",
-        frame_numbers=steps,
+        folder=str(shard),
+        path=path,
+        scene=f"{numbers[-1] + 1} frames at {clips.fps * clips.world.stride:g} fps, 2 cameras",
+        frame_numbers=numbers,
         fps=clips.fps,
-        scene_frames=clips.frames,
-        scene_fps=clips.fps * clips.world.stride,
-        cameras=("source", "target"),
         source_camera="source",
-        hfov_deg=lens.hfov_deg,
-        source=clip.source,
+        lens=lens,
+        views=views,
+        poses=targets,
         target=clip.target,
         target_is="rendered exactly",
         target_depth=clip.target_depth,
-        splat=_splatted(views, targets, lens),
         visible=_visible(views, clip.target_depth, targets, lens),
-        labels=labels,
-        kind="class" if clips.classes else "instance",
-        names=tuple(classes) or _instances(labels, {0: "background"}),
-        depth=clip.source_depth,
-        world_from_source=sources,
-        world_from_target=targets,
+        classes=tuple(OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes)),
+        instances={},
+        world_from_source=world_from_source,
+        world_from_target=world_from_target,
         look_at=LOOK_AT if clips.mount is None else DRIVING_GOAL_TARGET,
         world=_STAGE if clips.mount is None else _VEHICLE,
     )
-    if clips.mount is not None:
-        vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
-        return replace(
-            shown,
-            world_from_source=np.repeat(vehicle_from_source[None], clips.frames, axis=0),
-            world_from_target=vehicle_from_source @ np.linalg.inv(sources) @ targets,
-        )
-    orbit = clips.orbit(index)
-    azimuth_deg, elevation_deg, radius_m = orbit.change
-    words = f"{azimuth_deg:+.1f}° azimuth, {elevation_deg:+.1f}° elevation,\n{radius_m:+.1f} m radius, gradual"
-    return replace(shown, path=words, frame_numbers=orbit.frame_numbers, scene_frames=orbit.frame_numbers[-1] + 1)
+
+
+def _clip_number(folder: Path, clips: PairedClips, seed: int | None) -> int:
+    if seed is not None and seed not in clips.seeds:
+        low, high = clips.seeds[0], clips.seeds[-1]
+        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(clips)}, {low} to {high}")
+    return 0 if seed is None else clips.seeds.index(seed)
 
 
 def _pair_poses(shard: Path, name: str) -> tuple[Poses, Poses]:
