@@ -211,9 +211,9 @@ def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tupl
         raise RecipeError("Kubric-4D has no classes: leave out --modality semantic")
     cameras = tuple(options.camera or (kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS))
     whole = (
-        Kubric4D.open(folder, cameras=cameras, published=released)
+        Kubric4D(folder, cameras=cameras, published=released)
         if orbits
-        else ParallelDomain4D.open(folder, cameras=cameras, classes=painted)
+        else ParallelDomain4D(folder, cameras=cameras, classes=painted)
     )
     sampling = _sampling(options, size[0], orbits=orbits, gradual=gradual)
     controls = _controls(options, whole.scenes, sampling)
