@@ -61,16 +61,6 @@ def taken_apart(tensor: Tensor, source: Source) -> dict[str, Tensor]:
     return {source.names[0]: tensor[:, :, 0, 0].contiguous() if source.form == "pixelwise" else tensor.clone()}
 
 
-def from_diffusers_unet(weights: Mapping[str, Tensor], unet: VideoUNet) -> dict[str, Tensor]:
-    """The other way: diffusers' weights under the names of `unet`."""
-    levels, ours = levels_of(unet=unet.config), dict[str, Tensor]()
-    for name in unet.state_dict():
-        source = diffusers_source(f"unet.{name}", levels)
-        assert source is not None
-        ours[name] = weights[source.names[0].removeprefix("unet/")]
-    return ours
-
-
 def on_meta(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The same shapes without storage (weights that never leave the host included)."""
     return {name: torch.empty_like(value, device="meta") for name, value in weights.items()}

@@ -9,7 +9,7 @@ from gcd_model.clip import Clip, View
 from gcd_model.config import ImageEncoderConfig, ModelConfig, SamplingConfig, SemanticClass, UNetConfig, VAEConfig
 from gcd_model.diffusion import RenderOptions
 from gcd_model.geometry import Trajectory
-from gcd_model.networks import Networks
+from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.weights.families import DRIVING_SEMANTIC, KUBRIC90
@@ -123,7 +123,7 @@ def give_published_epsilon(diffusers_unet: nn.Module) -> int:
     return changed
 
 
-def tiny_traits(config: ModelConfig = TINY) -> Traits:
+def tiny_traits(config: ModelConfig = TINY, *, precision: str = "float32", device: str = "cpu") -> Traits:
     """Traits of a gradual Kubric-4D checkpoint with limits of 90 and 30 degrees."""
     return Traits(
         name="tiny",
@@ -131,8 +131,8 @@ def tiny_traits(config: ModelConfig = TINY) -> Traits:
         family=KUBRIC90,
         move_time=config.frames - 1,
         sha256_12="0" * 12,
-        precision="float32",
-        device="cpu",
+        precision=precision,
+        device=device,
         trained=False,
     )
 
@@ -150,6 +150,19 @@ def tiny_driving(config: ModelConfig = TINY_DRIVING, seed: int = 0) -> Synthesiz
     networks = Networks(config)
     randomise(networks, seed)
     return Synthesizer(networks, replace(tiny_traits(config), name="tiny-driving", family=DRIVING_SEMANTIC))
+
+
+def loaded(synthesizer: Synthesizer) -> LoadedWeights:
+    """The same as it comes from a file."""
+    traits = synthesizer.traits
+    return LoadedWeights(
+        name=traits.name,
+        networks=synthesizer.networks,
+        family=traits.family,
+        move_time=traits.move_time,
+        trained=False,
+        sha256_12=traits.sha256_12,
+    )
 
 
 def synthesize(synthesizer: Synthesizer, clip: Clip, path: Trajectory, options: RenderOptions | None = None) -> View:

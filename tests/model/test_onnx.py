@@ -6,7 +6,7 @@ import msgspec
 import pytest
 import torch
 from msgspec import structs
-from small_models import TINY, random_clip, relative_error, tiny_synthesizer
+from small_models import TINY, loaded, random_clip, relative_error, tiny_synthesizer
 from torch import Tensor
 
 from gcd_model.diffusion import RenderOptions, SolverName
@@ -27,8 +27,7 @@ from gcd_model.loading import load_synthesizer
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import KUBRIC90
-from gcd_model.weights.load import LoadedWeights, digest
+from gcd_model.weights.load import digest
 
 
 class TorchGraphs:
@@ -227,26 +226,19 @@ def test_onnxruntime_runs_nothing_but_exports(options: dict[str, object]) -> Non
         load_synthesizer("random:kubric90", **options)
 
 
-def tiny_weights() -> LoadedWeights:
-    networks = tiny_synthesizer().networks
-    return LoadedWeights(
-        name="tiny", networks=networks, family=KUBRIC90, move_time=2, trained=False, sha256_12="0" * 12
-    )
-
-
 @pytest.mark.parametrize(("out", "options"), [("mine", {}), ("mine", {"overwrite": True}), ("no/where", {})])
 def test_nothing_is_written_over_that_is_no_export_or_into_nowhere(
     tmp_path: Path, out: str, options: dict[str, bool]
 ) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(OptionError):
-        export_onnx(tiny_weights(), tmp_path / out, **options)
+        export_onnx(loaded(tiny_synthesizer()), tmp_path / out, **options)
     assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
 
 
 def test_a_size_the_network_cannot_take_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError):
-        export_onnx(tiny_weights(), tmp_path / "export", height=36)
+        export_onnx(loaded(tiny_synthesizer()), tmp_path / "export", height=36)
 
 
 def test_an_export_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -255,5 +247,5 @@ def test_an_export_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr("gcd_model.engines.onnx_export.write_graph", full)
     with pytest.raises(CheckpointError):
-        export_onnx(tiny_weights(), tmp_path / "export")
+        export_onnx(loaded(tiny_synthesizer()), tmp_path / "export")
     assert list(tmp_path.iterdir()) == []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from msgspec import structs
-from small_models import TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
+from small_models import TINY_DRIVING, loaded, random_clip, relative_error, tiny_driving, tiny_synthesizer
 
 from gcd_model.clip import View
 from gcd_model.diffusion import RenderOptions
@@ -16,7 +16,6 @@ from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
 from gcd_model.loading import load_synthesizer
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.load import LoadedWeights
 
 pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")
 pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
@@ -28,16 +27,7 @@ WORKER = Path(__file__).parent / "full_size_export.py"
 def exported(
     synthesizer: Synthesizer, folder: Path, precision: str = "float32", apart_above: int = 1 << 30
 ) -> Manifest:
-    traits = synthesizer.traits
-    loaded = LoadedWeights(
-        name=traits.name,
-        networks=synthesizer.networks,
-        family=traits.family,
-        move_time=traits.move_time,
-        trained=False,
-        sha256_12=traits.sha256_12,
-    )
-    return export_onnx(loaded, folder, precision=precision, apart_above=apart_above)
+    return export_onnx(loaded(synthesizer), folder, precision=precision, apart_above=apart_above)
 
 
 def view(synthesizer: Synthesizer) -> View:
@@ -84,18 +74,7 @@ def test_narrow_numbers_miss_by_little_and_take_less_room(
 def test_another_size_is_another_export(tmp_path: Path) -> None:
     torched = tiny_driving()
     config = structs.replace(torched.traits.config, height=64)
-    export_onnx(
-        LoadedWeights(
-            name="tiny",
-            networks=torched.networks,
-            family=torched.traits.family,
-            move_time=2,
-            trained=False,
-            sha256_12="0" * 12,
-        ),
-        tmp_path / "export",
-        height=64,
-    )
+    export_onnx(loaded(torched), tmp_path / "export", height=64)
     larger = load_synthesizer(tmp_path / "export")
     assert larger.traits.config == config
     assert larger.encode(random_clip(config)).latents.shape[-2:] == (16, 12)

@@ -54,20 +54,12 @@ def error(solver: SolverName, steps: int) -> float:
     return ((flow(solver, steps) - limit).norm(dim=1) / limit.norm(dim=1)).mean().item()
 
 
-def in_quality(quality: Quality, sampling: SamplingConfig = PUBLISHED) -> Sampler:
-    return Sampler.of(sampling, RenderOptions(quality=quality))
-
-
-def test_exact_is_what_was_published() -> None:
-    assert in_quality("exact") == Sampler(steps=25, solver="euler", guidance=(1.0, 1.5), guidance_interval=None)
-    assert Sampler.of(PUBLISHED, RenderOptions()) == in_quality("exact")
-
-
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_a_checkpoint_of_few_steps_is_sampled_its_own_way_in_every_quality(quality: Quality) -> None:
-    sampling = PLAIN_SMALL.sampling
-    own = Sampler(steps=sampling.steps, solver="euler", guidance=sampling.guidance)
-    assert in_quality(quality, sampling) == own
+def test_exact_is_what_was_published_and_few_steps_are_their_checkpoints_own(quality: Quality) -> None:
+    assert Sampler.of(PUBLISHED, RenderOptions()) == Sampler(steps=25, solver="euler", guidance=(1.0, 1.5))
+    few = PLAIN_SMALL.sampling
+    own = Sampler(steps=few.steps, solver="euler", guidance=few.guidance)
+    assert Sampler.of(few, RenderOptions(quality=quality)) == own
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5, 25, 59])
@@ -79,24 +71,19 @@ def test_no_quality_takes_more_of_the_network_than_a_better_one(steps: int) -> N
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_what_is_named_wins_over_the_quality(quality: Quality) -> None:
+def test_what_is_named_wins_over_the_quality_and_what_is_not_is_as_the_quality_has_it(quality: Quality) -> None:
     named = RenderOptions(quality=quality, steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0))
     assert Sampler.of(PUBLISHED, named) == Sampler(
         steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0)
     )
+    usual = Sampler.of(PUBLISHED, RenderOptions(quality=quality))
+    assert Sampler.of(PUBLISHED, RenderOptions(quality=quality, steps=7)) == replace(usual, steps=7)
+    assert Sampler.of(PUBLISHED, RenderOptions(quality=quality, solver="heun")) == replace(usual, solver="heun")
 
 
-def test_what_is_not_named_is_as_the_quality_has_it() -> None:
-    assert Sampler.of(PUBLISHED, RenderOptions(quality="fast", steps=7)) == replace(in_quality("fast"), steps=7)
-    assert Sampler.of(PUBLISHED, RenderOptions(solver="dpmpp_2m")) == replace(in_quality("exact"), solver="dpmpp_2m")
-
-
-def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are() -> None:
-    assert error(*PRESETS["fast"]) <= error("euler", 25)
-
-
-def test_fastest_is_at_most_three_times_as_far() -> None:
-    assert error("euler", 25) < error(*PRESETS["fastest"]) <= 3 * error("euler", 25)
+def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are_and_fastest_at_most_three_times_as_far() -> None:
+    fast, exact, fastest = error(*PRESETS["fast"]), error("euler", 25), error(*PRESETS["fastest"])
+    assert fast <= exact < fastest <= 3 * exact
 
 
 STEPS = 4
