@@ -7,6 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import replace
 
 from gcd_model.errors import OptionError
 
@@ -273,26 +274,22 @@ PLAIN_SMALL = ModelConfig(
     height=128,
     width=192,
     camera="none",
-    unet=UNetConfig(
+    unet=replace(
+        SMALL.unet,
         latent_channels=12,
         condition_channels=12,
         width=48,
-        multipliers=(1, 2, 3),
         attention=(False, False, True),
-        blocks_per_level=1,
         embedding_width=192,
         head_width=48,
         context_width=None,
-        vector_width=96,
         camera_width=0,
-        norm_groups=8,
     ),
-    vae=VAEConfig(
+    vae=replace(
+        SMALL.vae,
         latent_channels=12,
         width=32,
         multipliers=(1, 2, 3),
-        blocks_per_level=1,
-        norm_groups=8,
         scale=1.0,
         shared=True,
         patch=2,

@@ -387,8 +387,8 @@ class GuidedDenoiser:
 def evaluated(backbone: Backbone, x: Tensor, inputs: StepInputs, branches: int) -> Tensor:
     """What the network says of x [K, T, C, h, w]: [R, K, T, C, h, w]. branches: R, 1 for the conditional one alone."""
     rows = (x * inputs.numbers[0]).flatten(0, 1).repeat(branches, 1, 1, 1)
-    condition, crosses = (each if each is None else each[-len(rows) :] for each in (inputs.condition, inputs.crosses))
-    raw = backbone.predict(rows, condition, inputs.embeddings.repeat(branches, 1), crosses)
+    crosses = None if inputs.crosses is None else inputs.crosses[-len(rows) :]
+    raw = backbone.predict(rows, inputs.condition[-len(rows) :], inputs.embeddings.repeat(branches, 1), crosses)
     return raw.unflatten(0, (branches, *x.shape[:2]))
 
 

@@ -4,6 +4,9 @@ The names come from the table that loads checkpoints, read the other way round; 
 elsewhere.
 """
 
+from collections.abc import Mapping
+
+import torch
 from torch import Tensor, nn
 
 from gcd_model.unet import VideoUNet
@@ -31,3 +34,8 @@ def diffusers_state(module: nn.Module, own: str, folder: str) -> dict[str, Tenso
         parts = taken_apart(published_names(f"{own}.{name}", "diffusers", Levels()), value)
         state |= {published.removeprefix(folder): part for published, part in parts.items()}
     return state
+
+
+def on_meta(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The same shapes without storage (weights that never leave the host included)."""
+    return {name: torch.empty_like(value, device="meta") for name, value in weights.items()}

@@ -124,7 +124,7 @@ def give_published_epsilon(diffusers_unet: nn.Module) -> int:
     return changed
 
 
-def tiny_traits(config: ModelConfig = TINY) -> Traits:
+def tiny_traits(config: ModelConfig = TINY, *, precision: str = "float32", device: str = "cpu") -> Traits:
     """Traits of a gradual Kubric-4D checkpoint with limits of 90 and 30 degrees."""
     return Traits(
         name="tiny",
@@ -132,8 +132,8 @@ def tiny_traits(config: ModelConfig = TINY) -> Traits:
         family=KUBRIC90,
         move_time=config.frames - 1,
         sha256_12="0" * 12,
-        precision="float32",
-        device="cpu",
+        precision=precision,
+        device=device,
         trained=False,
     )
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer
+from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer, tiny_traits
 
 from gcd_model.clip import View
 from gcd_model.config import SVD_14, ModelConfig
@@ -17,8 +17,6 @@ from gcd_model.errors import Cancelled
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.synthesizer import Download, Synthesizer
-from gcd_model.traits import Traits
-from gcd_model.weights.families import KUBRIC90
 
 pytestmark = [
     pytest.mark.gpu,
@@ -31,15 +29,7 @@ def latents(device: str, dtype: torch.dtype) -> torch.Tensor:
     networks = random_networks(TINY, seed=0).to(device)
     networks.to(dtype)
     networks.decoder.float()
-    traits = Traits(
-        name="tiny",
-        config=TINY,
-        family=KUBRIC90,
-        move_time=TINY.frames - 1,
-        sha256_12="0" * 12,
-        precision=str(dtype),
-        device=device,
-    )
+    traits = tiny_traits(precision=str(dtype), device=device)
     synthesizer = Synthesizer(networks, traits)
     path = traits.plan_view(SphericalDelta(azimuth_deg=30.0))
     view = synthesizer.render(synthesizer.encode(random_clip()), [path], RenderOptions(steps=3, samples=2))[0]
@@ -57,9 +47,7 @@ def test_bfloat16_stays_near_float32_on_a_gpu() -> None:
 
 def test_a_clip_may_lie_on_the_gpu() -> None:
     networks = random_networks(TINY, seed=0).cuda()
-    traits = Traits(
-        name="tiny", config=TINY, family=KUBRIC90, move_time=1, sha256_12="0" * 12, precision="float32", device="cuda"
-    )
+    traits = tiny_traits(device="cuda")
     clip = random_clip()
     on_gpu = type(clip)(video=clip.video.cuda(), fps=clip.fps)
     assert Synthesizer(networks, traits).encode(on_gpu).latents.is_cuda
@@ -190,16 +178,7 @@ def test_a_download_holds_what_the_device_had_and_lies_in_pinned_memory() -> Non
 @pytest.mark.timeout(1800)
 def test_a_full_size_window_equals_plain_torch_within_bfloat16_and_ten_gigabytes() -> None:
     networks = random_networks(SVD_14, seed=0)
-    traits = Traits(
-        name="random-full",
-        config=SVD_14,
-        family=KUBRIC90,
-        move_time=13,
-        sha256_12="0" * 12,
-        precision="bfloat16",
-        device="cuda",
-        trained=False,
-    )
+    traits = tiny_traits(SVD_14, precision="bfloat16", device="cuda")
     for module in networks.children():
         module.to("cuda", torch.bfloat16)
     networks.decoder.float()

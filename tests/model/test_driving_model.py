@@ -1,7 +1,5 @@
 """A small model with every switch that is ours: x0, shared noise, patches; and the class map of what it paints."""
 
-from pathlib import Path
-
 import msgspec
 import pytest
 import torch
@@ -10,7 +8,6 @@ from small_models import (
     TINY_DRIVING,
     draw,
     random_clip,
-    randomise,
     relative_error,
     tiny_driving,
     tiny_synthesizer,
@@ -23,11 +20,8 @@ from gcd_model.config import DRIVING_CLASSES, ModelConfig, SemanticClass
 from gcd_model.diffusion import RenderOptions
 from gcd_model.errors import OptionError
 from gcd_model.geometry import CameraMount
-from gcd_model.loading import load_synthesizer
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import Card
-from gcd_model.weights.load import save_weights
 
 FRAMES, HEIGHT, WIDTH = TINY_DRIVING.frames, TINY_DRIVING.height, TINY_DRIVING.width
 LATENTS = (FRAMES, 4, HEIGHT // 4, WIDTH // 4)
@@ -94,20 +88,6 @@ def test_a_mount_is_refused_where_the_view_hangs_on_no_vehicle(synthesizer: Synt
     for traits in (synthesizer.traits, tiny_synthesizer().traits):
         with pytest.raises(OptionError):
             traits.plan_view(mount=CameraMount())
-
-
-def test_a_model_stored_in_half_precision_comes_back_and_computes_in_float32(tmp_path: Path) -> None:
-    networks = Networks(TINY_DRIVING)
-    randomise(networks)
-    networks.half()
-    card = Card(name="tiny-driving", config=TINY_DRIVING, family="driving-semantic", move_time=FRAMES - 1)
-    save_weights(networks, tmp_path / "tiny.safetensors", card)
-    loaded = load_synthesizer(tmp_path / "tiny.safetensors", device="cpu")
-    assert isinstance(loaded, Synthesizer)
-    assert {parameter.dtype for parameter in loaded.networks.parameters()} == {torch.float32}
-    assert loaded.traits.config == TINY_DRIVING
-    expected, view = rendered(Synthesizer(networks.float(), loaded.traits)), rendered(loaded)
-    assert torch.equal(view.samples, expected.samples)
 
 
 def test_an_ontology_that_cannot_be_told_apart_is_refused() -> None:

@@ -1,9 +1,10 @@
-"""The door: what `encode` and `render` promise, on the smallest network that has every part."""
+"""The door: what `encode` and `render` promise, on the smallest network that has every part, and on its variants."""
 
 import threading
 from collections.abc import Callable
 from dataclasses import replace
 
+import msgspec
 import pytest
 import torch
 from small_models import TINY, draw, random_clip, relative_error, synthesize, tiny_synthesizer
@@ -12,8 +13,9 @@ from torch.testing import assert_close
 
 from gcd_model.clip import Augmentation, Clip, View
 from gcd_model.conditioning import SourceFeatures
+from gcd_model.config import ModelConfig, SamplingConfig
 from gcd_model.diffusion import RenderOptions, unit_noise
-from gcd_model.errors import Cancelled, NonFiniteError, OptionError, ShapeError
+from gcd_model.errors import Cancelled, ModelError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
 from gcd_model.synthesizer import Synthesizer
 
@@ -172,37 +174,33 @@ def test_guidance_of_one_throughout_runs_the_conditional_branch_alone_and_gives_
 
 
 @pytest.mark.parametrize("shape", [(3, 4, 8, 8), (2, *LATENTS)])
-def test_initial_noise_of_another_shape_is_refused(synthesizer: Synthesizer, shape: tuple[int, ...]) -> None:
+def test_noise_of_another_shape_is_refused(synthesizer: Synthesizer, shape: tuple[int, ...]) -> None:
     features = synthesizer.encode(random_clip())
     with pytest.raises(OptionError):
         synthesizer.render(features, [path(synthesizer)], RenderOptions(initial_noise=draw(*shape)))
-
-
-def test_augmentation_noise_of_another_shape_is_refused(synthesizer: Synthesizer) -> None:
     with pytest.raises(ShapeError):
-        synthesizer.encode(random_clip(), Augmentation(noise=draw(3, 3, 8, 8)))
+        synthesizer.encode(random_clip(), Augmentation(noise=draw(*shape)))
 
 
-@pytest.mark.parametrize(("height", "width"), [(30, 64), (0, 64)])
-def test_a_size_the_network_cannot_take_is_refused_with_the_size_it_was_trained_on(
-    synthesizer: Synthesizer, height: int, width: int
+@pytest.mark.parametrize(
+    ("video", "fps", "error"),
+    [
+        (torch.zeros(3, 32, 64), 12.0, ShapeError),
+        (torch.zeros(3, 1, 32, 64), 12.0, ShapeError),
+        (torch.zeros(1, 3, 3, 32, 64), 12.0, ShapeError),
+        (torch.zeros(3, 3, 8, 8, dtype=torch.uint8), 12.0, ShapeError),
+        (torch.zeros(3, 3, 32, 64), 0.0, OptionError),
+        (torch.zeros(3, 3, 32, 64), -1.0, OptionError),
+        (torch.zeros(3, 3, 32, 64), float("nan"), OptionError),
+        (torch.zeros(3, 3, 30, 64), 12.0, OptionError),
+        (torch.zeros(3, 3, 0, 64), 12.0, OptionError),
+    ],
+)
+def test_a_clip_that_is_none_or_of_a_size_the_network_cannot_take_is_refused(
+    synthesizer: Synthesizer, video: Tensor, fps: float, error: type[ModelError]
 ) -> None:
-    with pytest.raises(OptionError):
-        synthesizer.encode(Clip(video=torch.zeros(3, 3, height, width), fps=12.0))
-
-
-@pytest.mark.parametrize("shape", [(3, 32, 64), (3, 1, 32, 64), (1, 3, 3, 32, 64)])
-def test_a_clip_that_is_no_list_of_colour_pictures_is_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ShapeError):
-        Clip(video=torch.zeros(shape), fps=12.0)
-
-
-def test_a_clip_in_another_type_or_without_frame_rate_is_refused() -> None:
-    with pytest.raises(ShapeError):
-        Clip(video=torch.zeros(3, 3, 8, 8, dtype=torch.uint8), fps=12.0)
-    for fps in (0.0, -1.0, float("nan")):
-        with pytest.raises(OptionError):
-            Clip(video=torch.zeros(3, 3, 8, 8), fps=fps)
+    with pytest.raises(error):
+        synthesizer.encode(Clip(video=video, fps=fps))
 
 
 @pytest.mark.parametrize("frames", [2, 4])
@@ -257,3 +255,88 @@ def test_features_of_another_kind_are_not_joined() -> None:
     for other in (replace(plain, tokens=torch.zeros(2, 5)), replace(plain, extra=latents), replace(plain, fps=6.0)):
         with pytest.raises(ShapeError):
             plain.followed_by(other)
+
+
+def with_unet(**changes: object) -> ModelConfig:
+    """TINY with other fields in its U-Net."""
+    return msgspec.structs.replace(TINY, unet=msgspec.structs.replace(TINY.unet, **changes))
+
+
+@pytest.mark.parametrize("channels", [0, 3])
+def test_a_checkpoint_with_extra_condition_channels_wants_exactly_those(channels: int) -> None:
+    synthesizer = tiny_synthesizer(with_unet(condition_channels=6))
+    extra = draw(3, channels, *LATENTS[2:]) if channels else None
+    with pytest.raises(ShapeError):
+        synthesizer.encode(random_clip(), extra=extra)
+    features = synthesizer.encode(random_clip(), extra=draw(3, 2, *LATENTS[2:]))
+    assert synthesizer.render(features, [path(synthesizer)])[0].samples.isfinite().all()
+
+
+def test_a_model_without_image_tower_has_no_tokens_and_still_renders() -> None:
+    unet = msgspec.structs.replace(TINY.unet, context_width=None)
+    synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, image_encoder=None))
+    assert synthesizer.encode(random_clip()).tokens is None
+    assert synthesize(synthesizer, random_clip(), path(synthesizer)).samples.isfinite().all()
+
+
+@pytest.mark.parametrize("control", ["relative_pose", "none"])
+def test_the_other_camera_controls_render_too(control: str) -> None:
+    unet = msgspec.structs.replace(TINY.unet, camera_width=0 if control == "none" else TINY.unet.camera_width)
+    synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, camera=control), family_known=False)
+    options = RenderOptions(motion_bucket=127.0)
+    angle = torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 0], poses[:, 0, 2], poses[:, 2, 0], poses[:, 2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+    features = synthesizer.encode(random_clip())
+    still, moving = synthesizer.render(
+        features, [pose_trajectory(poses[:1].repeat(3, 1, 1)), pose_trajectory(poses)], options
+    )
+    assert (relative_error(still.latents, moving.latents) > 1e-3) == (control == "relative_pose")
+
+
+def test_networks_in_bfloat16_give_float32_views_near_those_of_float32(synthesizer: Synthesizer) -> None:
+    half = tiny_synthesizer()
+    for name, network in half.networks.named_children():
+        if name != "decoder":
+            network.bfloat16()
+    exact = synthesize(synthesizer, random_clip(), path(synthesizer))
+    rounded = synthesize(half, random_clip(), path(half))
+    assert rounded.samples.dtype == rounded.latents.dtype == torch.float32
+    assert 0 < relative_error(rounded.latents, exact.latents) < 0.05
+
+
+def test_a_render_at_another_number_of_frames_levels_and_latent_channels_has_the_shapes_the_config_says() -> None:
+    config = ModelConfig(
+        frames=5,
+        height=16,
+        width=32,
+        unet=msgspec.structs.replace(
+            TINY.unet, latent_channels=8, condition_channels=8, multipliers=(1, 1, 2), attention=(True, False, True)
+        ),
+        vae=msgspec.structs.replace(TINY.vae, latent_channels=8, multipliers=(1, 2)),
+        image_encoder=TINY.image_encoder,
+        sampling=SamplingConfig(steps=2),
+    )
+    assert (config.vae.down_factor, config.unet.size_factor, config.size_factor) == (2, 4, 8)
+    synthesizer = tiny_synthesizer(config)
+    features = synthesizer.encode(random_clip(config))
+    (view,) = synthesizer.render(features, [path(synthesizer)])
+    assert view.video.shape == (5, 3, 16, 32)
+    assert view.latents.shape == (1, 5, 8, 8, 16)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: msgspec.structs.replace(TINY, camera="none"),
+        lambda: msgspec.structs.replace(TINY, image_encoder=None),
+        lambda: msgspec.structs.replace(TINY, vae=msgspec.structs.replace(TINY.vae, latent_channels=8)),
+        lambda: with_unet(attention=(True,)),
+        lambda: with_unet(vector_width=25),
+        lambda: with_unet(width=12),
+        lambda: with_unet(head_width=24),
+    ],
+)
+def test_parts_that_do_not_fit_together_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(OptionError):
+        make()

@@ -152,7 +152,7 @@ class StepMemory:
         self._backbone, self._update = backbone, update
         self._x, self._before = start.clone(), start.clone()
         self._denoiser = GuidedDenoiser(backbone, given, schedule, start)
-        self._inputs = StepInputs(*(each if each is None else each.clone() for each in self._denoiser.inputs(0)))
+        self._inputs = StepInputs._make(each if each is None else each.clone() for each in self._denoiser.inputs(0))
         self._replays: dict[int, Replay] = {}
 
     def begin(self, start: Tensor, given: Conditioning, schedule: Schedule) -> None:

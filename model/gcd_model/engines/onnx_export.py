@@ -47,27 +47,20 @@ Report = Callable[[str, int, int], None]
 """Called with (graph that is next, graphs done, graphs)."""
 
 
-class Embeddings(nn.Module):
-    """Noise level [1], micro-conditioning [T, V] and camera features [T, F], projected for every stage of the U-Net."""
-
-    def __init__(self, networks: Networks) -> None:
-        super().__init__()
-        self.unet, self.camera = networks.unet, None if networks.camera is None else networks.camera.proj
-
-    def forward(self, label: Tensor, vector: Tensor, camera: Tensor | None = None) -> Tensor:
-        """[T, E]."""
-        features = None if self.camera is None or camera is None else self.camera(camera)
-        return self.unet.plan(label, vector, features, None).embeddings[0]
-
-
 class _Function(nn.Module):
-    def __init__(self, module: nn.Module, compute: Callable[[Any, Tensor], Tensor | None]) -> None:
+    def __init__(self, module: nn.Module, compute: Callable[..., Tensor | None]) -> None:
         super().__init__()
         self.module, self.compute = module, compute
 
-    def forward(self, x: Tensor) -> Tensor | None:
-        """What is computed of a module and one tensor."""
-        return self.compute(self.module, x)
+    def forward(self, *inputs: Tensor) -> Tensor | None:
+        """What is computed of a module and tensors."""
+        return self.compute(self.module, *inputs)
+
+
+def _embeddings(networks: Networks, label: Tensor, vector: Tensor, camera: Tensor | None = None) -> Tensor:
+    """Noise level [1], micro-conditioning [T, V] and camera features [T, F], projected for every stage: [T, E]."""
+    features = None if networks.camera is None or camera is None else networks.camera.proj(camera)
+    return networks.unet.plan(label, vector, features, None).embeddings[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +90,7 @@ def graphs(networks: Networks) -> Iterator[Graph]:
     inputs = {"label": torch.zeros(1), "vector": torch.zeros(frames, config.unet.vector_width)}
     if networks.camera is not None:
         inputs["camera"] = torch.zeros(frames, CAMERA_FEATURES[config.camera])
-    yield Graph("embeddings", Embeddings(networks), inputs, "embeddings")
+    yield Graph("embeddings", _Function(networks, _embeddings), inputs, "embeddings")
     yield step_graph(networks)
     decoder = _Function(networks.decoder, lambda decoder, latents: decoder(latents, frames))
     latents = torch.zeros(frames, config.vae.latent_channels, height // factor, width // factor)

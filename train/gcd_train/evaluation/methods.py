@@ -17,7 +17,7 @@ from torch import Tensor
 from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, weights_path
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.diffusion import Quality, SolverName
+from gcd_model.diffusion import Quality, Sampler, SolverName
 from gcd_train.data.files import package_version
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
