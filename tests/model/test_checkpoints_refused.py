@@ -4,7 +4,7 @@ import pickle
 import sys
 import types
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -103,12 +103,41 @@ def test_a_pickle_cannot_change_what_rebuilds_tensors(tmp_path: Path) -> None:
     assert torch._utils._rebuild_tensor_v2.__defaults__ == (None,)
 
 
-def write_pickle(path: Path, program: bytes) -> Path:
+STORAGE = b"(Vstorage\nctorch\nFloatStorage\nV%s\nVcpu\nI%d\ntQ"
+REBUILT = b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE + b"I%d\n(I%d\nt(I%d\ntI00\nNtR"
+
+
+@pytest.mark.parametrize(
+    ("key", "count", "start", "size", "stride"),
+    [
+        (b"0", 100, 0, 4, 1),  # more than the record holds
+        (b"1", 4, 0, 4, 1),  # no record
+        (b"../version", 4, 0, 4, 1),
+        (b"0", -4, 0, 4, 1),
+        (b"0", 4, 2, 4, 1),  # a tensor that reaches beyond its storage
+        (b"0", 4, -2, 4, 1),
+        (b"0", 4, 3, 4, -1),
+        (b"0", 4, 0, 10**18, 1),
+    ],
+)
+def test_no_tensor_reaches_beyond_its_record(
+    tmp_path: Path, key: bytes, count: int, start: int, size: int, stride: int
+) -> None:
+    program = b"(Va\n" + REBUILT % (key, count, start, size, stride) + b"d."
+    message = refused(write_pickle(tmp_path / "a.ckpt", program, {"data/0": bytes(16)}))
+    assert "no layout known" not in message, "that a tensor was made"
+    whole = b"(Va\n" + REBUILT % (b"0", 4, 0, 4, 1) + b"d."
+    assert "no layout known" in refused(write_pickle(tmp_path / "b.ckpt", whole, {"data/0": bytes(16)}))
+
+
+def write_pickle(path: Path, program: bytes, records: Mapping[str, bytes] | None = None) -> Path:
     """A torch zip whose pickle is the given program."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("archive/data.pkl", program)
         archive.writestr("archive/version", "3\n")
         archive.writestr("archive/byteorder", "little")
+        for name, content in (records or {}).items():
+            archive.writestr(f"archive/{name}", content)
     return path
 
 
