@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import Provenance, combined, told_by_name, told_by_yaml
+from gcd_model.weights.families import FamilyName, Provenance, combined, told_by_name, told_by_yaml
 from gcd_model.weights.load import digest, save_weights
 
 # --- the family ------------------------------------------------------------------------------------------------------
@@ -165,42 +165,28 @@ def test_a_large_file_is_digested_by_samples(tmp_path: Path, monkeypatch: pytest
     assert digest((path,)) != sampled
 
 
-NAMES = [
-    ("kubric_gradual_max90", "kubric90", 13),
-    ("kubric_direct_max90", "kubric90", 0),
-    ("kubric_gradual_max180", "kubric180", 13),
-    ("kubric_direct_max180", "kubric180", 0),
-    ("pardom_gradual_rgb", "driving", 13),
-    ("pardom_direct_rgb", "driving", 0),
-    ("pardom_gradual_semantic", "driving-semantic", 13),
-    ("pardom_direct_semantic", "driving-semantic", 0),
-]
-
-
-@pytest.mark.parametrize(("name", "family", "move_time"), NAMES)
-def test_every_published_name_tells_family_and_move_time(name: str, family: str, move_time: int) -> None:
-    for stem in (name, f"{name}_bf16", f"my-{name.upper()}"):
-        told = told_by_name(stem)
-        assert (told.family, told.move_time, told.told_by) == (family, move_time, "file name")
-
-
 @pytest.mark.parametrize(
-    ("name", "frames"),
+    ("names", "family", "move_time", "frames"),
     [
-        ("svd", None),
-        ("stable-video-diffusion-img2vid", None),
-        ("svd_xt", 25),
-        ("stable-video-diffusion-img2vid-xt", 25),
+        (["kubric_gradual_max90", "kubric_gradual_max90_bf16", "my-KUBRIC_gradual_max90"], "kubric90", 13, None),
+        (["kubric_direct_max90"], "kubric90", 0, None),
+        (["kubric_gradual_max180"], "kubric180", 13, None),
+        (["kubric_direct_max180"], "kubric180", 0, None),
+        (["pardom_gradual_rgb"], "driving", 13, None),
+        (["pardom_direct_rgb"], "driving", 0, None),
+        (["pardom_gradual_semantic"], "driving-semantic", 13, None),
+        (["pardom_direct_semantic", "pardom_direct_semantic_bf16"], "driving-semantic", 0, None),
+        (["svd", "stable-video-diffusion-img2vid"], "svd", None, None),
+        (["svd_xt", "stable-video-diffusion-img2vid-xt"], "svd", None, 25),
+        (["", "last", "my_svd_finetune", "kubric_gradual_max900", "kubric_gradual", "svd2"], None, None, None),
     ],
 )
-def test_the_base_models_are_known_by_their_whole_names(name: str, frames: int | None) -> None:
-    told = told_by_name(name)
-    assert (told.family, told.frames, told.move_time) == ("svd", frames, None)
-
-
-@pytest.mark.parametrize("name", ["", "last", "my_svd_finetune", "kubric_gradual_max900", "kubric_gradual", "svd2"])
-def test_other_names_tell_nothing(name: str) -> None:
-    assert told_by_name(name) == Provenance()
+def test_published_names_tell_family_move_time_and_frames_and_others_nothing(
+    names: list[str], family: FamilyName | None, move_time: int | None, frames: int | None
+) -> None:
+    told_by = None if family is None else "file name"
+    wanted = Provenance(family=family, move_time=move_time, frames=frames, told_by=told_by)
+    assert [told_by_name(name) for name in names] == [wanted] * len(names)
 
 
 YAML = """

@@ -4,7 +4,7 @@ import pickle
 import sys
 import types
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -51,39 +51,36 @@ class Listed(list[int]):
     """Rebuilt by appending to an instance with state."""
 
 
-def test_foreign_objects_beside_the_weights_do_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    callback = foreign_class(monkeypatch)(monitor="loss")
-    listed = Listed([1, 2, 3])
+def test_foreign_objects_and_hostile_code_beside_the_weights_do_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trace = tmp_path / "trace"
+    callback, listed, hostile = foreign_class(monkeypatch)(monitor="loss"), Listed([1, 2, 3]), Hostile(trace)
     listed.note = "kept in the instance's dictionary"
-    entries = {"callbacks": {"best": callback}, "loops": [listed, {1, 2}, Path("a/b")], "hyper_parameters": callback}
-    path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()), **entries)
+    entries = {
+        "callbacks": {"best": callback, "worst": hostile},
+        "loops": [listed, {1, 2}, Path("a/b")],
+        "hyper_parameters": callback,
+    }
+    path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()), **entries, optimizer_states=[hostile])
     monkeypatch.undo()
     assert_same_weights(load(path).networks, filled())
     assert set(entries) < set(inspect(path).other_entries)
+    assert not trace.exists()
+    pickle.loads(pickle.dumps(hostile))
+    assert trace.exists(), "the attack must work on pickle itself, else this test shows nothing"
 
 
-def test_a_foreign_object_among_the_weights_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_tensor_among_the_weights_is_refused_by_name_and_never_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trace = tmp_path / "trace"
     path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()) | {"extra": foreign_class(monkeypatch)()})
     monkeypatch.undo()
     message = refused(path)
     assert "made_up_trainer.Callback" in message
     assert "'extra'" in message
-
-
-@pytest.mark.parametrize("place", ["callbacks", "optimizer_states"])
-def test_hostile_code_beside_the_weights_never_runs(tmp_path: Path, place: str) -> None:
-    trace = tmp_path / "trace"
-    path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()), **{place: [Hostile(trace)]})
-    assert_same_weights(load(path).networks, filled())
-    assert not trace.exists()
-    pickle.loads(pickle.dumps(Hostile(trace)))
-    assert trace.exists(), "the attack must work on pickle itself, else this test shows nothing"
-
-
-def test_hostile_code_among_the_weights_is_refused_and_never_runs(tmp_path: Path) -> None:
-    trace = tmp_path / "trace"
-    path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()) | {CONV: Hostile(trace)})
-    assert "refused" in refused(path)
+    assert CONV in refused(write_lightning(tmp_path / "b.ckpt", gcd_state(filled()) | {CONV: Hostile(trace)}))
     assert not trace.exists()
 
 
@@ -103,12 +100,41 @@ def test_a_pickle_cannot_change_what_rebuilds_tensors(tmp_path: Path) -> None:
     assert torch._utils._rebuild_tensor_v2.__defaults__ == (None,)
 
 
-def write_pickle(path: Path, program: bytes) -> Path:
+STORAGE = b"(Vstorage\nctorch\nFloatStorage\nV%s\nVcpu\nI%d\ntQ"
+REBUILT = b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE + b"I%d\n(I%d\nt(I%d\ntI00\nNtR"
+
+
+@pytest.mark.parametrize(
+    ("key", "count", "start", "size", "stride"),
+    [
+        (b"0", 100, 0, 4, 1),  # more than the record holds
+        (b"1", 4, 0, 4, 1),  # no record
+        (b"../version", 4, 0, 4, 1),
+        (b"0", -4, 0, 4, 1),
+        (b"0", 4, 2, 4, 1),  # a tensor that reaches beyond its storage
+        (b"0", 4, -2, 4, 1),
+        (b"0", 4, 3, 4, -1),
+        (b"0", 4, 0, 10**18, 1),
+    ],
+)
+def test_no_tensor_reaches_beyond_its_record(
+    tmp_path: Path, key: bytes, count: int, start: int, size: int, stride: int
+) -> None:
+    program = b"(Va\n" + REBUILT % (key, count, start, size, stride) + b"d."
+    message = refused(write_pickle(tmp_path / "a.ckpt", program, {"data/0": bytes(16)}))
+    assert "no layout known" not in message, "that a tensor was made"
+    whole = b"(Va\n" + REBUILT % (b"0", 4, 0, 4, 1) + b"d."
+    assert "no layout known" in refused(write_pickle(tmp_path / "b.ckpt", whole, {"data/0": bytes(16)}))
+
+
+def write_pickle(path: Path, program: bytes, records: Mapping[str, bytes] | None = None) -> Path:
     """A torch zip whose pickle is the given program."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("archive/data.pkl", program)
         archive.writestr("archive/version", "3\n")
         archive.writestr("archive/byteorder", "little")
+        for name, content in (records or {}).items():
+            archive.writestr(f"archive/{name}", content)
     return path
 
 

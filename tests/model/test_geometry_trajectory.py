@@ -135,7 +135,7 @@ def test_the_driving_path_leads_from_the_forward_camera_to_above_and_behind() ->
 
 def test_on_the_driving_path_position_and_target_move_separately_at_a_sine_pace() -> None:
     trajectory = driving_trajectory(frames=14, move_time=13)
-    vehicle_from_source = look_at(point(DRIVING_SOURCE_POSITION), point(DRIVING_SOURCE_TARGET))
+    vehicle_from_source = CameraMount().vehicle_from_camera
     for t, done in enumerate(SINE_14):
         vehicle_from_camera = vehicle_from_source @ trajectory.source_from_target[t]
         position = (1 - done) * point(DRIVING_SOURCE_POSITION) + done * point(DRIVING_GOAL_POSITION)
@@ -205,21 +205,14 @@ def test_a_trajectory_checks_itself(poses: Tensor, delta: Tensor | None, flags: 
         Trajectory(source_from_target=poses, delta=delta, at_goal=(True,) * flags, source=None)
 
 
-def max90(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
-    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=2.0)
-    return motion_bucket(delta, max_azimuth_deg=90.0, max_elevation_deg=30.0, high=high)
-
-
-def max180(azimuth_deg: float, elevation_deg: float, high: float = 255.0) -> int:
-    delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
-    return motion_bucket(delta, max_azimuth_deg=180.0, max_elevation_deg=60.0, high=high)
-
-
 def test_the_motion_number_is_255_only_with_both_angles_at_their_largest() -> None:
-    assert max90(90.0, 30.0) == max180(180.0, 60.0) == 255
-    assert max90(90.0, 0.0) == max180(180.0, 0.0) == 242
-    assert max90(0.0, 30.0) == max180(0.0, 60.0) == 81
-    assert max90(0.0, 0.0) == 0
-    assert max90(180.0, 60.0) == 510  # it is not clamped
+    for largest in ((90.0, 30.0), (180.0, 60.0)):
+
+        def number(azimuth: float, elevation: float, largest: tuple[float, float] = largest) -> int:
+            delta = SphericalDelta(azimuth_deg=azimuth * largest[0], elevation_deg=elevation * largest[1], radius_m=2.0)
+            return motion_bucket(delta, max_azimuth_deg=largest[0], max_elevation_deg=largest[1])
+
+        assert [number(1, 1), number(1, 0), number(0, 1), number(0, 0)] == [255, 242, 81, 0]
+        assert number(2, 2) == 510  # it is not clamped
     with pytest.raises(OptionError):
         motion_bucket(SphericalDelta(azimuth_deg=10.0), max_azimuth_deg=0.0, max_elevation_deg=0.0)

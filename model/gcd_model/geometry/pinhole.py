@@ -1,7 +1,7 @@
 """The pinhole camera, and the crop that brings a picture to the trained shape."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -64,9 +64,8 @@ class Intrinsics:
     def resized(self, width: int, height: int) -> "Intrinsics":
         """The camera of the same picture at another size; the angles stay."""
         across, along = width / self.width, height / self.height
-        return Intrinsics(
-            fx=self.fx * across, fy=self.fy * along, cx=self.cx * across, cy=self.cy * along, width=width, height=height
-        )
+        fx, fy, cx, cy = self.fx * across, self.fy * along, self.cx * across, self.cy * along
+        return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Intrinsics":
         """The camera of a part of the picture, in pixels; the focal lengths stay.
@@ -79,7 +78,7 @@ class Intrinsics:
                 f"a crop must stay inside the {self.width} x {self.height} picture, "
                 f"got {width} x {height} at ({left}, {top})"
             )
-        return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx - left, cy=self.cy - top, width=width, height=height)
+        return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height)
 
 
 def center_crop_box(width: int, height: int, aspect: float, tolerance: float = 2e-3) -> tuple[int, int, int, int]:

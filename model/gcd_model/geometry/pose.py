@@ -97,10 +97,10 @@ def require_rigid(pose: Tensor, name: str) -> Tensor:
     if not bool(pose.isfinite().all()):
         raise PoseError(f"{name} holds NaN or infinite numbers; a pose must be finite")
     last_row = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
-    if _largest(pose[..., 3, :] - last_row) > RIGID_TOLERANCE:
+    if bool(((pose[..., 3, :] - last_row).abs() > RIGID_TOLERANCE).any()):
         raise PoseError(f"{name} must have the last row (0, 0, 0, 1); is it transposed?")
     rotation = pose[..., :3, :3]
-    skew = _largest(rotation.mT @ rotation - torch.eye(3, dtype=torch.float64))
+    skew = float((rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
     if skew > RIGID_TOLERANCE:
         raise PoseError(f"{name} must be rigid: its rotation is {skew:.2g} from orthonormal, at most {RIGID_TOLERANCE}")
     if bool((torch.linalg.det(rotation) < 0).any()):
@@ -115,10 +115,6 @@ def _points(points: Tensor, name: str) -> Tensor:
     if not bool(points.isfinite().all()):
         raise PoseError(f"{name} holds NaN or infinite numbers; a point must be finite")
     return points
-
-
-def _largest(difference: Tensor) -> float:
-    return float(difference.abs().max())
 
 
 # --- a camera on a vehicle -------------------------------------------------------------------------------------------

@@ -137,8 +137,13 @@ def from_pose(world_from_camera: Tensor) -> Spherical:
             "or say where the source camera stands"
         )
     level_m = math.hypot(x, y)
-    azimuth_deg = _azimuth_deg(x, y) if level_m > _POLE_SINE * radius_m else _azimuth_deg_of_right_axis(pose)
-    return Spherical(azimuth_deg=azimuth_deg, elevation_deg=math.degrees(math.atan2(z, level_m)), radius_m=radius_m)
+    elevation_deg = math.degrees(math.atan2(z, level_m))
+    if level_m <= _POLE_SINE * radius_m:
+        right_x, right_y = pose[:2, 0].tolist()
+        x, y = (right_y, -right_x) if math.hypot(right_x, right_y) >= _POLE_SINE else (1.0, 0.0)
+    azimuth_deg = math.degrees(math.atan2(y, x))
+    azimuth_deg = azimuth_deg if azimuth_deg > -180.0 else 180.0
+    return Spherical(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
 
 
 def nearest_delta(source_from_target: Tensor, source: Spherical) -> DeltaFit:
@@ -161,24 +166,8 @@ def nearest_delta(source_from_target: Tensor, source: Spherical) -> DeltaFit:
     return DeltaFit(
         delta=replace(delta, azimuth_deg=math.remainder(delta.azimuth_deg, 360.0)),
         position_error_m=float(torch.linalg.vector_norm(rest[:3, 3])),
-        rotation_error_deg=_rotation_angle_deg(rest[:3, :3]),
+        rotation_error_deg=math.degrees(float(torch.linalg.vector_norm(rotation_matrix_to_axis_angle(rest[:3, :3])))),
     )
-
-
-def _azimuth_deg(x: float, y: float) -> float:
-    azimuth_deg = math.degrees(math.atan2(y, x))
-    return azimuth_deg if azimuth_deg > -180.0 else 180.0
-
-
-def _azimuth_deg_of_right_axis(world_from_camera: Tensor) -> float:
-    right_x, right_y = world_from_camera[:2, 0].tolist()
-    if math.hypot(right_x, right_y) < _POLE_SINE:
-        return 0.0
-    return _azimuth_deg(right_y, -right_x)
-
-
-def _rotation_angle_deg(rotation: Tensor) -> float:
-    return math.degrees(float(torch.linalg.vector_norm(rotation_matrix_to_axis_angle(rotation))))
 
 
 def _require_finite(*numbers: float) -> None:

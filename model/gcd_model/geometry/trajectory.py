@@ -48,8 +48,11 @@ class Trajectory:
             raise ShapeError(f"source_from_target must be float64, got {self.source_from_target.dtype}")
         if len(self.at_goal) != self.frames:
             raise ShapeError(f"at_goal must have one flag for each of {self.frames} poses, got {len(self.at_goal)}")
-        if self.delta is not None:
-            _require_deltas(self.delta, self.frames)
+        delta = self.delta
+        if delta is not None and (delta.shape != (self.frames, 3) or delta.dtype != torch.float64):
+            raise ShapeError(f"delta must be float64 [{self.frames}, 3], got {delta.dtype} {list(delta.shape)}")
+        if delta is not None and not bool(delta.isfinite().all()):
+            raise ShapeError("delta holds NaN or infinite numbers; changes must be finite")
 
     @property
     def frames(self) -> int:
@@ -160,7 +163,12 @@ def fitted_trajectory(source_from_target: Tensor, source: Spherical) -> tuple[Tr
         ShapeError, PoseError: not a list of rigid poses, or one of them stands at the look-at point.
     """
     asked = _require_pose_list(source_from_target)
-    fits = _unwrapped([nearest_delta(pose, source) for pose in asked.unbind(0)])
+    fits: list[DeltaFit] = []
+    azimuth_deg = 0.0
+    for pose in asked.unbind(0):
+        fit = nearest_delta(pose, source)
+        azimuth_deg += math.remainder(fit.delta.azimuth_deg - azimuth_deg, 360.0)
+        fits.append(replace(fit, delta=replace(fit.delta, azimuth_deg=azimuth_deg)))
     return _trajectory_on_sphere(source, torch.stack([_numbers(fit.delta) for fit in fits])), fits
 
 
@@ -191,15 +199,6 @@ def _trajectory_on_sphere(source: Spherical, deltas: Tensor) -> Trajectory:
     return Trajectory(source_from_target=poses, delta=deltas, at_goal=_at_last_pose(poses), source=source)
 
 
-def _unwrapped(fits: list[DeltaFit]) -> list[DeltaFit]:
-    unwrapped: list[DeltaFit] = []
-    azimuth_deg = 0.0
-    for fit in fits:
-        azimuth_deg += math.remainder(fit.delta.azimuth_deg - azimuth_deg, 360.0)
-        unwrapped.append(replace(fit, delta=replace(fit.delta, azimuth_deg=azimuth_deg)))
-    return unwrapped
-
-
 def _at_last_pose(poses: Tensor) -> tuple[bool, ...]:
     # By pose, not by time: a camera that is asked to stay stands at its goal from the first frame on.
     apart = (poses - poses[-1]).abs().amax(dim=(-2, -1))
@@ -218,13 +217,6 @@ def _require_pose_list(poses: Tensor) -> Tensor:
     if poses.ndim != 3 or poses.shape[0] < 1:
         raise ShapeError(f"source_from_target must be [T, 4, 4], one pose per frame, got {list(poses.shape)}")
     return require_rigid(poses, "source_from_target")
-
-
-def _require_deltas(deltas: Tensor, frames: int) -> None:
-    if deltas.shape != (frames, 3) or deltas.dtype != torch.float64:
-        raise ShapeError(f"delta must be float64 [{frames}, 3], got {deltas.dtype} {list(deltas.shape)}")
-    if not bool(deltas.isfinite().all()):
-        raise ShapeError("delta holds NaN or infinite numbers; changes must be finite")
 
 
 # --- a destination that swings to and fro ----------------------------------------------------------------------------
@@ -274,23 +266,12 @@ class Orbit:
             raise OptionError(f"an orbit advances by a finite time, got {seconds} s")
         if self.rate_deg_s == 0.0 or self.amplitude_deg == 0.0:
             return self
+        amplitude = self.amplitude_deg
         rising = self.direction if self.rate_deg_s > 0.0 else -self.direction
-        travelled_deg = _unfolded(self.azimuth_deg, rising, self.amplitude_deg) + abs(self.rate_deg_s) * seconds
-        azimuth_deg, now_rising = _folded(travelled_deg, self.amplitude_deg)
-        return replace(self, azimuth_deg=azimuth_deg, direction=self.direction * rising * now_rising)
-
-
-def _unfolded(azimuth_deg: float, rising: int, amplitude_deg: float) -> float:
-    """Distance travelled since the last turn at -amplitude: up 2 amplitudes, then down 2."""
-    if rising > 0:
-        return azimuth_deg + amplitude_deg
-    return 2.0 * amplitude_deg + (amplitude_deg - azimuth_deg)
-
-
-def _folded(travelled_deg: float, amplitude_deg: float) -> tuple[float, int]:
-    """Inverse of _unfolded(): the azimuth, and 1 while it rises or -1 while it falls."""
-    phase_deg = travelled_deg % (4.0 * amplitude_deg)
-    if phase_deg < 2.0 * amplitude_deg:
-        return phase_deg - amplitude_deg, 1
-    # In this order each step rounds towards the limit, never beyond it.
-    return amplitude_deg - (phase_deg - 2.0 * amplitude_deg), -1
+        # Travelled since the last turn at -amplitude: up 2 amplitudes, then down 2.
+        done = self.azimuth_deg + amplitude if rising > 0 else 2.0 * amplitude + (amplitude - self.azimuth_deg)
+        phase = (done + abs(self.rate_deg_s) * seconds) % (4.0 * amplitude)
+        if phase < 2.0 * amplitude:
+            return replace(self, azimuth_deg=phase - amplitude, direction=self.direction * rising)
+        # In this order each step rounds towards the limit, never beyond it.
+        return replace(self, azimuth_deg=amplitude - (phase - 2.0 * amplitude), direction=-self.direction * rising)

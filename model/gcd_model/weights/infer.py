@@ -19,17 +19,7 @@ from gcd_model.config import (
     VAEConfig,
 )
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.weights.names import (
-    GCD_CONDITION_VAE,
-    GCD_IMAGE,
-    GCD_UNET,
-    GCD_VAE,
-    IMAGE,
-    Levels,
-    Naming,
-    published_names,
-    published_shape,
-)
+from gcd_model.weights.names import Levels, Naming, published_names, published_shape
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Names and their shapes."""
@@ -76,13 +66,13 @@ def levels_of(names: Iterable[str], naming: Naming) -> Levels:
 
     if naming == "diffusers":
         levels, blocks = count(r"unet/down_blocks\.(\d+)\."), count(r"unet/down_blocks\.0\.resnets\.(\d+)\.")
-        vae, res, tower = r"vae/encoder\.down_blocks", "resnets", rf"{re.escape(IMAGE)}\.encoder\.layers"
+        vae, res, tower = r"vae/encoder\.down_blocks", "resnets", r"image_encoder/vision_model\.encoder\.layers"
     else:
-        inputs = rf"{re.escape(GCD_UNET)}\.input_blocks\.(\d+)\."
-        levels = 1 + count(rf"{inputs}0\.op\.")
+        inputs = r"model\.diffusion_model\.input_blocks\.(\d+)\."
+        levels = 1 + count(inputs + r"0\.op\.")
         blocks = max(1, count(inputs) // levels - 1)  # each level has one more: the stem, then the resampling before it
-        vae, res = rf"{re.escape(GCD_VAE)}\.encoder\.down", "block"
-        tower = rf"{re.escape(GCD_IMAGE)}\.transformer\.resblocks"
+        vae, res = r"first_stage_model\.encoder\.down", "block"
+        tower = r"conditioner\.embedders\.0\.open_clip\.model\.visual\.transformer\.resblocks"
     return Levels(
         attention=(False,) * levels,
         unet_blocks=blocks,
@@ -245,11 +235,11 @@ _FIRST = 5  # names an error lists
 LEFTOVERS = {
     "CLIP text tower": r"conditioner\.embedders\.0\.open_clip\.model\.(positional_embedding|text_projection|logit_scale"
     r"|attn_mask|token_embedding\.weight|ln_final\.(weight|bias)|transformer\..+)",
-    "decoder of the condition VAE": rf"{re.escape(GCD_CONDITION_VAE)}\.(decoder|post_quant_conv)\..+",
+    "decoder of the condition VAE": r"conditioner\.embedders\.3\.encoder\.(decoder|post_quant_conv)\..+",
     "LPIPS": r"lpips\..+",
     "EMA": r"model_ema\..+",
     "noise table": r"denoiser\.sigmas",
-    "position numbers": rf"{re.escape(IMAGE)}\.embeddings\.position_ids",
+    "position numbers": r"image_encoder/vision_model\.embeddings\.position_ids",
 }
 """Published weights that inference does not use, by the whole name. Anything else that is left over is an error."""
 

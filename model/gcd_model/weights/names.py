@@ -19,10 +19,6 @@ from gcd_model.config import ModelConfig
 Naming = Literal["own", "gcd", "diffusers"]
 
 GCD_UNET = "model.diffusion_model"
-GCD_IMAGE = "conditioner.embedders.0.open_clip.model.visual"
-GCD_CONDITION_VAE = "conditioner.embedders.3.encoder"
-GCD_VAE = "first_stage_model"
-IMAGE = "image_encoder/vision_model"
 PROJECTION = "image_encoder/visual_projection.weight"
 """The one matrix that diffusers has transposed."""
 

@@ -130,7 +130,7 @@ class _Reader(pickle.Unpickler):
             start = entry.header_offset + 30 + name + extra
             self._storages[key] = cast(UntypedStorage, self._bytes[start : start + entry.file_size])
         there = self._storages[key].nbytes()
-        if there < claimed:
+        if not 0 <= claimed <= there:
             raise CheckpointError(
                 f"tensor record {key} should hold {claimed} bytes and holds {there}: damaged, refused"
             )

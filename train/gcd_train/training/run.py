@@ -31,10 +31,10 @@ from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import BatchSource, UNetTask
 from gcd_train.training.setup import (
     Precision,
-    carried_leftovers,
     digest_of,
     family_of,
     fill,
+    loaded_base,
     require_exportable,
     run_config,
     sampled_as_trained,
@@ -218,7 +218,7 @@ class Trainer:
         self._loop(task, _DENOISER, recipe, identity, recipe.parts)
 
     def _export(self) -> None:
-        recipe, networks = self._recipe, self._start()
+        recipe, networks, start = self._recipe, self._start(), self._recipe.model.weights
         updates = self._fill_denoiser(networks)
         merge_lora(networks)
         thaw(networks)
@@ -228,7 +228,7 @@ class Trainer:
             move_time=recipe.data.goal_frame(self._config.frames),
             updates=updates,
             recipe=recipe.export,
-            leftovers=lambda: carried_leftovers(recipe.model, self._config),
+            leftovers=lambda: {} if start is None else loaded_base(start, self._config).carried,
             adapter=self._adapter if recipe.model.train == "lora" else None,
         )
         export(networks, self._folder, job, self._validation())

@@ -1,7 +1,6 @@
 """From a recipe to networks on a device: their config, their arithmetic, the weights they start from."""
 
 import hashlib
-from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -284,17 +283,11 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
     return networks
 
 
-def carried_leftovers(recipe: ModelRecipe, config: ModelConfig) -> Mapping[str, Tensor]:
-    """Weights of the file training started from that nothing here uses; see gcd_model.weights.save."""
-    return {} if recipe.weights is None else loaded_base(recipe.weights, config).carried
-
-
 def loaded_base(path: str, config: ModelConfig | None = None) -> LoadedWeights:
     """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError.
 
-    config: what it is to be, for heads, which published layouts do not tell.
+    config: of the model it is to start, for its heads, which published layouts do not tell.
     """
-    if config is None:
-        return load_weights(weights_path(path), ask_family=False)
-    heads = None if config.image_encoder is None else config.image_encoder.heads
-    return load_weights(weights_path(path), ask_family=False, head_width=config.unet.head_width, image_heads=heads)
+    tower, width = (None, None) if config is None else (config.image_encoder, config.unet.head_width)
+    heads = None if tower is None else tower.heads
+    return load_weights(weights_path(path), ask_family=False, head_width=width, image_heads=heads)
