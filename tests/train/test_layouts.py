@@ -153,7 +153,7 @@ class TestEncodings:
         with image.open(tmp_path / "ids.png") as opened:
             assert opened.mode == "P"
             np.testing.assert_array_equal(np.asarray(opened), ids)
-        (tmp_path / "rgba.png").write_bytes(encodings.rgba_png(drawing().rgb))
+        (tmp_path / "rgba.png").write_bytes(encodings.colour_png(drawing().rgb, alpha=True))
         with image.open(tmp_path / "rgba.png") as opened:
             assert opened.mode == "RGBA"
             np.testing.assert_array_equal(np.asarray(opened)[..., :3], drawing().rgb)

@@ -20,7 +20,6 @@ from gcd_train.cli.generate import app
 from gcd_train.data.files import FileFault
 from gcd_train.data.lerobot import CAMERA_FILE, CameraCalibration, LeRobotPairs
 from gcd_train.data.lerobot_export import (
-    ExportOptions,
     LeRobotWriter,
     LoggedEpisode,
     TabletopExport,
@@ -78,8 +77,9 @@ def _episode(number: int) -> LoggedEpisode:
 
 
 def _write(folder: Path, episodes: int = 3, episodes_a_file: int = 2) -> Path:
-    options = ExportOptions(robot="test", fps=FPS, names={}, episodes_a_file=episodes_a_file, crf=4)
-    with LeRobotWriter(folder, _calibrations(), options) as writer:
+    with LeRobotWriter(
+        folder, _calibrations(), robot="test", fps=FPS, names={}, episodes_a_file=episodes_a_file, crf=4
+    ) as writer:
         for number in range(episodes):
             writer.add(_episode(number), _pictures(number, ROWS))
     return folder

@@ -15,8 +15,7 @@ from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
-from gcd_model.weights.families import Family
-from gcd_train.data.cache import CachedClip, CachedLatents, FrozenEncoders, PathKind, encoders_digest
+from gcd_train.data.cache import CachedLatents, FrozenEncoders, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader
 from gcd_train.data.sample import Samples, to_network
@@ -225,23 +224,19 @@ class CachedBatches(WholeClips):
         source = self._precision.frames(self._joined([clip.source for clip in clips]))
         tokens = self._joined_if([clip.tokens for clip in clips])
         condition, tokens = drop_streams(source, tokens, self._config.frames, draws, self._recipe)
-        by_class = self._recipe.loss.class_weights != "none"
+        by_class, width = self._recipe.loss.class_weights != "none", self._config.unet.vector_width
+        motion, noise = self._recipe.motion_bucket, self._recipe.augmentation
+        vectors = [micro_conditioning(clip.fps, motion, noise, width) for clip in clips]
         return Batch(
             target=self._precision.frames(self._joined([clip.target for clip in clips])),
             condition=condition,
-            vector=torch.cat([self._vector(clip) for clip in clips]).to(self._precision.device),
+            vector=torch.stack(vectors).repeat_interleave(self._config.frames, dim=0).to(self._precision.device),
             tokens=tokens,
             emphasis=self._joined_if([clip.emphasis for clip in clips]) if by_class else None,
             frames=self._config.frames,
             ids=tuple(f"{clip.scene} from {clip.place.start} by {clip.place.stride}" for clip in clips),
             wait_s=wait_s,
         )
-
-    def _vector(self, clip: CachedClip) -> Tensor:
-        """Micro-conditioning of a clip's frames, [T, V]."""
-        recipe, width = self._recipe, self._config.unet.vector_width
-        vector = micro_conditioning(clip.fps, recipe.motion_bucket, recipe.augmentation, width)
-        return vector.expand(self._config.frames, -1)
 
     def _joined(self, rows: Sequence[Tensor]) -> Tensor:
         return torch.cat(list(rows)).to(self._precision.device)

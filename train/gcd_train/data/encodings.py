@@ -104,14 +104,9 @@ def with_sky(metres: Floats) -> Floats:
     return np.where(metres > 0, metres, np.float32(SKY_M))
 
 
-def rgba_png(rgb: Bytes) -> bytes:
-    """[H, W, 3] as a PNG with an alpha channel that is opaque everywhere."""
-    return _encoded(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGRA), _FAST_PNG)
-
-
-def rgb_png(rgb: Bytes) -> bytes:
-    """[H, W, 3] as a PNG without loss."""
-    return _encoded(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), _FAST_PNG)
+def colour_png(rgb: Bytes, *, alpha: bool = False) -> bytes:
+    """[H, W, 3] as a PNG without loss. alpha: with a channel that is opaque everywhere."""
+    return _encoded(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGRA if alpha else cv2.COLOR_RGB2BGR), _FAST_PNG)
 
 
 def webp(rgb: Bytes, *, quality: int) -> bytes:

@@ -59,6 +59,8 @@ SUFFIXES: dict[Layer, str] = {"rgba": "png", "depth": "tiff", "segmentation": "p
 COMPACT_SUFFIXES: dict[Layer, str] = {"rgba": "webp", "depth": "png", "segmentation": "png"}
 CAMERAS = tuple(f"view{view}" for view in range(VIEWS))
 """The published views by their number."""
+_PLANAR = ".png"
+"""Depth of compact scenes goes along the axis; published depth is the distance."""
 STEP_RATE_HZ = 480
 """Of the physics of both worlds in this layout."""
 
@@ -164,7 +166,10 @@ class Kubric4D(Dataset4D):
         folder, view = self.folder(scene), self._views(scene)[camera]
         if not 0 <= time < len(view.poses):
             raise FileFault(view.path, f"tells of {len(view.poses)} frames, wanted frame {time}")
-        (colour, _), (far, is_planar) = (_existing(folder, camera, layer, time) for layer in ("rgba", "depth"))
+        colour, far = (
+            one_of(*(frame_path(folder, camera, layer, time, compact=compact) for compact in (False, True)))
+            for layer in ("rgba", "depth")
+        )
         size = (view.lens.height, view.lens.width, view.path.name)
         rgb, depth = sized(colour, read_colour(colour), *size), sized(far, read_depth(far), *size)
         instances = None
@@ -173,7 +178,7 @@ class Kubric4D(Dataset4D):
             instances = sized(path, read_palette_indices(path), *size).astype(np.uint16)
         return SceneView(
             rgb=rgb,
-            depth=depth if is_planar else planar_from_distance(depth, view.lens, published=self._published),
+            depth=depth if far.suffix == _PLANAR else planar_from_distance(depth, view.lens, published=self._published),
             classes=None,
             instances=instances,
             world_from_camera=view.poses[time],
@@ -191,13 +196,6 @@ class Kubric4D(Dataset4D):
                     f"{first.lens.width} x {first.lens.height}: sizes are mixed",
                 )
         return views
-
-
-def _existing(folder: Path, camera: str, layer: Layer, time: int) -> tuple[Path, bool]:
-    """The file of a picture, and whether it is the compact one."""
-    published, compact = (frame_path(folder, camera, layer, time, compact=each) for each in (False, True))
-    path = one_of(published, compact)
-    return path, path == compact
 
 
 def _read_view(path: Path) -> _View:
@@ -250,7 +248,7 @@ class Kubric4DWriter:
             self._write(view, "rgba", time, encodings.webp(drawn.rgb, quality=WEBP_QUALITY))
             self._write(view, "depth", time, encodings.depth_png(with_sky(drawn.depth)))
         else:
-            self._write(view, "rgba", time, encodings.rgba_png(drawn.rgb))
+            self._write(view, "rgba", time, encodings.colour_png(drawn.rgb, alpha=True))
             self._write(view, "depth", time, encodings.float_tiff(with_sky(drawn.depth * self._rays)))
 
     def finish(self) -> None:

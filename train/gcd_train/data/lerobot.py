@@ -278,7 +278,8 @@ class LeRobotPairs(DrawnSamples):
         repeats: int = 400,
         episodes: tuple[int, int | None] = (0, None),
     ) -> None:
-        extra("pyarrow.parquet"), extra("av")  # what is not installed is said now, not sample by sample
+        for module in ("pyarrow.parquet", "av"):  # what is not installed is said now, not sample by sample
+            extra(module)
         self.info = _read_info(folder)
         every = _episodes(folder, self.info)
         self.episodes = every[slice(*episodes)]

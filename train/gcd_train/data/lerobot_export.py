@@ -47,21 +47,6 @@ class LoggedEpisode:
     task: str
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ExportOptions:
-    """How a set is written.
-
-    robot: its name. fps: of rows and videos. names: what the numbers of a feature are called. crf: quality of H.264,
-    lower is better. episodes_a_file: after so many, the next files begin.
-    """
-
-    robot: str
-    fps: int
-    names: Mapping[str, Sequence[str]]
-    crf: int = 18
-    episodes_a_file: int = 100
-
-
 Statistics = dict[str, NDArray[np.float64]]
 """min, max, mean and std of each number, and the count of rows, [1]."""
 
@@ -99,11 +84,24 @@ class _Video:
 class LeRobotWriter:
     """Writes a data set episode by episode into an empty folder; complete when it is closed.
 
+    robot: its name. fps: of rows and videos. names: what the numbers of a feature are called. crf: quality of H.264,
+    lower is better. episodes_a_file: after so many, the next files begin.
     Raises DataError without the extra `lerobot`, or if an episode does not fit the others.
     """
 
-    def __init__(self, folder: Path, cameras: dict[str, CameraCalibration], options: ExportOptions) -> None:
-        self._folder, self._cameras, self._options = folder, cameras, options
+    def __init__(
+        self,
+        folder: Path,
+        cameras: dict[str, CameraCalibration],
+        *,
+        robot: str,
+        fps: int,
+        names: Mapping[str, Sequence[str]],
+        crf: int = 18,
+        episodes_a_file: int = 100,
+    ) -> None:
+        self._folder, self._cameras, self._robot, self._fps = folder, cameras, robot, fps
+        self._names, self._crf, self._episodes_a_file = names, crf, episodes_a_file
         self._arrow, self._parquet, self._av = extra("pyarrow"), extra("pyarrow.parquet"), extra("av")
         self._count, self._frames, self._tasks = 0, 0, dict[str, int]()
         self._statistics: dict[str, list[Statistics]] = {}
@@ -132,7 +130,7 @@ class LeRobotWriter:
         self._tables.append(pa.table(flat | lists))
         self._episodes.append(self._episode(episode, frames, begins, statistics))
         self._count, self._frames = self._count + 1, self._frames + frames
-        if self._count % self._options.episodes_a_file == 0:
+        if self._count % self._episodes_a_file == 0:
             self._finish_files()
 
     def close(self) -> None:
@@ -147,7 +145,7 @@ class LeRobotWriter:
 
     @property
     def _place(self) -> dict[str, int]:
-        number = self._count // self._options.episodes_a_file
+        number = self._count // self._episodes_a_file
         return {"chunk": number // CHUNK, "file": number % CHUNK}
 
     def _video(self, name: str) -> _Video:
@@ -155,12 +153,12 @@ class LeRobotWriter:
             path = self._folder / "videos" / name / f"{_FILE.format(**self._place)}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
             container = self._av.open(str(path), "w")
-            stream = container.add_stream("libx264", rate=self._options.fps)
+            stream = container.add_stream("libx264", rate=self._fps)
             camera = self._cameras[name]
             stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
-            stream.time_base = Fraction(1, self._options.fps)
+            stream.time_base = Fraction(1, self._fps)
             stream.codec_context.gop_size = 2  # as LeRobot's own: any frame is near a key frame
-            stream.options = {"crf": str(self._options.crf), "preset": "fast", "bf": "0"}
+            stream.options = {"crf": str(self._crf), "preset": "fast", "bf": "0"}
             self._videos[name] = _Video(container, stream)
         return self._videos[name]
 
@@ -176,7 +174,7 @@ class LeRobotWriter:
                     self._video(name),
                     self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24"),
                 )
-                frame.pts, frame.time_base = video.frames, Fraction(1, self._options.fps)
+                frame.pts, frame.time_base = video.frames, Fraction(1, self._fps)
                 video.container.mux(video.stream.encode(frame))
                 video.frames += 1
                 if number % _SAMPLED == 0:
@@ -192,14 +190,14 @@ class LeRobotWriter:
                 raise DataError(f"{name} had {width} numbers in the first episode and has {rows.shape[1]} in this one")
         task, steps = self._tasks.setdefault(episode.task, len(self._tasks)), np.arange(frames)
         numbers = (steps, np.full(frames, self._count), self._frames + steps, np.full(frames, task))
-        own = [(steps / self._options.fps).astype(np.float32), *(row.astype(np.int64) for row in numbers)]
+        own = [(steps / self._fps).astype(np.float32), *(row.astype(np.int64) for row in numbers)]
         return columns | {name: row[:, None] for name, row in zip(_OWN, own, strict=True)}
 
     def _episode(
         self, episode: LoggedEpisode, frames: int, begins: dict[str, int], statistics: dict[str, Statistics]
     ) -> dict[str, Any]:
         """The episode's row in meta/episodes."""
-        place, fps = self._place, self._options.fps
+        place, fps = self._place, self._fps
         row: dict[str, Any] = {
             "episode_index": self._count,
             "tasks": [episode.task],
@@ -237,7 +235,7 @@ class LeRobotWriter:
         self._videos = {}
         if not self._tables:
             return
-        number = (self._count - 1) // self._options.episodes_a_file
+        number = (self._count - 1) // self._episodes_a_file
         name = f"{_FILE.format(chunk=number // CHUNK, file=number % CHUNK)}.parquet"
         for table, room in (
             (self._arrow.concat_tables(self._tables), "data"),
@@ -264,14 +262,14 @@ class LeRobotWriter:
     def _info(self) -> dict[str, Any]:
         return {
             "codebase_version": "v3.0",
-            "robot_type": self._options.robot,
+            "robot_type": self._robot,
             "total_episodes": self._count,
             "total_frames": self._frames,
             "total_tasks": len(self._tasks),
             "chunks_size": CHUNK,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
-            "fps": self._options.fps,
+            "fps": self._fps,
             "splits": {"train": f"0:{self._count}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
@@ -282,13 +280,13 @@ class LeRobotWriter:
         told: dict[str, Any] = {}
         for name, camera in self._cameras.items():
             video: dict[str, Any] = {"height": camera.height, "width": camera.width, "codec": "h264"}
-            video |= {"pix_fmt": "yuv420p", "is_depth_map": False, "fps": self._options.fps, "channels": 3}
+            video |= {"pix_fmt": "yuv420p", "is_depth_map": False, "fps": self._fps, "channels": 3}
             info = {f"video.{key}": value for key, value in video.items()} | {"has_audio": False}
             shape, axes = [camera.height, camera.width, 3], ["height", "width", "channels"]
             told[name] = {"dtype": "video", "shape": shape, "names": axes, "info": info}
         for name, parts in self._statistics.items():
             if name not in self._cameras and name not in _OWN:
-                names = list(self._options.names.get(name, [])) or None
+                names = list(self._names.get(name, [])) or None
                 told[name] = {"dtype": "float32", "shape": list(parts[0]["mean"].shape), "names": names}
         for name in _OWN:
             told[name] = {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
@@ -333,11 +331,12 @@ def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out} is there already; choose another folder, or remove it")
     names = {_POSE_FEATURE: [f"base_from_camera_{row}{column}" for row in range(4) for column in range(4)]}
-    options = ExportOptions(robot="tabletop primitive", fps=round(FPS), names=names)
     with (
         new_folder(out.absolute().parent, out.name) as folder,
         Renderer(export.width, export.height, oversample=export.oversample) as renderer,
-        LeRobotWriter(folder, _calibrations(export, poses), options) as writer,
+        LeRobotWriter(
+            folder, _calibrations(export, poses), robot="tabletop primitive", fps=round(FPS), names=names
+        ) as writer,
     ):
         for done, seed in enumerate(export.seeds, start=1):
             episode = tabletop_episode(seed, frames=export.frames, skipped_s=0.0)

@@ -104,15 +104,15 @@ class SampleLoader:
         self._batches = iter(self._loader(numbers)) if self._recipe.workers else self._here(numbers)
 
     def _here(self, numbers: Iterator[int]) -> Iterator[SampleBatch | TrainError]:
-        for indices in _Batches(self._order, numbers, self._count):
-            yield collate([self._samples.sample(index) for index in indices])
+        for number in numbers:
+            yield collate([self._samples.sample(index) for index in self._order.batch(number, self._count)])
 
     def _loader(self, numbers: Iterator[int]) -> DataLoader[Sample | TrainError]:
-        recipe = self._recipe
+        recipe, count = self._recipe, self._count
         order = SampleOrder(self._order.length, self._order.seed)  # read ahead, so not the one that is looked up
         return DataLoader(
             _Numbered(self._samples),
-            batch_sampler=_Batches(order, numbers, self._count),
+            batch_sampler=(order.batch(number, count) for number in numbers),
             num_workers=recipe.workers,
             prefetch_factor=recipe.prefetch,
             collate_fn=_collated,
@@ -125,18 +125,6 @@ class SampleLoader:
 def _numbered(first: int, steps: Sequence[int]) -> Iterator[int]:
     """`first`, then on and on by the steps in turn."""
     return accumulate(cycle(steps), initial=first)
-
-
-@dataclass(frozen=True, slots=True)
-class _Batches:
-    """Numbers of the samples of each batch: a batch sampler."""
-
-    order: SampleOrder
-    numbers: Iterator[int]
-    count: int
-
-    def __iter__(self) -> Iterator[list[int]]:
-        return (self.order.batch(number, self.count) for number in self.numbers)
 
 
 class _Numbered(Dataset[Sample | TrainError]):

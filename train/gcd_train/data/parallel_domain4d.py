@@ -166,7 +166,10 @@ class ParallelDomain4D(Dataset4D):
     def view(self, scene: str, camera: str, time: int) -> SceneView:
         """See Dataset4D."""
         folder, (lens, pose) = self.folder(scene), self._scene(scene).cameras[camera]
-        colour, depth = (_existing(folder, camera, layer, time) for layer in ("rgb", "depth"))
+        colour, depth = (
+            one_of(*(frame_path(folder, camera, layer, time, compact=compact) for compact in (False, True)))
+            for layer in ("rgb", "depth")
+        )
         size = (lens.height, lens.width, f"{self.source_camera}'s first picture")
         rgb, metres = sized(colour, read_colour(colour), *size), sized(depth, read_depth(depth, DEPTH_KEY), *size)
         classes = instances = None
@@ -200,11 +203,6 @@ class ParallelDomain4D(Dataset4D):
                     ontology_folder(folder), f"holds the wrong ontology: it differs from the first scene's {differ}"
                 )
         return _Scene(cameras, 1 + max(frame_time(path.stem) or 0 for path in pictures))
-
-
-def _existing(folder: Path, camera: str, layer: Layer, time: int) -> Path:
-    """The file of a picture, published or compact."""
-    return one_of(*(frame_path(folder, camera, layer, time, compact=compact) for compact in (False, True)))
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -333,7 +331,7 @@ class ParallelDomain4DWriter:
             self._write(camera, "rgb", time, encodings.webp(drawn.rgb, quality=WEBP_QUALITY))
             self._write(camera, "depth", time, encodings.street_depth_png(depth))
         else:
-            self._write(camera, "rgb", time, encodings.rgb_png(drawn.rgb))
+            self._write(camera, "rgb", time, encodings.colour_png(drawn.rgb))
             self._write(camera, "depth", time, encodings.float_npz(depth, DEPTH_KEY))
         self._write(camera, "semantic_segmentation_2d", time, id_png(self._class_ids[drawn.classes]))
         self._write(camera, "instance_segmentation_2d", time, id_png(drawn.instances))

@@ -71,7 +71,13 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
     place = root / world.scene_name(seed)
     header = _header(world, form, seed)
     if place.exists():
-        _require_alike(place, header)
+        there = read_manifest(place)
+        for name, wanted in header.items():
+            if getattr(there, name) != wanted:
+                raise DataError(
+                    f"{place} is there already with {name} {getattr(there, name)}, wanted {wanted}; choose another "
+                    "folder or remove it"
+                )
         return SceneMade(folder=place, made=False)
     started = time.process_time()
     require_drawing()  # before a simulation of many seconds
@@ -119,16 +125,6 @@ def _header(world: SceneWorld, form: SceneFormat, seed: int) -> dict[str, Any]:
         "oversample": form.oversample,
         "compact": form.compact,
     }
-
-
-def _require_alike(place: Path, header: dict[str, Any]) -> None:
-    there = read_manifest(place)
-    for name, wanted in header.items():
-        came = getattr(there, name)
-        if came != wanted:
-            raise DataError(
-                f"{place} is there already with {name} {came}, wanted {wanted}; choose another folder or remove it"
-            )
 
 
 def _vehicle_path(world: SceneWorld, scene: Scene) -> tuple[Matrix, ...] | None:
