@@ -127,7 +127,7 @@ def test_no_vehicle_drives_through_a_camera() -> None:
     rows = np.array([[t, 100.0, 0.0, 0.0] for t in range(5)], np.float32)
     for height, kept in ((2.0, False), (6.0, True)):
         cameras = np.tile([4.0, 100.0, height], (5, 1, 1))
-        crowd = Crowd(street=street, drive=way, obstacles=np.zeros((0, 5)), cameras=cameras, camera_room_m=0.5)
+        crowd = Crowd(street=street, drive=way, obstacles=np.zeros((0, 5)), cameras=cameras)
         assert crowd.add(bus, rows) is kept
         assert not crowd.add(bus, rows + np.array([1, 0, 0, 0], np.float32))  # there is one, or the camera still is
 
