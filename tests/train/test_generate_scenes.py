@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,16 +68,15 @@ class TestNewFolder:
         assert inside(tmp_path) == ["scn00001"]
         assert (tmp_path / "scn00001" / "a").read_bytes() == b"fast"
 
-    def test_a_file_in_the_way_is_named(self, tmp_path: Path) -> None:
-        (tmp_path / "scn00001").write_text("notes")
-        with pytest.raises(RunError, match=r"scn00001 is in the way"), new_folder(tmp_path, "scn00001") as folder:
+    @pytest.mark.parametrize(("root", "taken"), [(".", "scn00001"), ("data", "data")])
+    def test_a_file_in_the_way_is_named(self, root: str, taken: str, tmp_path: Path) -> None:
+        (tmp_path / taken).write_text("notes")
+        with (
+            pytest.raises(RunError, match=f"{taken} (is in the way|cannot be written)"),
+            new_folder(tmp_path / root, "scn00001") as folder,
+        ):
             (folder / "a").write_bytes(b"1")
-        assert (tmp_path / "scn00001").read_text() == "notes"
-
-    def test_a_place_that_is_no_folder_is_named(self, tmp_path: Path) -> None:
-        (tmp_path / "data").write_text("notes")
-        with pytest.raises(RunError, match="data cannot be written"), new_folder(tmp_path / "data", "scn00001"):
-            pass
+        assert (tmp_path / taken).read_text() == "notes"
 
     def test_what_others_are_making_is_no_leftover(self, tmp_path: Path) -> None:
         with new_folder(tmp_path, "scn00001") as folder:
@@ -138,19 +138,15 @@ class TestWriteScene:
         np.testing.assert_array_equal(again.rgb, drawn.rgb)
         assert {0, 4, 9} == set(np.unique(drawn.instances).tolist()), "the picture shows ground, both boxes"
 
-    def test_a_scene_that_is_there_is_kept(self, tmp_path: Path) -> None:
-        write_scene(tmp_path, box_world(), FORM, 0)
-        before = (tmp_path / "scn00000" / MANIFEST).stat().st_mtime_ns
+    def test_a_scene_that_is_there_is_kept_and_one_of_another_kind_refused(self, tmp_path: Path) -> None:
+        manifest = write_scene(tmp_path, box_world(), FORM, 0).folder / MANIFEST
+        before = manifest.stat().st_mtime_ns
         assert not write_scene(tmp_path, box_world(), FORM, 0).made
-        assert (tmp_path / "scn00000" / MANIFEST).stat().st_mtime_ns == before
-
-    def test_a_scene_of_another_kind_is_refused(self, tmp_path: Path) -> None:
-        write_scene(tmp_path, box_world(), FORM, 0)
-        other = SceneFormat(width=48, height=32, frames=2, oversample=1, compact=True)
+        assert manifest.stat().st_mtime_ns == before
         with pytest.raises(DataError, match="with compact False, wanted True; choose another folder"):
-            write_scene(tmp_path, box_world(), other, 0)
-        newer = msgspec.structs.replace(read_manifest(tmp_path / "scn00000"), edition=2)
-        (tmp_path / "scn00000" / MANIFEST).write_bytes(msgspec.json.encode(newer))
+            write_scene(tmp_path, box_world(), replace(FORM, compact=True), 0)
+        newer = msgspec.structs.replace(read_manifest(manifest.parent), edition=2)
+        manifest.write_bytes(msgspec.json.encode(newer))
         with pytest.raises(DataError, match="edition 2, wanted 1"):
             write_scene(tmp_path, box_world(), FORM, 0)
 
