@@ -25,7 +25,7 @@ from gcd_node.errors import ConfigError
 from gcd_node.health import Health
 from gcd_node.sources import SourceConfig, SourcePose
 from gcd_node.verbs import VERBS, RequestError, parse_command
-from gcd_train.cli.generate import app as train_app
+from gcd_train.cli.main import app as train_app
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "launch/README", "tools/README", "client/README")]

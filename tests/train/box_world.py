@@ -3,27 +3,25 @@
 from pathlib import Path
 
 import numpy as np
+from stage_world import LIGHT
 
-from gcd_model.geometry import sphere_poses
 from gcd_train.data.files import SceneManifest, faults, read_manifest
 from gcd_train.errors import DataError
-from gcd_train.scenes.description import Light, Paint, Part, Pattern, Scene, SceneObject, Sheet, square, upright
+from gcd_train.scenes.description import Paint, Part, Pattern, Scene, SceneObject, Sheet, square, upright
+from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.worlds import SceneWorld
 
 RED, GREEN = 9, 4
 """Instance ids; out of order, so that renumbering shows."""
-HFOV_DEG = float(np.degrees(2 * np.arctan(0.5)))
 
 
 def box_scene(seed: int, frames: int) -> Scene:
     """Seed n: the green box is n / 10 m further to the left."""
-    import torch
-
     slide = np.zeros((frames, 3, 4), np.float32)
     slide[:, 1] = (2.0, -1.5, 1.0, 0.0)
     slide[:, 2, 0], slide[:, 2, 1], slide[:, 2, 3] = 0.5 * np.arange(frames), 2.0 + seed / 10, 0.3 * np.arange(frames)
     slide[:, 2, 2] = 0.5
-    angles = torch.tensor([[90.0, 45.0, 15.0], [15.0, 5.0, 15.0]], dtype=torch.float64)
+    cameras = orbit_cameras(frames)
     return Scene(
         parts=(
             Part("box", (0, 0, 0), (2, 2, 2), Paint((0.9, 0.1, 0.1)), 5, instance=RED, body=1),
@@ -33,13 +31,13 @@ def box_scene(seed: int, frames: int) -> Scene:
         sheets=(Sheet(square(40.0, 0.0), Paint((0.4, 0.4, 0.4)), 1),),
         poses=upright(slide),
         focus=np.zeros((frames, 3), np.float32),
-        cameras={f"view{n}": np.tile(pose, (frames, 1, 1)) for n, pose in enumerate(sphere_poses(angles).numpy())},
+        cameras={"view0": cameras["view1"], "view1": cameras["view4"]},
         hfov_deg=HFOV_DEG,
-        light=_LIGHT,
+        light=LIGHT,
         facts={"seed": seed},
         objects=(
-            _object("red box", RED, 1, (2.0, 2.0, 2.0), slide[:, 1]),
-            _object("green box", GREEN, 2, (1.0, 3.0, 1.0), slide[:, 2]),
+            box_object("red box", RED, 1, (2.0, 2.0, 2.0), slide[:, 1]),
+            box_object("green box", GREEN, 2, (1.0, 3.0, 1.0), slide[:, 2]),
         ),
     )
 
@@ -52,16 +50,7 @@ def odd_box_scene(seed: int, frames: int) -> Scene:
 
 
 def box_world(make: object = box_scene) -> SceneWorld:
-    return SceneWorld(
-        name="boxes",
-        layout="kubric4d",
-        make=make,  # pyright: ignore[reportArgumentType]
-        edition=1,
-        frames=2,
-        fps=24.0,
-        width=48,
-        height=32,
-    )
+    return SceneWorld(name="boxes", make=make, frames=2, width=48, height=32)  # pyright: ignore[reportArgumentType]
 
 
 def checked(scene: Path) -> SceneManifest:
@@ -70,7 +59,7 @@ def checked(scene: Path) -> SceneManifest:
     return read_manifest(scene)
 
 
-def _object(name: str, instance: int, body: int, size: tuple[float, float, float], path: np.ndarray) -> SceneObject:
+def box_object(name: str, instance: int, body: int, size: tuple[float, float, float], path: np.ndarray) -> SceneObject:
     frames, half = len(path), path[:, 3] / 2
     turns = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1).astype(np.float64)
     return SceneObject(
@@ -88,16 +77,3 @@ def _object(name: str, instance: int, body: int, size: tuple[float, float, float
         velocities=np.zeros((frames, 3)),
         angular_velocities=np.zeros((frames, 3)),
     )
-
-
-_LIGHT = Light(
-    sun_to=(0.3, 0.2, 0.93),
-    sun=(2.0, 2.0, 2.0),
-    sky=(0.5, 0.6, 0.7),
-    ground=(0.2, 0.2, 0.2),
-    horizon=(0.7, 0.8, 0.9),
-    zenith=(0.2, 0.4, 0.8),
-    fog_m=500.0,
-    cloud=0.2,
-    exposure=1.0,
-)

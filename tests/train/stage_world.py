@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gcd_model.geometry import Spherical, to_pose
 from gcd_train.scenes.description import Light, Paint, Part, Scene, upright
+from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.worlds import SCENE_WORLDS
 
 LIGHT = Light(
@@ -25,8 +25,6 @@ def stage(seed: int, frames: int) -> Scene:
     """A floor with a box that slides over it; no physics."""
     path = np.zeros((frames, 2, 4), np.float32)
     path[:, 1, 0] = np.arange(frames) + seed
-    angles = [(90.0 * view, 45.0) for view in range(4)] + [(15.0 + 30.0 * view, 5.0) for view in range(12)]
-    poses = [to_pose(Spherical(azimuth_deg=a, elevation_deg=e, radius_m=15.0)).numpy() for a, e in angles]
     floor = Part("box", (0, 0, -0.5), (60, 60, 1), Paint((0.5, 0.4, 0.3)), 1)
     box = Part("box", (0, 0, 1), (2, 2, 2), Paint((0.2, 0.3, 0.8)), 2, instance=7, body=1)
     return Scene(
@@ -34,8 +32,8 @@ def stage(seed: int, frames: int) -> Scene:
         sheets=(),
         poses=upright(path),
         focus=np.zeros((frames, 3), np.float32),
-        cameras={f"view{view}": np.repeat(pose[None], frames, 0) for view, pose in enumerate(poses)},
-        hfov_deg=float(2 * np.degrees(np.arctan(0.5))),
+        cameras=orbit_cameras(frames),
+        hfov_deg=HFOV_DEG,
         light=LIGHT,
     )
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from typer.testing import CliRunner
 
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data.compact import Compaction
 from gcd_train.data.encodings import DepthCode
 from gcd_train.data.kubric4d import Kubric4D

@@ -10,7 +10,7 @@ from driving_plane import PlaneClips
 from made_records import note, record
 from typer.testing import CliRunner
 
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError, RunError
 from gcd_train.evaluation.baselines import CopySource

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from box_world import box_scene, box_world, checked, odd_box_scene
 from headless import needs_egl
 from typer.testing import CliRunner
 
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data import kubric4d
 from gcd_train.data.files import GEOMETRY, MANIFEST, SceneFiles, faults, read_manifest
 from gcd_train.errors import DataError, RecipeError, RenderError, RunError
@@ -68,16 +69,15 @@ class TestNewFolder:
         assert inside(tmp_path) == ["scn00001"]
         assert (tmp_path / "scn00001" / "a").read_bytes() == b"fast"
 
-    def test_a_file_in_the_way_is_named(self, tmp_path: Path) -> None:
-        (tmp_path / "scn00001").write_text("notes")
-        with pytest.raises(RunError, match=r"scn00001 is in the way"), new_folder(tmp_path, "scn00001") as folder:
+    @pytest.mark.parametrize(("root", "taken"), [(".", "scn00001"), ("data", "data")])
+    def test_a_file_in_the_way_is_named(self, root: str, taken: str, tmp_path: Path) -> None:
+        (tmp_path / taken).write_text("notes")
+        with (
+            pytest.raises(RunError, match=f"{taken} (is in the way|cannot be written)"),
+            new_folder(tmp_path / root, "scn00001") as folder,
+        ):
             (folder / "a").write_bytes(b"1")
-        assert (tmp_path / "scn00001").read_text() == "notes"
-
-    def test_a_place_that_is_no_folder_is_named(self, tmp_path: Path) -> None:
-        (tmp_path / "data").write_text("notes")
-        with pytest.raises(RunError, match="data cannot be written"), new_folder(tmp_path / "data", "scn00001"):
-            pass
+        assert (tmp_path / taken).read_text() == "notes"
 
     def test_what_others_are_making_is_no_leftover(self, tmp_path: Path) -> None:
         with new_folder(tmp_path, "scn00001") as folder:
@@ -128,37 +128,26 @@ class TestWriteScene:
         assert len(files) == 2 * 2 * 3 + 2 + 2  # views, frames, layers; metadata; geometry and manifest
         assert made.size == sum((made.folder / name).stat().st_size for name in files)
 
-    def test_pictures_are_those_of_the_renderer(self, tmp_path: Path) -> None:
-        folder = write_scene(tmp_path, box_world(), FORM, 0).folder
+    def test_pictures_are_those_of_the_renderer_and_of_the_kept_geometry(self, tmp_path: Path) -> None:
+        folder, cameras = write_scene(tmp_path, box_world(), FORM, 0).folder, box_scene(0, 2).cameras
         with Renderer(48, 32, oversample=1) as renderer:
             drawn = renderer.render(box_scene(0, 2))["view1"][1]
+            again = [view for _, _, view in renderer.views(FrozenScene.load(folder / GEOMETRY), cameras)][-1]
         rgba = cv2.imread(str(kubric4d.frame_path(folder, "view1", "rgba", 1)), cv2.IMREAD_UNCHANGED)
         assert rgba is not None
         np.testing.assert_array_equal(rgba[..., 2::-1], drawn.rgb)
+        np.testing.assert_array_equal(again.rgb, drawn.rgb)
         assert {0, 4, 9} == set(np.unique(drawn.instances).tolist()), "the picture shows ground, both boxes"
 
-    def test_the_kept_geometry_draws_the_same_picture(self, tmp_path: Path) -> None:
-        folder = write_scene(tmp_path, box_world(), FORM, 0).folder
-        frozen = FrozenScene.load(folder / GEOMETRY)
-        with Renderer(48, 32, oversample=1) as renderer:
-            first = next(iter(renderer.views(frozen, box_scene(0, 2).cameras)))[2]
-        rgba = cv2.imread(str(kubric4d.frame_path(folder, "view0", "rgba", 0)), cv2.IMREAD_UNCHANGED)
-        assert rgba is not None
-        np.testing.assert_array_equal(rgba[..., 2::-1], first.rgb)
-
-    def test_a_scene_that_is_there_is_kept(self, tmp_path: Path) -> None:
-        write_scene(tmp_path, box_world(), FORM, 0)
-        before = (tmp_path / "scn00000" / MANIFEST).stat().st_mtime_ns
+    def test_a_scene_that_is_there_is_kept_and_one_of_another_kind_refused(self, tmp_path: Path) -> None:
+        manifest = write_scene(tmp_path, box_world(), FORM, 0).folder / MANIFEST
+        before = manifest.stat().st_mtime_ns
         assert not write_scene(tmp_path, box_world(), FORM, 0).made
-        assert (tmp_path / "scn00000" / MANIFEST).stat().st_mtime_ns == before
-
-    def test_a_scene_of_another_kind_is_refused(self, tmp_path: Path) -> None:
-        write_scene(tmp_path, box_world(), FORM, 0)
-        other = SceneFormat(width=48, height=32, frames=2, oversample=1, compact=True)
+        assert manifest.stat().st_mtime_ns == before
         with pytest.raises(DataError, match="with compact False, wanted True; choose another folder"):
-            write_scene(tmp_path, box_world(), other, 0)
-        newer = msgspec.structs.replace(read_manifest(tmp_path / "scn00000"), edition=2)
-        (tmp_path / "scn00000" / MANIFEST).write_bytes(msgspec.json.encode(newer))
+            write_scene(tmp_path, box_world(), replace(FORM, compact=True), 0)
+        newer = msgspec.structs.replace(read_manifest(manifest.parent), edition=2)
+        manifest.write_bytes(msgspec.json.encode(newer))
         with pytest.raises(DataError, match="edition 2, wanted 1"):
             write_scene(tmp_path, box_world(), FORM, 0)
 
@@ -182,41 +171,22 @@ class TestWriteScene:
         with pytest.raises(DataError):
             list(faults(folder))
 
-    def test_a_full_disk_leaves_what_was_finished(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        write_scene(tmp_path, box_world(), FORM, 0)
-        whole = SceneFiles.write
-
-        def full(self: SceneFiles, path: Path, data: bytes) -> None:
-            if len(self.checksums) == 5:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(data[:10])
-                raise OSError(28, "No space left on device", str(path))
-            whole(self, path, data)
-
-        monkeypatch.setattr(SceneFiles, "write", full)
-        accounts = [
-            (run.written, run.there, dict(run.failures))
-            for run in generate_scenes(tmp_path, box_world(), FORM, range(2))
-        ]
-        assert accounts[0] == (0, 1, {})
-        assert accounts[1][:2] == (0, 1)
-        assert "No space left on device" in accounts[1][2][1]
-        assert inside(tmp_path) == ["scn00000"]
-        checked(tmp_path / "scn00000")
-
-    def test_a_file_size_limit_leaves_nothing_half_done(self, tmp_path: Path) -> None:
+    def test_a_file_size_limit_leaves_what_was_finished_and_nothing_half_done(self, tmp_path: Path) -> None:
         """The kernel refuses the sixth kibibyte of any file: what a quota or a full disk does, for real."""
+        write_scene(tmp_path, box_world(), FORM, 1)
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         try:
             resource.setrlimit(resource.RLIMIT_FSIZE, (5120, before[1]))
-            *_, last = generate_scenes(tmp_path, box_world(), FORM, range(1))
+            *_, last = generate_scenes(tmp_path, box_world(), FORM, range(2))
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
             signal.signal(signal.SIGXFSZ, handler)
+        assert (last.written, last.there, list(last.failures)) == (0, 1, [0])
         assert "File too large" in last.failures[0]
         assert re.search(r"scn00000/(frames_p0_v\d/\w+_0000\d\.\w+|geometry\.npz)", last.failures[0])
-        assert inside(tmp_path) == []
+        assert inside(tmp_path) == ["scn00001"]
+        checked(tmp_path / "scn00001")
 
 
 @needs_egl
@@ -304,17 +274,7 @@ SMALL = ["--width", "48", "--height", "32", "--frames", "2", "--oversample", "1"
 @needs_egl
 class TestCommand:
     def test_driving_scenes(self, tmp_path: Path) -> None:
-        line = [
-            "generate",
-            "driving",
-            str(tmp_path / "data"),
-            "--scenes",
-            "1",
-            "--compact",
-            "--first-seed",
-            "5",
-            *SMALL,
-        ]
+        line = [*f"generate driving {tmp_path / 'data'} --scenes 1 --compact --first-seed 5".split(), *SMALL]
         made = CliRunner().invoke(app, line)
         assert made.exit_code == 0, made.output
         assert "1 written" in made.output
@@ -333,10 +293,7 @@ class TestCommand:
     @pytest.mark.parametrize("world", ["drop", "tabletop"])
     def test_scenes_on_a_stage(self, tmp_path: Path, world: str) -> None:
         pytest.importorskip("mujoco", reason="needs the extra `scenes`")
-        few_things = "7"
-        made = CliRunner().invoke(
-            app, ["generate", world, str(tmp_path), "--first-seed", few_things, "--compact", *SMALL]
-        )
+        made = CliRunner().invoke(app, ["generate", world, str(tmp_path), "--first-seed", "7", "--compact", *SMALL])
         assert made.exit_code == 0, made.output
         manifest = checked(tmp_path / "scn00007")
         assert (manifest.world, len(manifest.cameras)) == (world, 16)

@@ -29,7 +29,7 @@ from torch.testing import assert_close
 from typer.testing import CliRunner
 
 from gcd_model.loading import random_weights
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data.batches import CachedBatches
 from gcd_train.data.cache import (
     CachedLatents,

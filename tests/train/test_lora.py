@@ -16,7 +16,7 @@ from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_model.weights.adapter import adapted, base_digest
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data.open import RunData
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe

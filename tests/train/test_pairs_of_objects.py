@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from box_world import box_object
 from headless import needs_egl
 from stage_world import STAGE as FAST_STAGE
 from stage_world import stage as fast_stage
@@ -16,12 +17,12 @@ from typer.testing import CliRunner
 
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import CameraMount, driving_trajectory
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.sample import painted as painted_clips
 from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
-from gcd_train.scenes.description import Scene, SceneObject
+from gcd_train.scenes.description import Scene
 from gcd_train.scenes.pair_writer import orbit_draw, write_shard
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.worlds import (
@@ -214,23 +215,9 @@ def test_things_keep_clear_of_the_cameras() -> None:
 
 def with_thing(scene: Scene, at: tuple[float, float, float], side: float = 2.0) -> Scene:
     """The scene with a cube that stands there, as far as metadata tells."""
-    still = np.zeros((scene.frames, 3))
-    cube = SceneObject(
-        name="cube",
-        instance=1,
-        body=1,
-        label=1,
-        size=(side, side, side),
-        dynamic=False,
-        mass_kg=1.0,
-        friction=0.5,
-        restitution=0.1,
-        positions=still + at,
-        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (scene.frames, 1)),
-        velocities=still,
-        angular_velocities=still,
+    return replace(
+        scene, objects=(box_object("cube", 1, 1, (side, side, side), np.tile((*at, 0.0), (scene.frames, 1))),)
     )
-    return replace(scene, objects=(cube,))
 
 
 @pytest.mark.parametrize(("world", "frames", "said"), [("driving", 14, "no stage"), ("stage", 40, "up to 30")])
@@ -249,8 +236,8 @@ def test_a_world_that_is_none_is_refused() -> None:
 def test_the_command_makes_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCENE_WORLDS, "drop", replace(STAGE, name="drop"))
     data = tmp_path / "data"
-    size = ["--width", "48", "--height", "32", "--frames", "3", "--oversample", "1", "--workers", "1"]
-    line = ["generate", "drop", str(data), "--pairs", "--first-seed", "5", *size]
+    size = "--width 48 --height 32 --frames 3 --oversample 1 --workers 1"
+    line = f"generate drop {data} --pairs --first-seed 5 {size}".split()
     made = CliRunner().invoke(app, [*line, "--clips", "4"])
     assert made.exit_code == 0, made.output
     clips = PairedClips.open(data)

@@ -17,7 +17,7 @@ from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import save_weights
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
 from gcd_train.evaluation.report import all_plots, make_report

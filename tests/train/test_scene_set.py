@@ -16,7 +16,7 @@ from gcd_model import Traits
 from gcd_model.config import SVD_14
 from gcd_model.geometry import Spherical
 from gcd_model.weights.families import FAMILIES, FamilyName
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data.files import MANIFEST, SceneManifest
 from gcd_train.data.paths import FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError

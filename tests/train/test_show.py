@@ -15,7 +15,7 @@ from stage_world import STAGE
 from tiny_scenes4d import write_driving, write_kubric
 from typer.testing import CliRunner
 
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data.files import GEOMETRY, FileFault
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.look.sheet import SKY_M, UNSEEN, Footage

@@ -10,7 +10,7 @@ from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.recipe_files import load_recipe, packaged_recipes
 from gcd_train.scenes.scene_writer import SceneFormat, write_scene
 

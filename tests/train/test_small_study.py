@@ -13,7 +13,7 @@ from headless import needs_egl
 from typer.testing import CliRunner
 
 from gcd_model.config import PLAIN_SMALL
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe
 from gcd_train.training.setup import model_config, sampled_as_trained

@@ -10,8 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from gcd_train.cli.common import errors_shown
-from gcd_train.cli.generate import app
-from gcd_train.cli.main import COMMANDS
+from gcd_train.cli.main import COMMANDS, app
 from gcd_train.errors import RunError
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 import msgspec
 from typer.testing import CliRunner
 
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import packaged_recipes
 

@@ -7,7 +7,7 @@ from box_world import box_world
 from headless import needs_egl
 from typer.testing import CliRunner, Result
 
-from gcd_train.cli.generate import app
+from gcd_train.cli.main import app
 from gcd_train.data import kubric4d
 from gcd_train.data.files import MANIFEST
 from gcd_train.errors import DataError

@@ -15,6 +15,7 @@ from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
+from gcd_model.weights.families import Family
 from gcd_train.data.cache import CachedLatents, FrozenEncoders, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.loader import LoadedBatch, SampleLoader

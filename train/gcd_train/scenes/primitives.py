@@ -113,7 +113,8 @@ def _cylinder(sides: int) -> Triangles:
     for rim, z in ((high, 1.0), (low, -1.0)):
         corners.append(np.stack([np.broadcast_to((0, 0, z / 2), (sides, 3)), rim[:-1], rim[1:]], 1).astype(np.float32))
         normals.append(np.broadcast_to(np.array((0, 0, z), np.float32), (sides, 3, 3)))
-    return np.concatenate(corners), np.concatenate(normals)
+    around, about = (np.concatenate(a).reshape(4, sides, 3, 3).swapaxes(0, 1) for a in (corners, normals))
+    return around.reshape(-1, 3, 3), about.reshape(-1, 3, 3)
 
 
 def _arc(centre: tuple[float, float], radius: float, start_deg: float, end_deg: float, pieces: int) -> Profile:

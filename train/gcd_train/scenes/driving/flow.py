@@ -13,7 +13,7 @@ from gcd_train.scenes.driving import vehicles
 from gcd_train.scenes.driving.classes import Label
 from gcd_train.scenes.driving.ground import PAVEMENT_M, stop_line_m, zebra_m
 from gcd_train.scenes.driving.roads import Crossing, Road, Street
-from gcd_train.scenes.driving.roadside import Footprints, holds_a_point, touches
+from gcd_train.scenes.driving.roadside import CAMERA_ROOM_M, Footprints, holds_a_point, touches
 from gcd_train.scenes.driving.vehicles import Assembly, Lamps
 
 FPS = 10.0
@@ -102,7 +102,6 @@ class Crowd:
     drive: Drive
     obstacles: Footprints
     cameras: Doubles
-    camera_room_m: float
     users: list[RoadUser] = field(default_factory=list[RoadUser])
     _ground: list[Footprints] = field(default_factory=list[Footprints])
 
@@ -124,7 +123,7 @@ class Crowd:
         near = np.hypot(away[..., 0], away[..., 1]) < assembly.length
         cos, sin = np.cos(rows[:, 3])[:, None], np.sin(rows[:, 3])[:, None]
         x, y = away[..., 0] * cos + away[..., 1] * sin, away[..., 1] * cos - away[..., 0] * sin
-        return holds_a_point(assembly.parts, np.stack([x, y, away[..., 2]], -1)[near], self.camera_room_m)
+        return holds_a_point(assembly.parts, np.stack([x, y, away[..., 2]], -1)[near], CAMERA_ROOM_M)
 
     def is_near(self, place: tuple[float, float]) -> bool:
         """Whether the ego comes close to a place."""

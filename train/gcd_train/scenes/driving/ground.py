@@ -26,23 +26,23 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     paving: Colour = (grey, grey * random.uniform(0.92, 1.0), grey * random.uniform(0.84, 1.0))
     grass: Colour = (random.uniform(0.24, 0.4), random.uniform(0.38, 0.48), random.uniform(0.16, 0.26))
     dry: Colour = (random.uniform(0.5, 0.62), random.uniform(0.46, 0.54), random.uniform(0.32, 0.4))
-    sheets = [terrain(800.0, 200.0, grass if random.random() < 0.75 else dry, 0.3 * wetness)]
+    sheets = [_terrain(grass if random.random() < 0.75 else dry, 0.3 * wetness)]
     if paved:
         court = [piece for road in street.roads for piece in _beside(road, 1.0, road.pavement_m + 16.0, _COURT_M)]
-        sheets.append(flat(np.concatenate(court), shaded(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
-    sheets.append(flat(_asphalt(street), asphalt, Label.ROAD, Pattern.SPECKLE, wetness))
-    sheets.append(flat(_repairs(street.main, random), shaded(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
+        sheets.append(_flat(np.concatenate(court), shaded(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
+    sheets.append(_flat(_asphalt(street), asphalt, Label.ROAD, Pattern.SPECKLE, wetness))
+    sheets.append(_flat(_repairs(street.main, random), shaded(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
     if wetness > 0:
-        sheets.append(flat(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
+        sheets.append(_flat(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
     stone = [piece for road in street.roads for piece in _beside(road, 0.0, road.pavement_m, PAVEMENT_M)]
     for middle, first, second in _quadrants(street):
         stone.append(fan(np.append(middle, PAVEMENT_M), _rim(middle, first, second, _CORNER_M, PAVEMENT_M)))
-    sheets.append(flat(np.concatenate(stone), paving, Label.PAVEMENT, Pattern.TILES, wetness))
-    sheets.append(flat(_kerbs(street), (0.62, 0.62, 0.6), Label.KERB, wetness=wetness))
+    sheets.append(_flat(np.concatenate(stone), paving, Label.PAVEMENT, Pattern.TILES, wetness))
+    sheets.append(_flat(_kerbs(street), (0.62, 0.62, 0.6), Label.KERB, wetness=wetness))
     return [*sheets, *_marks(street, wetness, random)]
 
 
-def flat(
+def _flat(
     corners: Floats, colour: Colour, label: Label, pattern: Pattern = Pattern.PLAIN, wetness: float = 0.0
 ) -> Sheet:
     """Triangles turned so that they face up; what is wet is darker, and shines."""
@@ -52,12 +52,13 @@ def flat(
     return Sheet(upward, Paint(dark, pattern=pattern, gloss=wetness), label)
 
 
-def terrain(half_m: float, cell_m: float, colour: Colour, wetness: float = 0.0) -> Sheet:
+def _terrain(colour: Colour, wetness: float) -> Sheet:
     """A square of cells just below all roads; split, so that interpolation stays exact far away."""
-    x, y = np.meshgrid(np.arange(-half_m, half_m, cell_m), np.arange(-half_m, half_m, cell_m))
+    cell = 200.0
+    x, y = np.meshgrid(np.arange(-800.0, 800.0, cell), np.arange(-800.0, 800.0, cell))
     low = np.stack([x.reshape(-1), y.reshape(-1), np.full(x.size, -0.06)], -1)
-    corners = quads(low, *(low + np.array([a, b, 0.0]) for a, b in ((cell_m, 0.0), (cell_m, cell_m), (0.0, cell_m))))
-    return flat(corners, colour, Label.TERRAIN, Pattern.SPECKLE, wetness)
+    corners = quads(low, *(low + np.array([a, b, 0.0]) for a, b in ((cell, 0.0), (cell, cell), (0.0, cell))))
+    return _flat(corners, colour, Label.TERRAIN, Pattern.SPECKLE, wetness)
 
 
 def _asphalt(street: Street) -> Floats:
@@ -151,7 +152,7 @@ def _marks(street: Street, wetness: float, random: np.random.Generator) -> list[
         stops += [patches(road, _stop_lines(road, crossing), MARK_M) for crossing in road.crossings]
     kinds = ((lanes, paint, Label.LANE_MARKING), (centre, middle, Label.LANE_MARKING),
              (zebras, paint, Label.CROSSWALK), (stops, paint, Label.STOP_LINE))  # fmt: skip
-    return [flat(np.concatenate(shapes), colour, label, wetness=0.5 * wetness) for shapes, colour, label in kinds]
+    return [_flat(np.concatenate(shapes), colour, label, wetness=0.5 * wetness) for shapes, colour, label in kinds]
 
 
 def _lane_lines(road: Road, width: float, dash: tuple[float, float], edged: bool) -> list[Floats]:
@@ -168,8 +169,7 @@ def _lane_lines(road: Road, width: float, dash: tuple[float, float], edged: bool
 
 
 def _dashes(road: Road, lateral: float, width: float, dash: tuple[float, float] | None) -> Floats:
-    begin, end = max(_MARKED_M[0], road.start_m), min(_MARKED_M[1], road.end_m)
-    spans = road.free_spans(_CORNER_M + 5.6, begin, end)
+    spans = road.free_spans(_CORNER_M + 5.6, *_MARKED_M)
     right, left = lateral - width / 2, lateral + width / 2
     if dash is None:
         return ribbon(road, right, left, MARK_M, spans)

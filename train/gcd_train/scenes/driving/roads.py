@@ -90,10 +90,9 @@ class Road:
         """Whether a place lies outside all junctions."""
         return all(abs(s - crossing.at_m) >= crossing.half_m + margin_m for crossing in self.crossings)
 
-    def free_spans(self, margin_m: float, begin_m: float | None = None, end_m: float | None = None) -> list[Span]:
+    def free_spans(self, margin_m: float, begin_m: float = -np.inf, end_m: float = np.inf) -> list[Span]:
         """The stretches between the junctions, each junction widened by a margin on both sides."""
-        start = self.start_m if begin_m is None else begin_m
-        end = self.end_m if end_m is None else end_m
+        start, end = max(begin_m, self.start_m), min(end_m, self.end_m)
         spans: list[Span] = []
         for crossing in sorted(self.crossings, key=lambda each: each.at_m):
             spans.append((start, min(end, crossing.at_m - crossing.half_m - margin_m)))

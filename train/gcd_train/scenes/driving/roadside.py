@@ -203,8 +203,10 @@ def _houses(plot: Plot, place: Place, district: District, paved: bool, lit: bool
     while s < min(_END_M, road.end_m):
         width, depth = float(random.uniform(*district.width_m)), float(random.uniform(9, 17))
         if random.random() < district.built:
-            back = float(random.uniform(*district.setback_m)) + things.sagitta(road, s + width / 2, width)
-            at = place.moved(s + width / 2, edge + back + depth / 2)
+            middle = s + width / 2
+            bend = abs(road.at(middle + width / 2)[2] - road.at(middle - width / 2)[2])
+            back = float(random.uniform(*district.setback_m)) + (width * bend / 4 + 0.3)  # fronts are straight
+            at = place.moved(middle, edge + back + depth / 2)
             house = things.building(width, depth, district, random)
             roof = house[1]
             if roof.shape == "gable":  # closed from below

@@ -7,7 +7,6 @@ import numpy as np
 
 from gcd_train.scenes.description import Colour, Paint, Part, Pattern, Point, mixed, pick
 from gcd_train.scenes.driving.classes import Label
-from gcd_train.scenes.driving.roads import Road
 
 Pair = tuple[float, float]
 
@@ -42,11 +41,6 @@ _BOARDS: tuple[Colour, ...] = (
 )  # fmt: skip
 
 
-def random_district(random: np.random.Generator) -> str:
-    """One of `DISTRICTS`."""
-    return str(random.choice(list(DISTRICTS), p=[0.4, 0.3, 0.18, 0.12]))
-
-
 def block(
     at: Point,
     size: Point,
@@ -69,18 +63,6 @@ def tone(random: np.random.Generator, colour: Colour, spread: float = 0.15) -> C
     shade = random.uniform(1 - spread, 1 + spread)
     r, g, b = (float(np.clip(c * shade * random.uniform(0.95, 1.05), 0.02, 0.97)) for c in colour)
     return r, g, b
-
-
-def sky_dome() -> Part:
-    """A dome far away; the shader paints it. Its inside must face the camera, hence the negative size."""
-    size = (-1600.0, 1600.0, 1600.0)
-    return block((0, 0, 0), size, (0.5, 0.6, 0.8), Label.SKY, shape="ball", pattern=Pattern.SKY)
-
-
-def sagitta(road: Road, s: float, width: float) -> float:
-    """How far a straight front must stand back from a curved road."""
-    turn = abs(road.at(s + width / 2)[2] - road.at(s - width / 2)[2])
-    return width * turn / 4 + 0.3
 
 
 def building(width: float, depth: float, district: District, random: np.random.Generator) -> list[Part]:

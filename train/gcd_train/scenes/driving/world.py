@@ -27,6 +27,7 @@ from gcd_train.scenes.description import (
     Floats,
     Light,
     Part,
+    Pattern,
     Point,
     Scene,
     mixed,
@@ -38,8 +39,8 @@ from gcd_train.scenes.driving.classes import Label, coarse
 from gcd_train.scenes.driving.flow import Crowd, RoadUser, fill, random_drive
 from gcd_train.scenes.driving.ground import PATCH_M, ground_sheets, lamp_pools
 from gcd_train.scenes.driving.roads import random_street
-from gcd_train.scenes.driving.roadside import CAMERA_ROOM_M, Plot, furnish
-from gcd_train.scenes.driving.things import DISTRICTS, block, lit_windows, random_district, sky_dome
+from gcd_train.scenes.driving.roadside import Plot, furnish
+from gcd_train.scenes.driving.things import DISTRICTS, block, lit_windows
 
 HFOV_DEG = 85.0
 EDITION = 2
@@ -49,6 +50,8 @@ _PAVED = ("city", "business")
 _SIDE_YAW_DEG, _SIDE_M = 60.0, 0.25
 _FOCUS_AHEAD_M = 28.0
 """Shadows fall around a point that far ahead of the vehicle."""
+_SKY = block((0, 0, 0), (-1600.0, 1600.0, 1600.0), (0.5, 0.6, 0.8), Label.SKY, shape="ball", pattern=Pattern.SKY)
+"""A dome far away; its inside faces the cameras, hence the negative size."""
 _POOLS_M = 70.0
 _BEAM_STEPS = 8
 _SURROUND: tuple[tuple[float, float, float, float, float], ...] = (
@@ -117,17 +120,17 @@ def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
     """
     layout, sky, way, standing, moving, ground = (np.random.default_rng([seed, EDITION, part]) for part in range(6))
     street, weather = random_street(layout), random_weather(sky)
-    district = random_district(layout)
+    district = str(layout.choice(list(DISTRICTS), p=[0.4, 0.3, 0.18, 0.12]))
     paved = district in _PAVED
     drive = random_drive(street, frames, way)
     cameras = _camera_places(drive.rows)
     plot = Plot(street=street, cameras=cameras.reshape(-1, 3))
     furnish(plot, DISTRICTS[district], paved, weather.dark, not drive.waits, standing)
-    crowd = Crowd(street=street, drive=drive, obstacles=plot.taken, cameras=cameras, camera_room_m=CAMERA_ROOM_M)
+    crowd = Crowd(street=street, drive=drive, obstacles=plot.taken, cameras=cameras)
     fill(crowd, weather.lamps, moving)
     sheets = ground_sheets(street, weather.wetness, paved, ground)
     asphalt = next(sheet.paint.colour for sheet in sheets if sheet.label == Label.ROAD)
-    parts = [sky_dome(), *(part for thing in plot.things for part in thing)]
+    parts = [_SKY, *(part for thing in plot.things for part in thing)]
     if weather.dark:
         lamps = [lamp for lamp in plot.lamps if abs(lamp.s) < _POOLS_M]
         spots = [lamp.road.at(lamp.s, lamp.side * (lamp.away - 2.0)) for lamp in lamps]

@@ -59,14 +59,9 @@ _STONES: tuple[tuple[Colour, Colour], ...] = (
     ((0.8, 0.66, 0.58), (0.5, 0.28, 0.22)),
 )
 _FAMILIES = (
-    (Pattern.PLAIN, 0.26),
-    (Pattern.CLOUDY, 0.1),
-    (Pattern.WOOD, 0.17),
-    (Pattern.MARBLE, 0.12),
-    (Pattern.CHECKER, 0.1),
-    (Pattern.STRIPES, 0.13),
-    (Pattern.DOTS, 0.12),
-)
+    (Pattern.PLAIN, 0.26), (Pattern.CLOUDY, 0.1), (Pattern.WOOD, 0.17), (Pattern.MARBLE, 0.12), (Pattern.CHECKER, 0.1),
+    (Pattern.STRIPES, 0.13), (Pattern.DOTS, 0.12),
+)  # fmt: skip
 
 
 def random_paint(random: _Random, size_m: float) -> Paint:

@@ -90,8 +90,6 @@ def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: in
     """
     stage = _Stage(things)
     settled = [i for i, thing in enumerate(things) if not thing.dynamic]
-    for i in range(len(things)):
-        stage.park(i)
     for i in settled:
         stage.put(i, random, (-7.0, -7.0, 0.0), (7.0, 7.0, 7.0))
     stage.settle(settled)
@@ -111,10 +109,8 @@ class _Stage:
         self._things = things
         self._model: Any = _compiled(self._mujoco, things)
         self._data: Any = self._mujoco.MjData(self._model)
-
-    def park(self, i: int) -> None:
-        """Far outside, alone, where it disturbs nobody."""
-        self._place(i, np.array([500.0 + 20.0 * i, 500.0, self._things[i].size[2] / 2 + 0.01]), np.eye(4)[0])
+        for i, thing in enumerate(things):  # far outside, alone, where it disturbs nothing
+            self._place(i, np.array([500.0 + 20.0 * i, 500.0, thing.size[2] / 2 + 0.01]), np.eye(4)[0])
 
     def put(self, i: int, random: np.random.Generator, low: Sequence[float], high: Sequence[float]) -> Doubles:
         """Somewhere in a box, in any attitude, where it touches nothing; its place [3]."""
@@ -123,7 +119,7 @@ class _Stage:
             place = random.uniform(low, high)
             self._place(i, place, quaternion / np.linalg.norm(quaternion))
             self._mujoco.mj_forward(self._model, self._data)
-            if not self._touches(i):
+            if not (self._model.geom_bodyid[self._data.contact.geom] == i + 1).any():
                 return place
         raise UnsoundSceneError(f"no free place for a {self._things[i].name} in {_TRIES} tries")
 
@@ -174,10 +170,6 @@ class _Stage:
     def _place(self, i: int, place: Doubles, quaternion: Doubles) -> None:
         self._data.qpos[7 * i : 7 * i + 7] = np.concatenate([place, quaternion])
         self._data.qvel[6 * i : 6 * i + 6] = 0.0
-
-    def _touches(self, i: int) -> bool:
-        contact = self._data.contact
-        return bool((self._model.geom_bodyid[contact.geom] == i + 1).any())
 
 
 def load_mujoco() -> Any:

@@ -50,19 +50,9 @@ _LIVERIES: tuple[tuple[Colour, Colour], ...] = (
     ((0.80, 0.83, 0.86), (0.12, 0.38, 0.52)),
 )
 """Of shell and joints."""
-_LINKS = {
-    "base": "base",
-    "turret": "shoulder",
-    "upper": "upper_arm",
-    "fore": "forearm",
-    "roll": "wrist_roll",
-    "wrist": "wrist",
-    "palm": "palm",
-    "finger_left": "left_finger",
-    "finger_right": "right_finger",
-}
-"""Bodies of the model, and what they are called."""
-_GRIPPER = ("palm", "finger_left", "finger_right")
+_LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_roll", "wrist")
+_GRIPPER = ("palm", "left_finger", "right_finger")
+"""Bodies of the model."""
 _OPTIONS = f"""
 <option timestep="{STEP_S}" cone="elliptic" impratio="10" integrator="implicitfast" noslip_iterations="2"/>
 <compiler angle="radian" autolimits="true"/>
@@ -145,20 +135,20 @@ def random_arm(random: np.random.Generator) -> str:
 <body name="base" gravcomp="1">
   <geom class="arm" type="cylinder" size="{2.1 * r} 0.018" pos="0 0 0.018" {j}/>
   <geom class="arm" type="cylinder" size="{1.6 * r} 0.05" pos="0 0 0.08" {s}/>
-  <body name="turret" pos="0 0 0.13" gravcomp="1">
+  <body name="shoulder" pos="0 0 0.13" gravcomp="1">
     <joint name="yaw" class="arm" axis="0 0 1" range="-3 3"/>
     <geom class="arm" type="cylinder" size="{1.5 * r} 0.045" pos="0 0 0.045" {s}/>
     <geom class="arm" type="cylinder" size="{1.25 * r} {1.75 * r}" pos="0 0 0.10" quat="0.7071 0.7071 0 0" {j}/>
-    <body name="upper" pos="0 0 0.10" gravcomp="1">
+    <body name="upper_arm" pos="0 0 0.10" gravcomp="1">
       <joint name="shoulder" class="arm" axis="0 1 0" range="-2 2.3"/>
       <geom class="arm" type="capsule" size="{r}" fromto="0 {1.1 * r} 0.02 0 {0.55 * r} {upper - 0.02}" {s}/>
       <geom class="arm" type="capsule" size="{0.8 * r}" fromto="0 {-0.9 * r} 0 0 {-0.45 * r} {upper}" {s}/>
       <geom class="arm" type="cylinder" size="{1.15 * r} {1.5 * r}" pos="0 0 {upper}" quat="0.7071 0.7071 0 0" {j}/>
-      <body name="fore" pos="0 0 {upper}" gravcomp="1">
+      <body name="forearm" pos="0 0 {upper}" gravcomp="1">
         <joint name="elbow" class="arm" axis="0 1 0" range="-0.3 2.8"/>
         <geom class="arm" type="capsule" size="{0.85 * r}" fromto="0 0 0 0 0 {0.5 * fore}" {s}/>
         <geom class="arm" type="cylinder" size="{0.92 * r} 0.018" pos="0 0 {0.53 * fore}" {j}/>
-        <body name="roll" pos="0 0 {0.55 * fore}" gravcomp="1">
+        <body name="wrist_roll" pos="0 0 {0.55 * fore}" gravcomp="1">
           <joint name="forearm_roll" class="wrist" axis="0 0 1" range="-3 3"/>
           <geom class="arm" type="capsule" size="{0.72 * r}" fromto="0 0 0 0 0 {0.4 * fore}" {s}/>
           <geom class="arm" type="cylinder" size="{0.85 * r} {1.05 * r}" pos="0 0 {0.45 * fore}"
@@ -198,7 +188,7 @@ def _finger(side: str, sign: int, shell: str) -> str:
     """A finger that slides along y; at 0 its pad touches the middle."""
     rubber = 'rgba="0.09 0.09 0.10 1"'
     return f"""
-<body name="finger_{side}" pos="0 0 0.060" gravcomp="1">
+<body name="{side}_finger" pos="0 0 0.060" gravcomp="1">
   <joint name="slide_{side}" class="finger" axis="0 {sign} 0"/>
   <geom class="arm" type="box" size="0.012 0.008 0.012" pos="0 {0.013 * sign} 0.012" {shell}/>
   <geom class="arm" type="box" size="0.011 0.005 0.035" pos="0 {0.014 * sign} 0.051" {shell}/>
@@ -248,14 +238,15 @@ def arm_links(model: Model) -> list[tuple[TableThing, int, TabletopClass]]:
     Their names tell the class too, for layouts that keep no classes: robot_arm/upper_arm, gripper/palm.
     """
     found: list[tuple[TableThing, int, TabletopClass]] = []
-    for body_name, name in _LINKS.items():
-        label = TabletopClass.GRIPPER if body_name in _GRIPPER else TabletopClass.ROBOT_ARM
-        body = model.model.body(body_name).id
+    for name in (*_LINKS, *_GRIPPER):
+        label = TabletopClass.GRIPPER if name in _GRIPPER else TabletopClass.ROBOT_ARM
+        body = model.model.body(name).id
         parts = _parts_of_body(model, body, label)
         middle, size = _bounding_box(parts)
         mass_kg = float(model.model.body_mass[body])
-        name = f"{label.name.lower()}/{name}"
-        link = TableThing(name=name, parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8)
+        link = TableThing(
+            name=f"{label.name.lower()}/{name}", parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8
+        )
         found.append((link, body, label))
     return found
 
