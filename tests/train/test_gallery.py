@@ -143,19 +143,17 @@ def test_what_is_wider_than_trained_is_cut_off(
         (b"", "is no whole video file"),
         (b"just some text, renamed", "is no whole video file"),
         (b"\0\0\0\x18ftypmp42" + b"\0" * 64, "cannot be decoded"),
+        (None, "a picture of 1 x 64 has no part"),
     ],
 )
-def test_what_is_no_video_is_refused_by_name(tmp_path: Path, content: bytes, said: str) -> None:
-    (tmp_path / "broken.mp4").write_bytes(content)
-    with pytest.raises(DataError, match=rf"broken.mp4 {said}"):
-        windows_of(tmp_path / "broken.mp4")
-
-
-def test_a_video_too_narrow_for_the_network_is_refused_by_name(tmp_path: Path) -> None:
-    for number in range(20):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((64, 1, 3), np.uint8))
-    with pytest.raises(DataError, match=f"{tmp_path.name}: a picture of 1 x 64 has no part"):
-        windows_of(tmp_path, WindowChoice(rate=10.0))
+def test_what_is_no_video_or_too_narrow_is_refused_by_name(tmp_path: Path, content: bytes | None, said: str) -> None:
+    path = tmp_path / "broken.mp4"
+    if content is None:
+        write_video(path.with_suffix(".avi"), 20, 10.0, size=(1, 64)).rename(path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=rf"broken.mp4:? {said}"):
+        windows_of(path, WindowChoice(rate=10.0))
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
@@ -223,17 +221,13 @@ def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
         paths(traits("driving"), replace(high, angles=()))
 
 
-def test_the_live_models_view_knows_how_the_camera_is_mounted() -> None:
-    live = load_synthesizer("random:live", device="cpu").traits
-    assert mounted(live, ViewRecipe(), None) is None
-    assert mounted(live, ViewRecipe(tilt_deg=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
-    assert mounted(traits(), ViewRecipe(height_m=2.0), None) is None
-
-
-def test_the_live_model_knows_the_lens_without_a_mount() -> None:
+def test_the_live_model_knows_its_mount_where_one_is_declared_and_its_lens_without() -> None:
     model = Mirror(load_synthesizer("random:live", device="cpu").traits)
-    view_window(model, replace(a_window(), hfov_deg=60.0), ViewRecipe())
-    view_window(model, a_window(), ViewRecipe())
+    assert mounted(model.traits, ViewRecipe(), None) is None
+    assert mounted(model.traits, ViewRecipe(tilt_deg=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
+    assert mounted(traits(), ViewRecipe(height_m=2.0), None) is None
+    for window in (replace(a_window(), hfov_deg=60.0), a_window()):
+        view_window(model, window, ViewRecipe())
     assert [clip.lens for clip in model.clips] == [Intrinsics.from_hfov(60.0, W, H), None]
 
 

@@ -36,7 +36,7 @@ from gcd_train.errors import DataError, Interrupted, RecipeError
 from gcd_train.live.batches import FrameBatches, pictures_of
 from gcd_train.live.clips import Shelf, TrainingClips, read_clip, training_paths
 from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
-from gcd_train.live.figures import SpreadHistogram
+from gcd_train.live.figures import SpreadHistogram, truth_of
 from gcd_train.live.measure import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage, load_live_recipe
@@ -264,16 +264,8 @@ def test_true_logits_are_read_as_the_true_depth() -> None:
     label = torch.where(metres >= config.farthest_m, config.bins - 1, nearest)
     logits = 50.0 * torch.nn.functional.one_hot(label, config.bins).permute(0, 3, 1, 2).float()
     offsets = torch.zeros_like(logits)[:, 1:].scatter(1, nearest[:, None], ((place - nearest) / 1.5).atanh()[:, None])
-    nowhere = torch.zeros_like(logits[:, :1])
-    output = DepthOutput(
-        logits=logits,
-        raw_offsets=offsets,
-        classes=logits[:, :2],
-        moves=metres,
-        ground=nowhere,
-        ground_place=nowhere,
-        summary=nowhere,
-    )
+    nowhere = dict.fromkeys(("ground", "ground_place", "summary"), torch.zeros_like(logits[:, :1]))
+    output = DepthOutput(logits=logits, raw_offsets=offsets, classes=logits[:, :2], moves=metres, **nowhere)
     assert torch.allclose(read_depth(output, config).metres, metres, rtol=1e-3)
 
 
@@ -429,12 +421,11 @@ def test_calibration_makes_the_interval_hold_and_takes_back_what_rare_classes_go
     assert not bool((labels == 10).any())
     calibrate(networks, [path], [path], views, weights, torch.ones_like(weights))
     assert float(biases[rare]) <= 10.0
-    inside = SpreadHistogram()
-    clip = read_clip(path)
+    inside, clip = SpreadHistogram(), read_clip(path)
     made = LiveModel(networks=networks).views(clip)
     assert made.log_variance is not None
     assert made.visibility is not None
-    error = (made.video - torch.from_numpy(clip.arrays["target.rgb"]).permute(0, 3, 1, 2) / 255)[1:]
+    error = (made.video - truth_of(clip).video)[1:]
     inside.add(error, made.log_variance[1:], made.visibility[1:])
     shares = [share for share in inside.coverage if share == share]
     assert shares

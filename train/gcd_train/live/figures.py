@@ -148,7 +148,7 @@ class Tally:
         """What is summed up, and of how many, by figure."""
         self._confusion = torch.zeros(len(classes), len(classes), dtype=torch.int64)
         self._states = torch.zeros(3, 3, dtype=torch.int64)
-        self._views, self._truths = Moments(), Moments()
+        self._views, self._truths = list[Tensor](), list[Tensor]()
         self.spread = SpreadHistogram()
         self.psnr: dict[str, list[float]] = defaultdict(list)
         """Mean over frames of every clip, by scene."""
@@ -172,8 +172,8 @@ class Tally:
         self._mean("gradient_made", gradient_map(made), inside)
         self._mean("gradient_true", truth.gradient, inside)
         judged = F.avg_pool2d(never.float(), _CELL) >= _FULL_CELL
-        self._views.add(cells(made)[judged])
-        self._truths.add(truth.features[judged])
+        self._views.append(cells(made)[judged])
+        self._truths.append(truth.features[judged])
         for name, video in (("made", views.video), ("true", truth.video)):
             self._mean(f"flicker_{name}", _flicker(video, truth)[1:], truth.static[1:])
             self._mean(f"jump_{name}", (video[2:] - video[1:-1]).abs())
@@ -203,7 +203,7 @@ class Tally:
             ("jump", "jump_made", "jump_true"),
         ):
             made[name] = means[of] / max(means[by], 1e-10)
-        made["frechet_random"] = frechet_distance(self._views, self._truths)
+        made["frechet_random"] = frechet_distance(torch.cat(self._views), torch.cat(self._truths))
         iou = np.array(_occurring_iou(self._confusion))
         made["miou"] = float(np.nanmean(iou)) if np.isfinite(iou).any() else math.nan
         made |= {name: float(iou[self._names.index(name)]) for name in NAMED_CLASSES}
@@ -239,39 +239,18 @@ def cells(pictures: Tensor) -> Tensor:
     return F.avg_pool2d(_judge()(pictures * 2 - 1), 2).permute(0, 2, 3, 1)
 
 
-class Moments:
-    """Count, sum and sum of outer products of feature vectors, float64."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.total = torch.zeros(_FEATURES, dtype=torch.float64)
-        self.outer = torch.zeros(_FEATURES, _FEATURES, dtype=torch.float64)
-
-    def add(self, vectors: Tensor) -> None:
-        """vectors: [N, 64]."""
-        vectors = vectors.double()
-        self.count += len(vectors)
-        self.total = self.total + vectors.sum(0)
-        self.outer = self.outer + vectors.T @ vectors
-
-    @property
-    def gaussian(self) -> tuple[Tensor, Tensor]:
-        """Mean [64] and covariance [64, 64]."""
-        mean = self.total / self.count
-        return mean, self.outer / self.count - torch.outer(mean, mean)
-
-
-def frechet_distance(views: Moments, truths: Moments) -> float:
-    """Between the two as Gaussians, in standard deviations of the truth's features; NaN for too few vectors.
+def frechet_distance(views: Tensor, truths: Tensor) -> float:
+    """Between features [N, 64] of the two as Gaussians, in standard deviations of the truth's; NaN for too few.
 
         |m - m'|^2 + tr(C + C' - 2 (C^1/2 C' C^1/2)^1/2)
 
     Source: Dowson and Landau 1982; Heusel et al. 2017, with features of our own.
     """
-    if min(views.count, truths.count) < 2 * _FEATURES:
+    if min(len(views), len(truths)) < 2 * _FEATURES:
         return math.nan
-    mean, covariance = views.gaussian
-    true_mean, true_covariance = truths.gaussian
+    (mean, covariance), (true_mean, true_covariance) = (
+        (each.mean(0), each.T.cov(correction=0)) for each in (views.double(), truths.double())
+    )
     scale = true_covariance.diagonal().clamp(min=1e-12).rsqrt()
     ridge = _RIDGE * torch.eye(_FEATURES, dtype=torch.float64)
     a, b = (c * scale[:, None] * scale + ridge for c in (covariance, true_covariance))
