@@ -26,7 +26,7 @@ MOST = [
     ("gcd_node", 59, 13_519),
     ("tests/node", 82, 14_236),
     ("train/gcd_train", 143, 28_993),
-    ("tests/train", 84, 14_805),
+    ("tests/train", 84, 14_799),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 
