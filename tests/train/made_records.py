@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+import msgspec
+
 from gcd_train.evaluation.store import ClipRecord, Counted, Region, RegionRecord, RunNote
 
 FRAMES = 4
@@ -70,30 +72,22 @@ def record(
     )
 
 
-def note(
-    *,
-    kind: str = "orbit",
-    modality: str = "rgb",
-    protocol: str = "pairs",
-    classes: Sequence[str] = (),
-    methods: Mapping[str, Mapping[str, str]] | None = None,
-    data_identity: str = "0123456789ab",
-    command: str = "gcd-train evaluate --data held-out --out run",
-) -> RunNote:
-    """What a run says of itself."""
-    return RunNote(
-        command=command,
-        made="2026-01-01T00:00:00+00:00",
-        versions={"gcd-node": "0.1.0", "torch": "2", "python": "3.11"},
-        data=("held-out",),
-        data_identity=data_identity,
-        kind=kind,
-        modality=modality,
-        protocol=protocol,
-        frames=FRAMES,
-        height=32,
-        width=48,
-        seed=3,
-        classes=tuple(classes),
-        methods={name: dict(told) for name, told in (methods or {}).items()},
-    )
+NOTE = RunNote(
+    command="gcd-train evaluate --data held-out --out run",
+    made="2026-01-01T00:00:00+00:00",
+    versions={"gcd-node": "0.1.0", "torch": "2", "python": "3.11"},
+    data=("held-out",),
+    data_identity="0123456789ab",
+    kind="orbit",
+    modality="rgb",
+    protocol="pairs",
+    frames=FRAMES,
+    height=32,
+    width=48,
+    seed=3,
+)
+
+
+def note(**changes: object) -> RunNote:
+    """What a run says of itself: pairs of an orbit, with these changes."""
+    return msgspec.structs.replace(NOTE, **changes)

@@ -166,16 +166,8 @@ class HexField(nn.Module):
         self.planes = HexPlanes(features=settings.features, side=settings.sides[0], moments=frames, generator=generator)
         self.trunk = _linear(3 * settings.features, settings.hidden, generator)
         self.density_head = _linear(settings.hidden, 1, generator)
-        self.colour_head = nn.Sequential(
-            _linear(settings.hidden, settings.hidden, generator),
-            nn.ReLU(),
-            _linear(settings.hidden, 3, generator),
-        )
-        self.background_head = nn.Sequential(
-            _linear(_HARMONICS + 2 * len(_HEIGHT_WAVES), _BACKGROUND_WIDTH, generator),
-            nn.ReLU(),
-            _linear(_BACKGROUND_WIDTH, 3, generator),
-        )
+        self.colour_head = _colour_head(settings.hidden, settings.hidden, generator)
+        self.background_head = _colour_head(_HARMONICS + 2 * len(_HEIGHT_WAVES), _BACKGROUND_WIDTH, generator)
 
     def forward(self, points: Tensor, times: Tensor) -> Tensor:
         """What the heads read. points: [P, 3], world, metres; times: [P], -1 first frame, 1 last -> [P, D]."""
@@ -206,6 +198,10 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
         nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
         layer.bias.zero_()
     return layer
+
+
+def _colour_head(inputs: int, width: int, generator: torch.Generator) -> nn.Sequential:
+    return nn.Sequential(_linear(inputs, width, generator), nn.ReLU(), _linear(width, 3, generator))
 
 
 # Weight that every stretch of a ray gets before samples are drawn, so that no surface is missed for good.
