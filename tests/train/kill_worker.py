@@ -4,10 +4,11 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import torch
-from two_processes import LOG, Never, Task, options, recipe_of
+from two_processes import LOG, Task, options, recipe_of
 
 from gcd_train.recipe_data import Budget
 from gcd_train.training.distributed import ALONE
@@ -34,7 +35,7 @@ class Told(Task):
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     log = msgspec.structs.replace(LOG, save_s=1e-9)  # after every update
-    chosen = replace(options(ALONE, Never(), log), budget=Budget(updates=UPDATES))
+    chosen = replace(options(ALONE, Event(), log), budget=Budget(updates=UPDATES))
     Loop(Told(folder / "losses.jsonl"), RunFolder(folder), chosen).run()
 
 

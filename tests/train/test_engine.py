@@ -3,16 +3,17 @@
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 import torch
-from tiny_world import tiny_recipe
+from tiny_world import After, tiny_recipe
 from torch import nn
 from torch.testing import assert_close
-from two_processes import FRAMES, LOG, UPDATES, AfterUpdates, Never, Noise, Task, options, recipe_of
+from two_processes import FRAMES, LOG, UPDATES, Noise, Task, options, recipe_of
 
 from gcd_model.networks import random_networks
 from gcd_model.unet import VideoUNet
@@ -25,6 +26,7 @@ from gcd_train.training.checkpoint import newest_weights
 from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, recompute_blocks, stages_of
 from gcd_train.training.draws import Draws
 from gcd_train.training.loop import Loop, Progress, StepLoss
+from gcd_train.training.loop import Task as BaseTask
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.optimiser import Ema, ParameterGroup, build_optimiser, set_rate
 from gcd_train.training.setup import Precision, model_config
@@ -161,15 +163,14 @@ def test_a_recipe_of_bfloat16_weights_computes_gradients_in_them() -> None:
     assert all(torch.isfinite(weight.grad).all() for weight in trained if weight.grad is not None)
 
 
-class Square:
+class Square(BaseTask):
     """64 x 64 numbers to learn, enough for 8-bit moments; one shape, as torchao compiles its step for each."""
 
-    def __init__(self) -> None:
-        self.module = nn.Linear(64, 64, bias=False)
-        nn.init.eye_(self.module.weight)
+    module: nn.Linear
 
-    def parameter_groups(self) -> list[ParameterGroup]:
-        return [ParameterGroup(parameters=list(self.module.parameters()))]
+    def __init__(self) -> None:
+        super().__init__(nn.Linear(64, 64, bias=False))
+        nn.init.eye_(self.module.weight)
 
     def step_loss(self, progress: Progress) -> StepLoss:
         inputs = torch.randn(8, 64, generator=torch.Generator().manual_seed(progress.updates))
@@ -177,15 +178,12 @@ class Square:
             loss = (self.module(inputs) + inputs).float().square().mean()
         return StepLoss(loss, {"square": loss}, 8)
 
-    def after_update(self, progress: Progress) -> bool:
-        return False
-
     def measure(self, picture: Path) -> dict[str, float]:
         return {}
 
 
 def square_trained(path: Path, kind: Any, weights: Any, stop_at: int | None) -> torch.Tensor:
-    task, stop = Square(), Never() if stop_at is None else AfterUpdates(stop_at)
+    task, stop = Square(), Event() if stop_at is None else After(stop_at + 1)
     chosen = replace(options(ALONE, stop, LOG, weights=weights), budget=Budget(updates=6))
     chosen = replace(chosen, optimiser=OptimiserRecipe(rate=1e-3, kind=kind))
     with suppress(Interrupted):

@@ -3,13 +3,14 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import numpy as np
 import pytest
 import torch
 from tiny_scenes4d import DRIVING_POSES, write_driving
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, TinyOrbits, saved, tiny_recipe
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, TinyClips, TinyOrbits, saved, tiny_recipe, trainer
 from torch import Tensor
 
 from gcd_model import FAMILIES, Clip, load_synthesizer
@@ -21,18 +22,16 @@ from gcd_train.data.batches import EncodedBatches, SampleBatches
 from gcd_train.data.latents import LatentClips, LatentRows
 from gcd_train.data.latents_writer import LatentsJob, encode_clips
 from gcd_train.data.loader import LoadedBatch
-from gcd_train.data.open import DataPlaces, RunData, open_data
+from gcd_train.data.open import DataPlaces, open_data
 from gcd_train.data.sample import Clips, MadeClips, Sample, collate, to_network
 from gcd_train.data.sample import painted as painted_clips
 from gcd_train.errors import DataError, Interrupted
 from gcd_train.recipe import ClassWeightsName, Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
-from gcd_train.stop import StopSignal
 from gcd_train.training.conditioner import Conditioner, mirrored_path
 from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.training.monitor import RunFolder
-from gcd_train.training.run import RunInputs, Trainer
+from gcd_train.training.run import Trainer
 from gcd_train.training.setup import Precision, model_config, start_networks
 
 CPU = torch.device("cpu")
@@ -68,13 +67,7 @@ def painted_recipe() -> Recipe:
     return small_recipe("tiny-painted", "driving-semantic", {"class_weights": "driving"})
 
 
-def trainer(path: Path, recipe: Recipe, clips: Clips, valid: Clips, stop: StopSignal | None = None) -> Trainer:
-    return Trainer(
-        RunInputs(recipe=recipe, data=RunData(clips=clips, valid=valid), folder=RunFolder(path), stop=stop or Never())
-    )
-
-
-def orbits(path: Path, stop: StopSignal | None = None) -> Trainer:
+def orbits(path: Path, stop: Event | None = None) -> Trainer:
     return trainer(path, orbit_recipe(), TinyOrbits(), TinyOrbits(1, seed=9), stop)
 
 
@@ -227,7 +220,7 @@ def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
         precision=PRECISION,
         seed=1,
         identity="test",
-        stop=Never(),
+        stop=Event(),
     )
     encode_clips(job)
     return LatentClips.open(path)

@@ -7,29 +7,14 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved, tiny_recipe
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, TinyClips, assert_same_states, saved, tiny_recipe, trainer
 
 from gcd_model import Clip, load_synthesizer
 from gcd_train.data.latents import LatentClips, write_index
-from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
-from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, StageName
-from gcd_train.stop import StopSignal
-from gcd_train.training.monitor import RunFolder
-from gcd_train.training.run import RunInputs, Trainer
 from gcd_train.training.setup import model_config, sampled_as_trained
-
-
-def trainer(path: Path, recipe: Recipe | None = None, stop: StopSignal | None = None, clips: int = 2) -> Trainer:
-    inputs = RunInputs(
-        recipe=recipe or tiny_recipe(),
-        data=RunData(clips=TinyClips(clips), valid=TinyClips(1, seed=9)),
-        folder=RunFolder(path),
-        stop=stop or Never(),
-    )
-    return Trainer(inputs)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +119,7 @@ def test_encoding_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
         trainer(path, stop=After(1)).run("latents")
     with pytest.raises(RunError, match="no finished latents"):
         LatentClips.open(path / "latents")
-    trainer(path, clips=3).run("latents")  # the data has grown; the run keeps the clips it began with
+    trainer(path, clips=TinyClips(3)).run("latents")  # the data has grown; the run keeps the clips it began with
     every = torch.arange(2).repeat_interleave(FRAMES), torch.arange(FRAMES).repeat(2), torch.arange(2 * FRAMES) % 2 > 0
     one, other = (LatentClips.open(folder / "latents").rows(*every, torch.device("cpu")) for folder in (path, run))
     assert torch.equal(one.source, other.source)

@@ -182,14 +182,13 @@ def _run(
 ) -> None:
     from gcd_train.data.open import open_data
     from gcd_train.training.monitor import RunFolder, TensorBoard
-    from gcd_train.training.run import RunInputs, Trainer
+    from gcd_train.training.run import Trainer
     from gcd_train.training.setup import family_of, run_config
 
     stop = _stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
     data = open_data(recipe, run_config(recipe), family_of(recipe.model), places)
     folder = RunFolder(out, board)
-    inputs = RunInputs(recipe=recipe, data=data, latents=latents, folder=folder, stop=stop, processes=processes)
-    trainer = Trainer(inputs)
+    trainer = Trainer(recipe=recipe, data=data, folder=folder, stop=stop, latents=latents, processes=processes)
     with folder.begun(recipe, command_line()) if processes.first else nullcontext():
         trainer.run(stage)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import torch
@@ -24,7 +25,6 @@ from gcd_train.data.latents import (
 from gcd_train.data.sample import Clips, numbers_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.recipe import LatentsRecipe, Recipe
-from gcd_train.stop import StopSignal
 from gcd_train.training.conditioner import Conditioner, mirrored_path
 from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, ClassWeight, class_emphasis
@@ -53,7 +53,7 @@ class LatentsJob:
     precision: Precision
     seed: int
     identity: str
-    stop: StopSignal
+    stop: Event
 
 
 def encode_clips(job: LatentsJob) -> None:
@@ -185,7 +185,7 @@ class Encodings:
     clips: Clips
     folder: Path
     shared: Path | None
-    stop: StopSignal
+    stop: Event
 
     def encode(self, networks: Networks) -> None:
         """Write what is not there yet. Raises Interrupted, DataError, RunError, see `encode_clips`."""

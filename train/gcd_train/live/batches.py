@@ -25,7 +25,7 @@ from gcd_model.loading import default_precision
 from gcd_train.live.clips import LiveClip, decode_depth, evenly, read_clip, tensor_of
 from gcd_train.live.draws import Poses
 from gcd_train.live.store import Camera, TrainingClips, camera_of
-from gcd_train.training.loop import Progress
+from gcd_train.training.loop import Task
 
 Random = np.random.Generator
 Record = TypeVar("Record")
@@ -322,18 +322,9 @@ def some_of(batch: Record, cut: slice) -> Record:
     return replace(cast("Any", batch), **taken)
 
 
-class LiveTask:
-    """What all stages' tasks have in common; see SharedTask."""
+class LiveTask(Task):
+    """What all stages' tasks have in common."""
 
     def __init__(self, net: nn.Module, config: LiveConfig) -> None:
-        self.module = net
-        self._network, self._config, self._device = net, config, next(net.parameters()).device
-
-    def compute_through(self, network: nn.Module) -> None:
-        """See SharedTask."""
-        self._network = network
-
-    def after_update(self, progress: Progress) -> bool:
-        """Nothing to do."""
-        _ = progress
-        return False
+        super().__init__(net)
+        self._config, self._device = config, next(net.parameters()).device

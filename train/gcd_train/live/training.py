@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import msgspec
@@ -30,7 +31,6 @@ from gcd_train.live.store import TrainingClips, training_paths
 from gcd_train.live.views import InputShelf, ViewBatches, make_inputs
 from gcd_train.parallel import map_items
 from gcd_train.recipe_data import ComputeRecipe, LiveStageName
-from gcd_train.stop import StopSignal
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.loop import Loop, LoopOptions, Task
 from gcd_train.training.monitor import RunFolder
@@ -53,7 +53,7 @@ class LivePlaces:
     out: Path
 
 
-def train_live(recipe: LiveRecipe, places: LivePlaces, stop: StopSignal, processes: Processes = ALONE) -> Path:
+def train_live(recipe: LiveRecipe, places: LivePlaces, stop: Event, processes: Processes = ALONE) -> Path:
     """All stages, or what is left of them; returns the weight file.
 
     Several processes share the updates of depth and paint; the first one does the rest.
@@ -157,7 +157,7 @@ def _scene(path: Path) -> str:
 def _stage(
     recipe: LiveRecipe,
     folder: RunFolder,
-    stop: StopSignal,
+    stop: Event,
     name: LiveStageName,
     stage: LiveStage,
     task: Task,
@@ -184,7 +184,7 @@ def _stage(
 
 
 def _make_all_inputs(
-    out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: StopSignal, workers: int
+    out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: Event, workers: int
 ) -> None:
     """Inputs of every clip that has none yet."""
     missing = [path for path in paths if not (out / path.parent.name / path.name).exists()]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
+from threading import Event
 from typing import TypeVar
 
 import torch
@@ -24,7 +25,6 @@ from gcd_model.layers import Dormant
 from gcd_model.unet import Stage, StageInputs
 from gcd_train.errors import Interrupted, RecipeError, TrainError
 from gcd_train.recipe_data import ComputeRecipe
-from gcd_train.stop import StopSignal
 
 _POLL_S = 0.2
 
@@ -102,7 +102,7 @@ class Processes:
             dist.broadcast_object_list(holder, src=0, group=self.control)
         return holder[0]
 
-    def by_the_first(self, work: Callable[[], None], stop: StopSignal) -> None:
+    def by_the_first(self, work: Callable[[], None], stop: Event) -> None:
         """Let the first process do something that may take hours, while the others wait.
 
         Raises Interrupted in a waiting process that was asked to stop, TrainError if the first one is gone.
