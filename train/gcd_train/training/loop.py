@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from gcd_train.errors import Interrupted
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe_data import AnyStageName, Budget, LogRecipe
-from gcd_train.training.checkpoint import Mark, States, Trained
+from gcd_train.training.checkpoint import States, Trained
 from gcd_train.training.distributed import Engine, held_back, whole
 from gcd_train.training.monitor import FiniteGuard, RunFolder
 from gcd_train.training.optimiser import Ema, ParameterGroup, build_optimiser, set_rate
@@ -126,9 +126,9 @@ class Loop:
         self._states = States(folder.stage(stage), trained, stage, options.identity, options.log, engine.processes)
         self._window = _Window()
         self._guard = FiniteGuard(options.stage, folder.stage(options.stage) / "not_finite.json")
-        mark = self._states.restore()
-        if mark is not None:
-            self._updates, self._seconds = mark.updates, mark.seconds
+        note = self._states.restore()
+        if note is not None:
+            self._updates, self._seconds = note.updates, note.seconds
 
     @property
     def progress(self) -> Progress:
@@ -268,7 +268,7 @@ class Loop:
 
     def _save(self) -> None:
         self._speak()  # a loss that is no number must not be saved
-        self._states.save(Mark(self._updates, self._seconds))
+        self._states.save(self._updates, self._seconds)
 
 
 def _duration(seconds: float) -> str:
