@@ -33,7 +33,7 @@ from gcd_model import (
 from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics
-from gcd_train.cli.gallery import gallery_command
+from gcd_train.cli.look import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import ViewRecipe, mounted, paths, view_window
 from gcd_train.look.real_video import WindowChoice, Windowed, find_videos, read_windows
