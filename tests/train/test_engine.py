@@ -1,13 +1,11 @@
-"""Blocks that compute twice, optimisers by name, and how an update is shared out; without starting processes."""
+"""Blocks that compute twice, and how an update is shared out; without starting processes."""
 
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from types import SimpleNamespace
 from typing import Any
 
-import msgspec
 import pytest
 import torch
 from tiny_world import After, tiny_recipe
@@ -17,21 +15,17 @@ from two_processes import FRAMES, LOG, UPDATES, Noise, Task, options, recipe_of
 
 from gcd_model.networks import random_networks
 from gcd_model.unet import VideoUNet
-from gcd_train.errors import Interrupted, RecipeError
-from gcd_train.recipe import EmaRecipe, OptimiserRecipe
+from gcd_train.errors import Interrupted
+from gcd_train.recipe import OptimiserRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
 from gcd_train.recipe_files import load_recipe, packaged_recipes
-from gcd_train.training import optimiser as optimisers
 from gcd_train.training.checkpoint import newest_weights
 from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, recompute_blocks, stages_of
 from gcd_train.training.draws import Draws
 from gcd_train.training.loop import Loop, Progress, StepLoss
 from gcd_train.training.loop import Task as BaseTask
 from gcd_train.training.monitor import RunFolder
-from gcd_train.training.optimiser import Ema, ParameterGroup, build_optimiser, set_rate
 from gcd_train.training.setup import Precision, model_config
-
-RATE = OptimiserRecipe(rate=0.1, kind="adam")
 
 
 def gradients(unet: VideoUNet) -> tuple[dict[str, torch.Tensor], int]:
@@ -48,85 +42,15 @@ def gradients(unet: VideoUNet) -> tuple[dict[str, torch.Tensor], int]:
     return found, len(runs)
 
 
-@pytest.mark.parametrize("every", [2])
-def test_blocks_computed_anew_give_the_same_gradients_under_the_same_names(every: int) -> None:
+def test_blocks_computed_anew_give_the_same_gradients_under_the_same_names() -> None:
     unet = random_networks(model_config(tiny_recipe().model), seed=2).unet
     plain, once = gradients(unet)
     names, blocks = list(unet.state_dict()), len(stages_of(unet))
-    recompute_blocks(unet, every)
+    recompute_blocks(unet, 2)
     again, runs = gradients(unet)
     assert list(unet.state_dict()) == names
-    assert (once, runs) == (blocks, blocks + blocks // every)
+    assert (once, runs) == (blocks, blocks + blocks // 2)
     assert_close(again, plain, atol=1e-6, rtol=1e-6)
-
-
-def groups(count: int = 3) -> list[ParameterGroup]:
-    return [ParameterGroup(parameters=[nn.Parameter(torch.ones(count))])]
-
-
-def test_torchs_own_optimisers_are_fused() -> None:
-    for kind, wanted in (("adam", torch.optim.Adam), ("adamw", torch.optim.AdamW)):
-        made = build_optimiser(groups(), msgspec.structs.replace(RATE, kind=kind))
-        assert type(made) is wanted
-        assert made.param_groups[0]["fused"] is True
-
-
-@pytest.mark.parametrize(
-    ("kind", "weights", "name"),
-    [
-        ("adam8bit", "float32", "Adam8bit"),
-        ("adamw8bit", "float32", "AdamW8bit"),
-        ("adamw8bit", "bfloat16", "AdamW8bit"),
-        ("adam", "bfloat16", "_AdamW"),
-        ("adamw", "bfloat16", "_AdamW"),
-    ],
-)
-def test_8_bit_moments_and_bfloat16_weights_come_from_torchao(
-    monkeypatch: pytest.MonkeyPatch, kind: str, weights: Any, name: str
-) -> None:
-    asked: list[tuple[str, dict[str, Any]]] = []
-
-    def maker(called: str) -> Any:
-        return lambda _groups, **named: asked.append((called, named))
-
-    library = SimpleNamespace(**{each: maker(each) for each in ("Adam8bit", "AdamW8bit", "_AdamW")})
-    monkeypatch.setattr(optimisers, "import_module", lambda _name: library)
-    build_optimiser(groups(), msgspec.structs.replace(RATE, kind=kind), weights)
-    (called, named), *_ = asked
-    assert called == name
-    assert named["bf16_stochastic_round"] == (weights == "bfloat16")
-    assert named["weight_decay"] == 0.0
-
-
-def test_what_torchao_is_for_is_said_when_it_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise ImportError(name)
-
-    monkeypatch.setattr(optimisers, "import_module", missing)
-    with pytest.raises(RecipeError, match=r"pip install 'gcd-node\[train\]'"):
-        build_optimiser(groups(), msgspec.structs.replace(RATE, kind="adam8bit"))
-
-
-def test_a_rate_that_is_a_tensor_is_filled() -> None:
-    made = build_optimiser(groups(), RATE)
-    rate = made.param_groups[0]["lr"] = torch.tensor(0.0)
-    set_rate(made, 0, 0.0, RATE)
-    assert made.param_groups[0]["lr"] is rate
-    assert rate.item() == pytest.approx(0.1)
-
-
-def test_the_average_of_bfloat16_weights_is_finer_than_they_are() -> None:
-    module = nn.Linear(1, 1, bias=False).bfloat16()
-    nn.init.ones_(module.weight)
-    ema = Ema(module, EmaRecipe(limit=0.999))
-    nn.init.constant_(module.weight, 1.5)
-    for update in range(1, 4):
-        ema.update(10**5 + update)
-    average = 1 + 0.5 * (1 - 0.999**3)  # less above 1 than bfloat16 can tell
-    with ema.applied():
-        assert module.weight.item() == 1.0
-    assert module.weight.item() == 1.5
-    assert ema.state_dict()["weight"].item() == pytest.approx(average, abs=1e-6)
 
 
 @pytest.mark.parametrize(("parts", "count"), [(6, 3), (14, 4), (24, 7), (2, 5)])
