@@ -20,7 +20,6 @@ from gcd_model.geometry import (
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips, Sample
 from gcd_train.recipe import Recipe
-from gcd_train.recipe_files import parse_recipe
 from gcd_train.training.checkpoint import SavedWeights, newest_weights
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.run import Trainer
@@ -126,7 +125,7 @@ class After(Event):
 
 def tiny_recipe(**changes: object) -> Recipe:
     """The tiny recipe, with top-level fields replaced."""
-    return msgspec.structs.replace(parse_recipe(RECIPE, "tiny"), **changes)
+    return msgspec.structs.replace(msgspec.toml.decode(RECIPE, type=Recipe), **changes)
 
 
 def trainer(
