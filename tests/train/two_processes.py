@@ -1,6 +1,7 @@
 """Two processes that train a tiny U-Net together, and what one process makes of the same; writes JSON for the tests.
 
-One start of Python, then a fork: an import of torch is most of what this costs. `python two_processes.py FOLDER [more]`
+One start of Python, then a fork: an import of torch is most of what this costs. `python two_processes.py FOLDER
+[more]`; with `killed` one process, to be killed.
 """
 
 import json
@@ -34,6 +35,7 @@ from gcd_train.training.setup import Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)  # one layout, so that all use the same kernels
+KILLED_UPDATES = 120
 UPDATES = 3  # the first two on single frames, which leave out the layers across frames
 
 
@@ -75,6 +77,27 @@ class Task(UNetTask):
         self.measured += 1
         self.gather()
         return {"weight": 0.0}
+
+
+class Told(Task):
+    """Writes down each loss, to the bit."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(recipe_of())
+        self._path = path
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        loss = super().step_loss(progress)
+        with self._path.open("a") as file:
+            file.write(json.dumps([progress.updates, progress.part, loss.total.item().hex()]) + "\n")
+        return loss
+
+
+def to_be_killed(folder: Path) -> None:
+    """A run that appends the loss of every update to a file, and saves after each."""
+    log = msgspec.structs.replace(LOG, save_s=1e-9)
+    chosen = replace(options(ALONE, Event(), log), budget=Budget(updates=KILLED_UPDATES))
+    Loop(Told(folder / "losses.jsonl"), RunFolder(folder), chosen).run()
 
 
 class BothDraws:
@@ -280,6 +303,9 @@ def free_port() -> int:
 
 def main(folder: Path, what: Sequence[str]) -> None:
     torch.set_num_threads(1)
+    if "killed" in what:
+        to_be_killed(folder)
+        return
     warnings.filterwarnings("ignore", message="FSDP2-wrapped module")
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "2"}
     os.environ["RANK"] = os.environ["LOCAL_RANK"] = "1" if os.fork() == 0 else "0"
