@@ -72,18 +72,21 @@ def test_items_are_taken_as_workers_come_free() -> None:
     assert len(taken) <= 4
 
 
-def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> None:
+def _started(folder: Path, work: str, place: Path) -> subprocess.Popen[bytes]:
+    """A process of its own that maps this work on two workers; `place` is the second of its arguments."""
     code = (
         "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
-        "from mapped_work import wait_for_ever\n"
+        "from mapped_work import mark_and_square, wait_for_ever\n"
         "from gcd_train.parallel import map_items\n"
-        "if __name__ == '__main__':\n"
-        "    list(map_items(wait_for_ever, [sys.argv[2]] * 3, workers=2))\n"
+        f"if __name__ == '__main__':\n    list(map_items({work}, workers=2))\n"
     )
-    script = tmp_path / "run.py"
-    script.write_text(code)
-    running = subprocess.Popen([sys.executable, str(script), str(HERE), str(tmp_path)], stderr=subprocess.DEVNULL)
+    (folder / "run.py").write_text(code)
+    return subprocess.Popen([sys.executable, folder / "run.py", HERE, place], stderr=subprocess.DEVNULL)
+
+
+def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> None:
+    running = _started(tmp_path, "wait_for_ever, [sys.argv[2]] * 3", tmp_path)
     pids = _wait_for(tmp_path, "begun-*", 2)
     running.send_signal(2)  # Ctrl-C
     running.wait(timeout=40)
@@ -92,19 +95,9 @@ def test_leaving_early_stops_the_workers_in_an_orderly_way(tmp_path: Path) -> No
 
 
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
-    (tmp_path / "items").mkdir()
-    code = (
-        "import signal, sys; sys.path.insert(0, sys.argv[1])\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
-        "from mapped_work import mark_and_square\n"
-        "from gcd_train.parallel import map_items\n"
-        "if __name__ == '__main__':\n"
-        "    list(map_items(mark_and_square, [(sys.argv[2], n) for n in range(10_000)], workers=2))\n"
-    )
-    script = tmp_path / "run.py"
-    script.write_text(code)
     place = tmp_path / "items"
-    running = subprocess.Popen([sys.executable, str(script), str(HERE), str(place)], stderr=subprocess.DEVNULL)
+    place.mkdir()
+    running = _started(tmp_path, "mark_and_square, [(sys.argv[2], n) for n in range(10_000)]", place)
     _wait_for(place, "*", 2)
     running.kill()
     running.wait(timeout=30)

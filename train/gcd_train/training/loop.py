@@ -187,11 +187,12 @@ class Loop:
         progress = self.progress
         set_rate(self._optimiser, progress.updates, progress.share, recipe)
         self._optimiser.zero_grad(set_to_none=True)
-        engine, parts = self._options.engine, self._options.parts
+        processes, parts = self._processes, self._options.parts
         for turn, (part, share) in enumerate(self._mine, 1):
             with held_back(self._task.network, last=turn == len(self._mine)):
                 loss = self._task.step_loss(replace(progress, part=part))
-                (loss.total * (share * engine.share_of_loss(parts))).backward()
+                # the gradient is the mean over the parts, and that of the processes is averaged
+                (loss.total * (share * (processes.count / parts))).backward()
             kept = {name: value.detach() for name, value in loss.parts.items()}
             self._guard.saw(progress.updates, "loss", loss.total, loss.ids)
             if share:  # and not one that only keeps the others company
@@ -199,7 +200,9 @@ class Loop:
         norm = self._clipped()
         self._window.norms.append(norm)
         self._guard.saw(progress.updates, "gradient", norm)
-        engine.seed_rounding(progress.updates)
+        if self._options.engine.compute.weights == "bfloat16":
+            # stochastic rounding follows from the number of the update: the same in every copy, and when resumed
+            torch.manual_seed(progress.updates)
         self._optimiser.step()
         self._updates += 1
         if self._ema is not None:
