@@ -5,26 +5,17 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
-from tiny_world import Never, TinyClips, saved, tiny_recipe
+from tiny_world import saved, tiny_recipe, trainer
 
-from gcd_train.data.open import RunData
 from gcd_train.training.checkpoint import SavedWeights
-from gcd_train.training.monitor import RunFolder
-from gcd_train.training.run import RunInputs, Trainer
 
 
 def unet_of(path: Path, *, compiled: bool, recompute: bool = False) -> SavedWeights:
     """The U-Net's state after all updates of the tiny recipe; the stages before it are taken as they lie there."""
     recipe = tiny_recipe()
     compute = msgspec.structs.replace(recipe.compute, compile=compiled, checkpoint_activations=recompute)
-    inputs = RunInputs(
-        recipe=msgspec.structs.replace(recipe, compute=compute),
-        data=RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9)),
-        folder=RunFolder(path),
-        stop=Never(),
-    )
     for stage in ("vae", "latents", "unet"):
-        Trainer(inputs).run(stage)
+        trainer(path, msgspec.structs.replace(recipe, compute=compute)).run(stage)
     return saved(path / "unet", "unet")
 
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 import torch
 from tiny_driving import smaller
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, saved, trainer
 
 from gcd_model import Clip, RenderOptions, Traits, load_synthesizer
 from gcd_model.config import SVD_14
@@ -18,17 +18,12 @@ from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_weights, read_adapter, save_weights
 from gcd_train.data.batches import SampleBatches
-from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
-from gcd_train.errors import Interrupted, RecipeError
+from gcd_train.errors import RecipeError
 from gcd_train.recipe import OptimiserRecipe, Recipe, StudentRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
-from gcd_train.stop import StopSignal
-from gcd_train.training.distill import sampled, schedule_of
 from gcd_train.training.draws import Draws
-from gcd_train.training.monitor import RunFolder
-from gcd_train.training.objective import Batch, denoiser_of
-from gcd_train.training.run import RunInputs, Trainer
+from gcd_train.training.objective import Batch, denoiser_of, sampled, schedule_of
 from gcd_train.training.setup import Precision, loaded_base, run_config, student_config
 
 CPU = Precision.of(ComputeRecipe(device="cpu"))
@@ -55,11 +50,6 @@ def tiny(teacher: Path, **changes: object) -> Recipe:
     return msgspec.convert({**table, **changes}, Recipe)
 
 
-def distiller(recipe: Recipe, path: Path, stop: StopSignal | None = None) -> Trainer:
-    data = RunData(clips=TinyClips(2), valid=TinyClips(1, seed=9))
-    return Trainer(RunInputs(recipe=recipe, data=data, folder=RunFolder(path), stop=stop or Never()))
-
-
 @pytest.fixture(scope="module")
 def teacher(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of a tiny driving model; tests only read them."""
@@ -81,7 +71,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, teacher: Path) -> Path:
     path = tmp_path_factory.mktemp("run")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    distiller(tiny(teacher), path).run()
+    trainer(path, tiny(teacher)).run()
     torch.set_num_threads(threads)
     return path
 
@@ -156,16 +146,6 @@ def test_a_distillation_says_what_it_measures(run: Path) -> None:
     assert all(5 < line["psnr"] < 60 for line in measured.values())
     said = next(line for line in lines if line["kind"] == "loss" and line["stage"] == "unet")
     assert said["latent"] > 0
-
-
-@pytest.mark.slow
-def test_a_stopped_distillation_goes_on_to_the_same_weights(run: Path, teacher: Path, tmp_path: Path) -> None:
-    (tmp_path / "latents").symlink_to(run / "latents")
-    with pytest.raises(Interrupted):
-        distiller(tiny(teacher), tmp_path, After(1)).run("unet")
-    assert saved(tmp_path / "unet", "unet").note.updates == 1
-    distiller(tiny(teacher), tmp_path).run("unet")
-    assert_same_states(tmp_path, run, "unet")
 
 
 def test_the_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher: Path) -> None:

@@ -5,17 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_world import FRAMES, Never, TinyClips, TinyOrbits
+from tiny_world import FRAMES, TinyClips, TinyOrbits, trainer
 
 from gcd_model import load_synthesizer
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.open import DataPlaces, RunData, open_data
-from gcd_train.data.sample import Clips, video_clips
+from gcd_train.data.open import DataPlaces, open_data
+from gcd_train.data.sample import video_clips
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe
-from gcd_train.training.monitor import RunFolder
-from gcd_train.training.run import RunInputs, Trainer
 from gcd_train.training.setup import family_of, model_config, start_networks
 
 CPU = torch.device("cpu")
@@ -42,23 +40,15 @@ def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> No
     assert len(set(videos.seeds)) == 6
 
 
-def trainer(folder: Path, told: Recipe, latents: Path, parts: tuple[Clips, ...] = ()) -> Trainer:
-    videos = video_clips(parts) if parts else None
-    inputs = RunInputs(
-        recipe=told,
-        data=RunData(clips=videos or TinyClips(2), valid=videos or TinyClips(1, seed=9)),
-        folder=RunFolder(folder),
-        stop=Never(),
-        latents=latents,
-    )
-    return Trainer(inputs)
+# examples
 
 
 def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     latents, other = tmp_path / "latents", TinyClips(2, seed=4)
     other.origin = "tiny direct"
     first = recipe("study-pretrain")
-    trainer(tmp_path / "first", first, latents, (TinyClips(2), other)).run()
+    videos = video_clips((TinyClips(2), other))
+    trainer(tmp_path / "first", first, videos, videos, latents=latents).run()
     weights = tmp_path / "first" / "study-pretrain-small.safetensors"
     made = load_synthesizer(weights, device="cpu")
     assert made.traits.family is FAMILIES["svd"]
@@ -67,7 +57,7 @@ def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     assert not (tmp_path / "first" / "latents").exists()
     then = recipe("study-gradual-pretrained", f"model.weights={weights}")
     for folder in ("second", "third"):  # which share their latents
-        trainer(tmp_path / folder, then, latents).run("latents")
+        trainer(tmp_path / folder, then, latents=latents).run("latents")
     after = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
     assert before.items() < after.items()
     assert len({path.parent for path in after}) == 2

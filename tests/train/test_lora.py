@@ -6,7 +6,7 @@ import msgspec
 import pytest
 import torch
 from test_start import SEED, given, published, random_batch, updated
-from tiny_world import FRAMES, HEIGHT, WIDTH, Never, TinyClips, saved
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, saved, trainer
 from torch import Tensor
 from torch.testing import assert_close
 from typer.testing import CliRunner
@@ -17,13 +17,8 @@ from gcd_model.weights.adapter import adapted, base_digest
 from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
 from gcd_train.cli.main import app
-from gcd_train.data.open import RunData
-from gcd_train.errors import RecipeError
 from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe
-from gcd_train.recipe_files import parse_recipe
-from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import Denoiser
-from gcd_train.training.run import RunInputs, Trainer
 from gcd_train.training.setup import copy_of, model_config
 from gcd_train.training.trainable import adapter_of, halve_frozen, is_temporal, let_train, merge_lora, plain_weights
 
@@ -110,8 +105,9 @@ def test_at_full_size_rank_32_is_under_two_percent_and_the_temporal_part_as_larg
 
 def test_adapters_want_weights_to_stand_on() -> None:
     text = b'name = "x"\n[model]\ntrain = "lora"\n[vae]\nbudget = {updates = 1}\noptimiser = {rate = 1.0}\n'
-    with pytest.raises(RecipeError, match="adds to a trained U-Net: give model"):
-        parse_recipe(text + b"[unet]\nbudget = {updates = 1}\noptimiser = {rate = 1.0}\n[latents]\n", "x.toml")
+    text += b"[unet]\nbudget = {updates = 1}\noptimiser = {rate = 1.0}\n[latents]\n"
+    with pytest.raises(msgspec.ValidationError, match="adds to a trained U-Net: give model"):
+        msgspec.toml.decode(text, type=Recipe)
 
 
 # --- a whole run -----------------------------------------------------------------------------------------------------
@@ -130,7 +126,7 @@ def recipe(base: Path) -> Recipe:
     clip_batch = 1
     optimiser = {{ kind = "adam", rate = 0.01 }}
     """
-    return parse_recipe("\n".join(text.splitlines()).replace(",\n  ", ", ").encode(), "mine")
+    return msgspec.toml.decode("\n".join(text.splitlines()).replace(",\n  ", ", "), type=Recipe)
 
 
 @pytest.mark.slow
@@ -140,11 +136,7 @@ def test_a_run_leaves_the_adapter_apart_and_merged_weights(tmp_path: Path) -> No
     model = ModelRecipe(base="small", family="driving", frames=FRAMES, height=HEIGHT, width=WIDTH)
     networks = random_networks(model_config(model), seed=1)
     save_weights(networks, base, Card(name="base", config=networks.config, family=None, move_time=3))
-    valid = TinyClips(1, seed=9)
-    inputs = RunInputs(
-        recipe=recipe(base), data=RunData(clips=TinyClips(1), valid=valid), folder=RunFolder(out), stop=Never()
-    )
-    Trainer(inputs).run()
+    trainer(out, recipe(base), TinyClips(1)).run()
     state = saved(out / "unet", "unet").module
     assert all(name.endswith((".down", ".up")) for name in state)
     joined = load_adapted(load_weights(base, ask_family=False), read_adapter(out / "mine-adapter.safetensors"))

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from gcd_train.errors import RunError, TrainError
-from gcd_train.pictures import write_sheet
-from gcd_train.training.monitor import FiniteGuard, RunFolder, TensorBoard
+from gcd_train.training.monitor import FiniteGuard, RunFolder, TensorBoard, write_sheet
 
 
 def test_a_loss_that_is_no_number_names_update_and_clips(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 from headless import needs_egl
-from kill_worker import UPDATES
 from tiny_world import FRAMES, HEIGHT, RECIPE, WIDTH
+from two_processes import KILLED_UPDATES
 
 HERE = Path(__file__).parent
 _SHARED_OUT = 5e-6
@@ -121,24 +121,24 @@ def losses_of(folder: Path) -> dict[tuple[int, int], set[str]]:
 @pytest.mark.timeout(600)
 def test_a_run_killed_at_three_random_points_goes_on_to_the_same_losses_bit_for_bit(tmp_path: Path) -> None:
     """kill -9 of a process that saves after every update: five starts of Python."""
-    command = [sys.executable, str(HERE / "kill_worker.py")]
+    command = [sys.executable, str(HERE / "two_processes.py")]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
         folder.mkdir()
-    subprocess.run([*command, str(whole)], env=QUIET, check=True)
+    subprocess.run([*command, str(whole), "killed"], env=QUIET, check=True)
     for share in sorted(random.uniform(0.1, 0.9) for _ in range(3)):
-        run = subprocess.Popen([*command, str(killed)], env=QUIET)
+        run = subprocess.Popen([*command, str(killed), "killed"], env=QUIET)
         seen = killed / "losses.jsonl"
-        while not seen.exists() or len(losses_of(killed)) < 2 * UPDATES * share:
+        while not seen.exists() or len(losses_of(killed)) < 2 * KILLED_UPDATES * share:
             assert run.poll() is None, "ended before it was killed"
             time.sleep(0.003 * random.random())
         run.send_signal(signal.SIGKILL)
         assert run.wait() == -signal.SIGKILL
         torn = seen.read_text()
         seen.write_text(torn[: torn.rindex("\n") + 1])
-    subprocess.run([*command, str(killed)], env=QUIET, check=True)
+    subprocess.run([*command, str(killed), "killed"], env=QUIET, check=True)
     found = losses_of(killed)
-    assert len(found) == 2 * UPDATES
+    assert len(found) == 2 * KILLED_UPDATES
     assert found == losses_of(whole)
 
 

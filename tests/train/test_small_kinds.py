@@ -1,15 +1,16 @@
 """Runs of small models that do more than show a road, at a tiny size: steered orbits, and painted classes."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import numpy as np
 import pytest
 import torch
 from tiny_scenes4d import DRIVING_POSES, write_driving
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, TinyOrbits, saved, tiny_recipe
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, TinyOrbits, saved, tiny_recipe, trainer
 from torch import Tensor
 
 from gcd_model import Clip, load_synthesizer
@@ -20,17 +21,14 @@ from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
 from gcd_train.data.batches import EncodedBatches
 from gcd_train.data.latents import Encodings, LatentClips, LatentRows
-from gcd_train.data.open import DataPlaces, RunData, open_data
+from gcd_train.data.open import DataPlaces, open_data
 from gcd_train.data.sample import Clips, MadeClips, Sample, to_network
 from gcd_train.data.sample import painted as painted_clips
-from gcd_train.errors import DataError, Interrupted
-from gcd_train.recipe import ClassWeightsName, Recipe
+from gcd_train.errors import DataError
+from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
-from gcd_train.stop import StopSignal
 from gcd_train.training.conditioner import mirrored_path
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.training.monitor import RunFolder
-from gcd_train.training.run import RunInputs, Trainer
 from gcd_train.training.setup import Precision, model_config, start_networks
 
 CPU = torch.device("cpu")
@@ -66,25 +64,11 @@ def painted_recipe() -> Recipe:
     return small_recipe("tiny-painted", "driving-semantic", {"class_weights": "driving"})
 
 
-def trainer(path: Path, recipe: Recipe, clips: Clips, valid: Clips, stop: StopSignal | None = None) -> Trainer:
-    return Trainer(
-        RunInputs(recipe=recipe, data=RunData(clips=clips, valid=valid), folder=RunFolder(path), stop=stop or Never())
-    )
-
-
-def orbits(path: Path, stop: StopSignal | None = None) -> Trainer:
-    return trainer(path, orbit_recipe(), TinyOrbits(), TinyOrbits(1, seed=9), stop)
-
-
-def painted(path: Path) -> Trainer:
-    return trainer(path, painted_recipe(), painted_clips(TinyClips()), painted_clips(TinyClips(1, seed=9)))
-
-
 @pytest.fixture(scope="module")
 def orbit_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run; tests only read it."""
     path = tmp_path_factory.mktemp("orbits")
-    orbits(path).run()
+    trainer(path, orbit_recipe(), TinyOrbits(), TinyOrbits(1, seed=9)).run()
     return path
 
 
@@ -92,7 +76,7 @@ def orbit_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def painted_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run; tests only read it."""
     path = tmp_path_factory.mktemp("painted")
-    painted(path).run()
+    trainer(path, painted_recipe(), painted_clips(TinyClips()), painted_clips(TinyClips(1, seed=9))).run()
     return path
 
 
@@ -158,23 +142,6 @@ def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tm
     assert all(0 <= found[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
 
 
-@pytest.mark.slow
-def test_a_resumed_run_on_orbits_equals_an_uninterrupted_one(orbit_run: Path, tmp_path: Path) -> None:
-    """Bit for bit, what is steered included; slow because other runs show the same of fixed paths."""
-    (tmp_path / "vae").symlink_to(orbit_run / "vae")
-    for stage in ("latents", "unet"):
-        with pytest.raises(Interrupted):
-            orbits(tmp_path, stop=After(1)).run(stage)
-        orbits(tmp_path).run(stage)
-    every = torch.arange(2).repeat_interleave(FRAMES), torch.arange(FRAMES).repeat(2), torch.arange(2 * FRAMES) % 2 > 0
-    one, other = (LatentClips.open(folder / "latents").rows(*every, CPU) for folder in (tmp_path, orbit_run))
-    assert torch.equal(one.source, other.source)
-    assert torch.equal(one.target, other.target)
-    assert_alike(one.control, other.control)
-    resumed, whole = (saved(folder / "unet", "unet").module for folder in (tmp_path, orbit_run))
-    assert all(torch.equal(resumed[name], value) for name, value in whole.items())
-
-
 def mirrored(clips: Clips) -> Clips:
     """Clips as seen in a mirror."""
 
@@ -196,21 +163,6 @@ def mirrored(clips: Clips) -> Clips:
     )
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A recipe, its clips, and the clips in a mirror."""
-
-    recipe: Recipe
-    clips: Clips
-    mirrored: Clips
-
-
-KINDS = {
-    "orbits": Kind(orbit_recipe(), TinyOrbits(), mirrored(TinyOrbits())),
-    "painted": Kind(painted_recipe(), painted_clips(TinyClips()), painted_clips(mirrored(TinyClips()))),
-}
-
-
 def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
     """Latents of clips by a random autoencoder."""
     config = model_config(recipe.model)
@@ -222,7 +174,7 @@ def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
         clips=clips,
         folder=path,
         shared=None,
-        stop=Never(),
+        stop=Event(),
     )
     work.encode(random_networks(config, seed=5))
     return LatentClips.open(path)
@@ -233,11 +185,18 @@ def row(clips: LatentClips, *, mirrored: bool) -> LatentRows:
     return clips.rows(torch.tensor([1]), torch.tensor([2]), torch.tensor([mirrored]), CPU)
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_a_mirrored_row_is_the_row_of_the_mirrored_scene(name: str, tmp_path: Path) -> None:
-    kind = KINDS[name]
-    one = row(encoded(tmp_path / "plain", kind.recipe, kind.clips), mirrored=True)
-    other = row(encoded(tmp_path / "mirrored", kind.recipe, kind.mirrored), mirrored=False)
+@pytest.mark.parametrize(
+    ("recipe", "clips", "seen"),
+    [
+        (orbit_recipe(), TinyOrbits(), mirrored(TinyOrbits())),
+        (painted_recipe(), painted_clips(TinyClips()), painted_clips(mirrored(TinyClips()))),
+    ],
+)
+def test_a_mirrored_row_is_the_row_of_the_mirrored_scene(
+    recipe: Recipe, clips: Clips, seen: Clips, tmp_path: Path
+) -> None:
+    one = row(encoded(tmp_path / "plain", recipe, clips), mirrored=True)
+    other = row(encoded(tmp_path / "mirrored", recipe, seen), mirrored=False)
     assert torch.equal(one.source, other.source)
     assert torch.equal(one.target, other.target)
     assert torch.equal(one.motion, other.motion)
@@ -269,8 +228,7 @@ def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run
 def test_people_and_vehicles_of_our_world_count_as_published(name: str, factor: float) -> None:
     (colour,) = (kind.colour for kind in DRIVING_CLASSES if kind.name == name)
     painted_one = torch.tensor(colour).view(1, 3, 1, 1).expand(1, 3, 8, 8) / 127.5 - 1
-    weights: ClassWeightsName = "driving"
-    emphasis = class_emphasis(painted_one, COLOUR_WEIGHTS[weights], (1, 1))
+    emphasis = class_emphasis(painted_one, COLOUR_WEIGHTS["driving"], (1, 1))
     assert emphasis.item() == pytest.approx(factor - 1)
 
 

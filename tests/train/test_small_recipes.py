@@ -74,30 +74,23 @@ def require_learned(lines: list[dict[str, float]]) -> None:
     assert any("psnr" in line for line in lines)
 
 
-def test_kubric_trains(kubric: Path, tmp_path: Path) -> None:
-    require_learned(trained("kubric-direct-max180", kubric, tmp_path, KUBRIC))
-    traits = load_synthesizer(tmp_path / "kubric-direct-max180-small.safetensors").traits
-    assert (traits.config.camera, traits.move_time) == ("spherical", 0)
-    assert traits.family is not None
-    assert traits.family.name == "kubric180"
+_PUBLISHED = [name for name in packaged_recipes() if name.startswith(("kubric-", "pardom-"))]
+_QUICK = "kubric-direct-max180"
 
 
-@pytest.mark.slow
-def test_driving_trains_on_painted_classes(driving: Path, tmp_path: Path) -> None:
-    """As above, on targets in class colours with their weights."""
-    require_learned(trained("pardom-gradual-semantic", driving, tmp_path, DRIVING))
-    traits = load_synthesizer(tmp_path / "pardom-gradual-semantic-small.safetensors").traits
-    assert (traits.config.camera, traits.move_time) == ("none", 2)
-    assert traits.family is not None
-    assert traits.family.output == "semantic"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in packaged_recipes() if name.startswith(("kubric-", "pardom-"))])
-def test_all_sixteen_published_recipes_train(name: str, kubric: Path, driving: Path, tmp_path: Path) -> None:
-    """Each for two updates, the ones from scratch too."""
-    data, changes = (kubric, KUBRIC) if name.startswith("kubric-") else (driving, DRIVING)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != _QUICK)) for name in _PUBLISHED]
+)
+def test_the_published_recipes_train(name: str, kubric: Path, driving: Path, tmp_path: Path) -> None:
+    """Each for two updates, the ones from scratch and those of painted classes too."""
+    orbit = name.startswith("kubric-")
+    data, changes = (kubric, KUBRIC) if orbit else (driving, DRIVING)
     require_learned(trained(name, data, tmp_path, changes))
+    traits = load_synthesizer(tmp_path / f"{name}-small.safetensors").traits
+    camera, goal = "spherical" if orbit else "none", 2 if "gradual" in name else 0
+    assert (traits.config.camera, traits.move_time) == (camera, goal)
+    assert traits.family is not None
+    assert traits.family.name == load_recipe(f"package:{name}").model.family
 
 
 @pytest.mark.slow

@@ -68,25 +68,23 @@ def assert_from(networks: Networks, source: Networks, anew: tuple[str, ...]) -> 
         assert torch.equal(value, expected), name
 
 
-@pytest.mark.parametrize("name", ["gcd.ckpt", "own.safetensors"])
-def test_a_model_of_the_same_kind_gives_all_its_weights(tmp_path: Path, name: str) -> None:
-    source = given()
-    networks = start_networks(starting(write(tmp_path / name, source)), published(), SEED)
-    assert_from(networks, source, ("nothing",))
-
-
-def test_the_base_model_gives_all_but_the_camera(tmp_path: Path) -> None:
-    source = given("none")
-    networks = start_networks(starting(write(tmp_path / "svd.safetensors", source)), published(), SEED)
-    assert_from(networks, source, ("camera.", "unet.embed_camera."))
-
-
-def test_from_scratch_takes_autoencoders_and_image_tower_alone(tmp_path: Path) -> None:
-    source = given("none")
-    path = write(tmp_path / "svd.safetensors", source)
-    networks = start_networks(starting(path, scratch=True), published(), SEED)
-    assert_from(networks, source, ("unet.", "camera."))
-    assert not torch.equal(networks.unet.stem.weight, source.unet.stem.weight)
+@pytest.mark.parametrize(
+    ("name", "camera", "scratch", "anew"),
+    [
+        ("gcd.ckpt", "spherical", False, ("nothing",)),
+        ("own.safetensors", "spherical", False, ("nothing",)),
+        ("svd.safetensors", "none", False, ("camera.", "unet.embed_camera.")),
+        ("svd.safetensors", "none", True, ("unet.", "camera.")),
+    ],
+)
+def test_a_file_gives_what_it_has_but_the_unet_from_scratch(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, camera: str, scratch: bool, anew: tuple[str, ...]
+) -> None:
+    source = given(camera)
+    networks = start_networks(starting(write(tmp_path / name, source), scratch), published(), SEED)
+    assert_from(networks, source, anew)
+    assert torch.equal(networks.unet.stem.weight, source.unet.stem.weight) == (not scratch)
+    assert caplog.text == ""  # a file that says no family is asked for none
 
 
 def test_a_file_of_another_model_is_refused_by_its_first_weight(tmp_path: Path) -> None:
@@ -94,11 +92,6 @@ def test_a_file_of_another_model_is_refused_by_its_first_weight(tmp_path: Path) 
     wide = msgspec.structs.replace(published(), unet=msgspec.structs.replace(published().unet, embedding_width=64))
     with pytest.raises(RecipeError, match=r"own.safetensors holds another model .* misshapen, first: unet\."):
         start_networks(starting(path), wide, SEED)
-
-
-def test_starting_from_a_file_needs_no_family_of_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    start_networks(starting(write(tmp_path / "mine.ckpt", given())), published(), SEED)
-    assert caplog.text == ""
 
 
 # --- what is trained -------------------------------------------------------------------------------------------------

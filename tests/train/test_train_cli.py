@@ -1,9 +1,13 @@
+"""`gcd-train`: what its commands list, and how they end where something is wrong."""
+
 import importlib
 import inspect
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
+import msgspec
 import pytest
 import torch
 import typer
@@ -12,39 +16,57 @@ from typer.testing import CliRunner
 from gcd_train.cli.common import errors_shown
 from gcd_train.cli.main import COMMANDS, app
 from gcd_train.errors import RunError
+from gcd_train.recipe import Recipe
+from gcd_train.recipe_files import packaged_recipes
 
 
-def test_families_lists_every_family_with_its_limits() -> None:
-    result = CliRunner().invoke(app, ["families"], env={"COLUMNS": "200"})
-    assert result.exit_code == 0
+def ran(*words: object, columns: int = 200) -> tuple[int, str]:
+    result = CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": str(columns)})
+    assert "Traceback" not in result.output
+    return result.exit_code, result.output
+
+
+def test_families_are_listed_with_their_limits_all_or_one() -> None:
+    code, said = ran("families")
+    assert code == 0
     for text in ("kubric90", "kubric180", "driving-semantic", "svd", "±180°", "53.13°"):
-        assert text in result.stdout
+        assert text in said
+    _, one = ran("families", "driving")
+    assert ("85°" in one, "kubric" in one) == (True, False)
+    code, refused = ran("families", "cubric")
+    assert (code != 0, "kubric90" in refused) == (True, True)
 
 
-def test_one_family_can_be_asked_for() -> None:
-    result = CliRunner().invoke(app, ["families", "driving"], env={"COLUMNS": "200"})
-    assert "85°" in result.stdout
-    assert "kubric" not in result.stdout
-
-
-def test_an_unknown_family_is_refused_with_the_known_ones() -> None:
-    result = CliRunner().invoke(app, ["families", "cubric"])
-    assert result.exit_code != 0
-    assert "kubric90" in result.output
+def test_recipes_are_listed_whole_and_one_is_shown_with_all_it_says() -> None:
+    for columns in (60, 160):  # a name that is cut off cannot be given to `train`
+        code, listed = ran("recipes", columns=columns)
+        assert code == 0
+        assert [name for name in packaged_recipes() if f"package:{name} " not in listed] == []
+    assert "parallel_domain4d, classes" in listed
+    code, shown = ran("recipes", "package:tabletop", "--small", "--set=unet.batch=6")
+    assert code == 0
+    for text in ('name = "tabletop-small"', 'camera = "relative_pose"', "batch = 6", "dropout_joint = false"):
+        assert text in shown
+    _, student = ran("recipes", "package:distill-kubric", "--set=student.steps=7")
+    assert msgspec.convert(tomllib.loads(student), Recipe).student.steps == 7  # pyright: ignore
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "words"),
+    ("words", "code", "said"),
     [
-        (["--no-baselines", "--data", "no[where]"], 66, "no[where]"),
+        (["train", "none.toml"], 78, "none.toml"),
+        (["train", "package:study-pretrain", "--valid=none"], 66, "none"),
+        (["train", "package:study-pretrain", "--stage", "gan"], 2, "export"),
+        (["train", "package:distill-kubric"], 78, "kubric_gradual_max90.ckpt"),
+        (["train", "package:tabletop", "--small", "--set=unet.clip_bath=2"], 78, "clip_batch"),
+        (["train", "package:tabletop", "--small"], 66, "none"),
+        (["evaluate", "--no-baselines"], 66, "no[where]"),
     ],
 )
-def test_evaluation_says_what_is_wrong_in_one_line(tmp_path: Path, options: list[str], code: int, words: str) -> None:
-    folders = [*([] if "--data" in options else ["--data", str(tmp_path)]), "--out", str(tmp_path / "report")]
-    result = CliRunner().invoke(app, ["evaluate", *folders, *options])
-    assert result.exit_code == code
-    assert words in result.output
-    assert "Traceback" not in result.output
+def test_what_is_wrong_is_one_line_and_an_exit_code(tmp_path: Path, words: list[str], code: int, said: str) -> None:
+    data = tmp_path / ("no[where]" if words[0] == "evaluate" else "none")
+    found, output = ran(*words, f"--data={data}", f"--out={tmp_path / 'out'}")
+    assert (found, said in output) == (code, True), output
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("of the device"), RuntimeError("can't allocate memory")])

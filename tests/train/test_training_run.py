@@ -7,30 +7,15 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
-from tiny_world import FRAMES, HEIGHT, WIDTH, After, Never, TinyClips, assert_same_states, saved, tiny_recipe
+from tiny_world import FRAMES, HEIGHT, WIDTH, After, TinyClips, assert_same_states, saved, tiny_recipe, trainer
 
 from gcd_model import Clip, load_synthesizer
 from gcd_train.data.cache import write_index
 from gcd_train.data.latents import LatentClips
-from gcd_train.data.open import RunData
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, Interrupted, RecipeError, RunError
-from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, StageName
-from gcd_train.stop import StopSignal
-from gcd_train.training.monitor import RunFolder
-from gcd_train.training.run import RunInputs, Trainer
 from gcd_train.training.setup import model_config, sampled_as_trained
-
-
-def trainer(path: Path, recipe: Recipe | None = None, stop: StopSignal | None = None, clips: int = 2) -> Trainer:
-    inputs = RunInputs(
-        recipe=recipe or tiny_recipe(),
-        data=RunData(clips=TinyClips(clips), valid=TinyClips(1, seed=9)),
-        folder=RunFolder(path),
-        stop=stop or Never(),
-    )
-    return Trainer(inputs)
 
 
 @pytest.fixture(scope="module")
@@ -107,20 +92,13 @@ def folder_with(run: Path, path: Path, *parts: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("stage", "before", "at"),
-    [
-        ("vae", (), 2),
-        ("vae", (), 5),
-        ("unet", ("vae", "latents"), 2),
-        ("unet", ("vae", "latents"), 5),
-    ],
-)
+@pytest.mark.parametrize("at", [2, 5])
+@pytest.mark.parametrize("stage", ["vae", "unet"])
 def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
-    run: Path, tmp_path: Path, stage: StageName, before: tuple[str, ...], at: int
+    run: Path, tmp_path: Path, stage: StageName, at: int
 ) -> None:
     torch.set_num_threads(1)
-    path = folder_with(run, tmp_path / "again", *before)
+    path = folder_with(run, tmp_path / "again", *(("vae", "latents") if stage == "unet" else ()))
     with pytest.raises(Interrupted, match=f"update {at}"):
         trainer(path, stop=After(at + 1)).run(stage)  # asked once before the first update, then after each
     assert saved(path / stage, stage).note.updates == at
@@ -135,7 +113,7 @@ def test_encoding_goes_on_where_it_stopped(run: Path, tmp_path: Path) -> None:
         trainer(path, stop=After(1)).run("latents")
     with pytest.raises(RunError, match="no finished latents"):
         LatentClips.open(path / "latents")
-    trainer(path, clips=3).run("latents")  # the data has grown; the run keeps the clips it began with
+    trainer(path, clips=TinyClips(3)).run("latents")  # the data has grown; the run keeps the clips it began with
     every = torch.arange(2).repeat_interleave(FRAMES), torch.arange(FRAMES).repeat(2), torch.arange(2 * FRAMES) % 2 > 0
     one, other = (LatentClips.open(folder / "latents").rows(*every, torch.device("cpu")) for folder in (path, run))
     assert torch.equal(one.source, other.source)
@@ -160,7 +138,7 @@ def test_a_state_of_another_seed_is_not_resumed(run: Path, tmp_path: Path) -> No
         trainer(path, recipe=tiny_recipe(seed=4)).run("vae")
 
 
-def test_the_shipped_sampler_is_that_of_the_recipe() -> None:
+def test_the_shipped_sampler_is_that_of_the_recipe_and_starts_where_something_was_trained() -> None:
     recipe = tiny_recipe()
     changed = msgspec.structs.replace(
         recipe.unet, augmentation=0.05, noise=msgspec.structs.replace(recipe.unet.noise, shared=0.0)
@@ -169,21 +147,14 @@ def test_the_shipped_sampler_is_that_of_the_recipe() -> None:
     assert sampled_as_trained(config, recipe.unet).sampling == config.sampling
     sampling = sampled_as_trained(config, changed).sampling
     assert (sampling.augmentation, sampling.shared_noise) == (0.05, False)
-
-
-def test_a_sampler_that_starts_where_nothing_was_trained_is_refused() -> None:
-    recipe = tiny_recipe()
     noise = msgspec.structs.replace(recipe.unet.noise, fixed_share=1.0, fixed_sigma=40.0)
     with pytest.raises(RecipeError, match="trains sigma 40 alone"):
-        sampled_as_trained(model_config(recipe.model), msgspec.structs.replace(recipe.unet, noise=noise))
+        sampled_as_trained(config, msgspec.structs.replace(recipe.unet, noise=noise))
 
 
-def test_a_stage_wants_the_one_before_it(tmp_path: Path) -> None:
+def test_a_stage_wants_the_one_before_it_and_the_recipe_to_have_it(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="--stage vae"):
         trainer(tmp_path).run("unet")
-
-
-def test_a_stage_the_recipe_lacks_is_refused(tmp_path: Path) -> None:
     model = msgspec.structs.replace(tiny_recipe().model, weights="none.safetensors")
     with pytest.raises(RecipeError, match="no stage 'vae'"):
         trainer(tmp_path, recipe=tiny_recipe(vae=None, model=model)).run("vae")
@@ -225,22 +196,13 @@ def test_a_stage_killed_before_its_last_measurement_measures_when_run_again(run:
     assert len(list((path / "vae" / "samples").glob("*.png"))) == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
-        ("fps", 5.0, "the clips have 5"),
-    ],
-)
-def test_clips_the_model_does_not_fit_are_refused_before_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: object, words: str
+def test_clips_the_model_or_the_latents_do_not_fit_are_refused_before_training(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(TinyClips, name, value)
-    with pytest.raises(DataError, match=words):
-        trainer(tmp_path)
-
-
-def test_latents_of_other_clips_are_not_used(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = folder_with(run, tmp_path / "again", "vae", "latents")
     monkeypatch.setattr(TinyClips, "origin", "another world")
     with pytest.raises(RunError, match="of other clips"):
         trainer(path).run("unet")
+    monkeypatch.setattr(TinyClips, "fps", 5.0)
+    with pytest.raises(DataError, match="the clips have 5"):
+        trainer(tmp_path)

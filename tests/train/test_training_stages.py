@@ -4,21 +4,21 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import pytest
 import torch
-from tiny_world import HEIGHT, WIDTH, Never, tiny_recipe
-from torch import Tensor, nn
+from tiny_world import HEIGHT, WIDTH, tiny_recipe
+from torch import nn
 from torch.testing import assert_close
 
 from gcd_model.networks import Networks, random_networks
 from gcd_train.errors import TrainError
 from gcd_train.recipe import OptimiserRecipe
 from gcd_train.recipe_data import Budget, LogRecipe
-from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
+from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss, Task
 from gcd_train.training.monitor import RunFolder
-from gcd_train.training.optimiser import ParameterGroup
 from gcd_train.training.setup import model_config
 from gcd_train.training.vae import normalise_latents, start_from_components
 
@@ -44,26 +44,21 @@ def test_normalising_gives_unit_latents_and_changes_no_picture_inside() -> None:
     assert_close(same[..., 1:-1, 1:-1], picture[..., 1:-1, 1:-1], atol=1e-4, rtol=1e-4)
 
 
-class Parabola:
+class Parabola(Task):
     """A task with one number to learn; its loss can go wrong."""
 
     def __init__(self, fails_at: int | None = None) -> None:
-        self.module = nn.ParameterDict({"x": nn.Parameter(torch.tensor(1.0))})
+        super().__init__(nn.Linear(1, 1, bias=False))
+        self.x = self.module.get_parameter("weight")
+        nn.init.ones_(self.x)
         self._fails_at = fails_at
 
-    def parameter_groups(self) -> Sequence[ParameterGroup]:
-        return [ParameterGroup(parameters=list(self.module.parameters()))]
-
     def step_loss(self, progress: Progress) -> StepLoss:
-        x: Tensor = self.module["x"]
-        loss = x**2 if progress.updates != self._fails_at else x * torch.inf
+        loss = (self.x**2 if progress.updates != self._fails_at else self.x * torch.inf).sum()
         return StepLoss(loss, {"square": loss}, 1)
 
-    def after_update(self, progress: Progress) -> bool:
-        return False
-
     def measure(self, picture: Path) -> dict[str, float]:
-        return {"x": self.module["x"].item()}
+        return {"x": self.x.item()}
 
 
 class Clock:
@@ -85,7 +80,7 @@ def options(budget: Budget, clock: Clock) -> LoopOptions:
         optimiser=OptimiserRecipe(rate=0.1),
         ema=None,
         log=LogRecipe(log_s=1000.0, save_s=1000.0, measure_s=1000.0),
-        stop=Never(),
+        stop=Event(),
         frames_per_clip=4,
         clock=clock,
     )
@@ -117,29 +112,22 @@ def test_a_run_measures_after_so_many_updates(tmp_path: Path) -> None:
     assert [line["updates"] for line in lines if line["kind"] == "measured"] == [2, 4, 5]
 
 
-class Distances:
-    """A task whose parts pull one number to different places; keeps the gradient of each update."""
+class Distances(Parabola):
+    """Its parts pull the number to different places; keeps the gradient of each update."""
 
     def __init__(self, places: Sequence[float]) -> None:
-        self.module = nn.ParameterDict({"x": nn.Parameter(torch.tensor(1.0))})
+        super().__init__()
         self.gradients: list[float] = []
         self._places = places
 
-    def parameter_groups(self) -> Sequence[ParameterGroup]:
-        return [ParameterGroup(parameters=list(self.module.parameters()))]
-
     def step_loss(self, progress: Progress) -> StepLoss:
-        loss = (self.module["x"] - self._places[progress.part]) ** 2
+        loss = (self.x - self._places[progress.part]).square().sum()
         return StepLoss(loss, {"distance": loss}, 1)
 
     def after_update(self, progress: Progress) -> bool:
-        gradient = self.module["x"].grad
-        assert gradient is not None
-        self.gradients.append(gradient.item())
+        assert self.x.grad is not None
+        self.gradients.append(self.x.grad.item())
         return False
-
-    def measure(self, picture: Path) -> dict[str, float]:
-        return {}
 
 
 def test_the_gradient_of_an_update_is_the_mean_over_its_parts(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
 from gcd_model.weights.load import inspect_weights
-from gcd_train.cli.calibrate import calibrate_command
+from gcd_train.cli.evaluate import calibrate_command
 from gcd_train.errors import DataError
 from gcd_train.evaluation.calibration import (
     Distances,

@@ -1,6 +1,7 @@
 """Clips, networks and recipes small enough to train in a second."""
 
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import numpy as np
@@ -16,10 +17,12 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
+from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips, Sample
 from gcd_train.recipe import Recipe
-from gcd_train.recipe_files import parse_recipe
 from gcd_train.training.checkpoint import SavedWeights, newest_weights
+from gcd_train.training.monitor import RunFolder
+from gcd_train.training.run import Trainer
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
 
@@ -108,17 +111,11 @@ class TinyOrbits(TinyClips):
         return spherical_trajectory(source, change, frames=FRAMES, move_time=FRAMES - 1)
 
 
-class Never:
-    """A stop signal that is never set."""
-
-    def is_set(self) -> bool:
-        return False
-
-
-class After:
+class After(Event):
     """A stop signal that is set the n-th time it is asked."""
 
     def __init__(self, asked: int) -> None:
+        super().__init__()
         self._left = asked
 
     def is_set(self) -> bool:
@@ -128,7 +125,25 @@ class After:
 
 def tiny_recipe(**changes: object) -> Recipe:
     """The tiny recipe, with top-level fields replaced."""
-    return msgspec.structs.replace(parse_recipe(RECIPE, "tiny"), **changes)
+    return msgspec.structs.replace(msgspec.toml.decode(RECIPE, type=Recipe), **changes)
+
+
+def trainer(
+    path: Path,
+    recipe: Recipe | None = None,
+    clips: Clips | None = None,
+    valid: Clips | None = None,
+    stop: Event | None = None,
+    latents: Path | None = None,
+) -> Trainer:
+    """A run in a folder, by default of the tiny recipe on tiny clips."""
+    return Trainer(
+        recipe=recipe or tiny_recipe(),
+        data=RunData(clips=clips or TinyClips(2), valid=valid or TinyClips(1, seed=9)),
+        folder=RunFolder(path),
+        stop=stop or Event(),
+        latents=latents,
+    )
 
 
 def saved(stage_folder: Path, stage: str) -> SavedWeights:

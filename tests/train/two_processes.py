@@ -1,6 +1,7 @@
 """Two processes that train a tiny U-Net together, and what one process makes of the same; writes JSON for the tests.
 
-One start of Python, then a fork: an import of torch is most of what this costs. `python two_processes.py FOLDER [more]`
+One start of Python, then a fork: an import of torch is most of what this costs. `python two_processes.py FOLDER
+[more]`; with `killed` one process, to be killed.
 """
 
 import json
@@ -13,17 +14,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import torch
-from tiny_world import FRAMES, saved, tiny_recipe
+from tiny_world import FRAMES, After, saved, tiny_recipe
 from torch import Tensor
 
 from gcd_model.networks import random_networks
 from gcd_train.errors import Interrupted, TrainError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, LogRecipe
-from gcd_train.stop import StopSignal
 from gcd_train.training.checkpoint import SavedWeights
 from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, whole
 from gcd_train.training.draws import Draws
@@ -34,6 +35,7 @@ from gcd_train.training.setup import Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)  # one layout, so that all use the same kernels
+KILLED_UPDATES = 120
 UPDATES = 3  # the first two on single frames, which leave out the layers across frames
 
 
@@ -58,22 +60,6 @@ class Noise:
         )
 
 
-class Never:
-    def is_set(self) -> bool:
-        return False
-
-
-class AfterUpdates:
-    """Set once it was asked so often."""
-
-    def __init__(self, count: int) -> None:
-        self._left = count
-
-    def is_set(self) -> bool:
-        self._left -= 1
-        return self._left < 0
-
-
 class Task(UNetTask):
     """The U-Net's own task, on noise, with nothing to measure on. dies_at: the update in which the process ends."""
 
@@ -91,6 +77,27 @@ class Task(UNetTask):
         self.measured += 1
         self.gather()
         return {"weight": 0.0}
+
+
+class Told(Task):
+    """Writes down each loss, to the bit."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(recipe_of())
+        self._path = path
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        loss = super().step_loss(progress)
+        with self._path.open("a") as file:
+            file.write(json.dumps([progress.updates, progress.part, loss.total.item().hex()]) + "\n")
+        return loss
+
+
+def to_be_killed(folder: Path) -> None:
+    """A run that appends the loss of every update to a file, and saves after each."""
+    log = msgspec.structs.replace(LOG, save_s=1e-9)
+    chosen = replace(options(ALONE, Event(), log), budget=Budget(updates=KILLED_UPDATES))
+    Loop(Told(folder / "losses.jsonl"), RunFolder(folder), chosen).run()
 
 
 class BothDraws:
@@ -116,7 +123,7 @@ class TwiceTheBatch(Task):
         made = self._batches.single_frames if single else self._batches.whole_clips
         batch = made(draws, 2 * (recipe.image_batch if single else recipe.clip_batch))  # pyright: ignore
         return diffusion_loss(
-            self._network, batch, draws, PRECISION,  # pyright: ignore
+            self.network, batch, draws, PRECISION,  # pyright: ignore
             noise=recipe.noise, loss=recipe.loss, channel_weights=None, step=progress.updates,
         )  # fmt: skip
 
@@ -132,7 +139,7 @@ def recipe_of(batch: int = 2) -> Recipe:
     )
 
 
-def options(processes: Processes, stop: StopSignal, log: LogRecipe, **compute: object) -> LoopOptions:
+def options(processes: Processes, stop: Event, log: LogRecipe, **compute: object) -> LoopOptions:
     recipe = recipe_of()
     return LoopOptions(
         stage="unet",
@@ -153,7 +160,7 @@ LOG = LogRecipe(log_s=1000.0, save_s=1000.0, measure_s=1000.0)
 
 def trained(path: Path, task: Task, chosen: LoopOptions, stop_at: int | None = None) -> dict[str, Tensor]:
     """The weights after a run; or after it was stopped."""
-    loop = Loop(task, RunFolder(path), chosen if stop_at is None else replace(chosen, stop=AfterUpdates(stop_at)))
+    loop = Loop(task, RunFolder(path), chosen if stop_at is None else replace(chosen, stop=After(stop_at + 1)))
     try:
         loop.run()
     except Interrupted:
@@ -182,11 +189,11 @@ def distance(first: dict[str, Tensor], second: dict[str, Tensor]) -> float:
 def alone(folder: Path) -> dict[str, dict[str, Tensor]]:
     """What one process makes of it, in an update of two batches, and in one of a batch twice as large."""
     recipe = recipe_of()
-    once = replace(options(ALONE, Never(), LOG), parts=1)
+    once = replace(options(ALONE, Event(), LOG), parts=1)
     return {
-        "two batches": trained(folder / "two", Task(recipe), options(ALONE, Never(), LOG)),
+        "two batches": trained(folder / "two", Task(recipe), options(ALONE, Event(), LOG)),
         "twice the batch": trained(folder / "twice", TwiceTheBatch(recipe), once),
-        "three batches": trained(folder / "three", Task(recipe_of(3)), in_three(options(ALONE, Never(), LOG))),
+        "three batches": trained(folder / "three", Task(recipe_of(3)), in_three(options(ALONE, Event(), LOG))),
         "start": Task(recipe).module.state_dict(),
     }
 
@@ -199,7 +206,7 @@ class Together:
 
     def run(self, name: str, stop_at: int | None = None, log: LogRecipe = LOG, **compute: object) -> dict[str, Tensor]:
         """The weights that such a run ends with, in a folder of that name."""
-        chosen = options(self.processes, Never(), log, **compute)
+        chosen = options(self.processes, Event(), log, **compute)
         return trained(self.folder / name, Task(recipe_of()), chosen, stop_at)
 
     def equal_one(self, *kinds: str) -> dict[str, object]:
@@ -207,7 +214,7 @@ class Together:
         found: dict[str, object] = {}
         for parallel in kinds:
             task = Task(recipe_of())
-            weights = trained(self.folder / parallel, task, options(self.processes, Never(), LOG, parallel=parallel))
+            weights = trained(self.folder / parallel, task, options(self.processes, Event(), LOG, parallel=parallel))
             rank = self.processes.rank
             mine = {"measured": (task.measured, 1), f"rank {rank}": (1.0, 1), "weighed": (float(rank), 1 + 2 * rank)}
             both = self.processes.averaged(mine)
@@ -221,7 +228,7 @@ class Together:
 
     def uneven(self) -> dict[str, object]:
         """Three batches an update, of which one process computes two."""
-        chosen = in_three(options(self.processes, Never(), LOG, parallel="ddp"))
+        chosen = in_three(options(self.processes, Event(), LOG, parallel="ddp"))
         weights = trained(self.folder / "uneven", Task(recipe_of(3)), chosen)
         speeds = [frames_per_s(self.folder / name) for name in ("uneven", "alone/three")]
         return {"uneven": furthest(weights, self.single["three batches"]), "uneven speeds": speeds}
@@ -257,7 +264,7 @@ class Together:
     def handed_on(self) -> dict[str, object]:
         """What one process began, two go on with for an update, and then one again."""
         if self.processes.first:
-            trained(self.folder / "handed", Task(recipe_of()), options(ALONE, Never(), LOG), 1)
+            trained(self.folder / "handed", Task(recipe_of()), options(ALONE, Event(), LOG), 1)
         self.processes.told(None)
         self.run("handed", 1, parallel="fsdp")
         found: dict[str, object] = {
@@ -265,7 +272,7 @@ class Together:
         }
         self.processes.told(None)
         if self.processes.first:
-            back = trained(self.folder / "handed", Task(recipe_of()), options(ALONE, Never(), LOG))
+            back = trained(self.folder / "handed", Task(recipe_of()), options(ALONE, Event(), LOG))
             found["handed back"] = furthest(back, self.single["two batches"])
         self.processes.told(None)
         return found
@@ -279,7 +286,7 @@ class Together:
         """What the first process says when the second one ends in the middle of its work. Must come last."""
         task = Task(recipe_of(), dies_at=1 if self.processes.rank == 1 else None)
         try:
-            trained(self.folder / "lost", task, options(self.processes, Never(), LOG, parallel="ddp"))
+            trained(self.folder / "lost", task, options(self.processes, Event(), LOG, parallel="ddp"))
         except TrainError as error:
             return {"lost": str(error)}
         return {"lost": "nothing happened"}
@@ -296,6 +303,9 @@ def free_port() -> int:
 
 def main(folder: Path, what: Sequence[str]) -> None:
     torch.set_num_threads(1)
+    if "killed" in what:
+        to_be_killed(folder)
+        return
     warnings.filterwarnings("ignore", message="FSDP2-wrapped module")
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "WORLD_SIZE": "2"}
     os.environ["RANK"] = os.environ["LOCAL_RANK"] = "1" if os.fork() == 0 else "0"

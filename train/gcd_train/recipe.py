@@ -15,7 +15,6 @@ from gcd_train.recipe_data import (
     NotNegative,
     Positive,
     Share,
-    StageName,
 )
 
 OptimiserKind: TypeAlias = Literal["adam", "adamw", "adam8bit", "adamw8bit"]
@@ -317,14 +316,3 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             )
         if (self.data.kind == "cache") != (self.unet.source == "cache"):
             raise ValueError('a latent cache is read with both data.kind "cache" and unet.source "cache"')
-
-    @property
-    def stages(self) -> tuple[StageName, ...]:
-        """The steps of a run, in their order."""
-        there: dict[StageName, bool] = {
-            "vae": self.vae is not None,
-            "latents": self.latents is not None,
-            "unet": True,
-            "export": True,
-        }
-        return tuple(name for name, wanted in there.items() if wanted)

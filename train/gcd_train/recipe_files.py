@@ -3,7 +3,6 @@
 import difflib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias, cast
 
@@ -24,40 +23,9 @@ _DEEPEST = 20
 Table: TypeAlias = dict[str, object]
 
 
-@dataclass(frozen=True, slots=True)
-class MergedTable:
-    """What a recipe states together with its bases. files: the recipe's, then its base, and so on."""
-
-    table: Table
-    files: tuple[str, ...]
-
-    @property
-    def place(self) -> str:
-        """The files, for a message."""
-        first, *rest = self.files
-        return first if not rest else f"{first} (based on {', '.join(rest)})"
-
-
-def recipe_path(source: str | Path, beside: Path | None = None) -> Path:
-    """Where a recipe lies: a path, taken from the folder `beside` if it is not absolute, or `package:NAME`."""
-    kind, _, name = str(source).partition(":")
-    if kind == "package":
-        return PACKAGED / f"{name}.toml"
-    return Path(source) if beside is None else beside / source
-
-
 def packaged_recipes() -> list[str]:
     """Names of the recipes that ship."""
     return sorted(file.stem for file in PACKAGED.glob("*.toml"))
-
-
-def read_merged(source: str | Path) -> MergedTable:
-    """A recipe file on its bases, as plain tables. `name` is the file's own: told in it, or the file's name.
-
-    Raises:
-        RecipeError: a file of the chain is missing or not TOML, or bases go in a circle; names the files.
-    """
-    return _read(recipe_path(source), ())
 
 
 def parsed(text: str | bytes, name: str) -> Table:
@@ -93,16 +61,8 @@ def on_top(base: Mapping[str, object], over: Mapping[str, object], name: str) ->
     return merged(table, {key: value for key, value in over.items() if key != WITHOUT})
 
 
-def require_known(table: Mapping[str, object], known: Sequence[str], name: str) -> None:
-    """Raises RecipeError for a key at the top of a file that no recipe has."""
-    for key in table:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
-            raise RecipeError(f"{name}: unknown key `{key}`; {hint}")
-
-
-def _read(path: Path, above: tuple[Path, ...]) -> MergedTable:
+def read_merged(path: Path, above: tuple[Path, ...] = ()) -> tuple[Table, tuple[str, ...]]:
+    """What a recipe states together with its bases, and the files: the recipe's, then its base, and so on."""
     here = Path(os.path.realpath(path))
     chain = (*above, here)
     if here in above or len(chain) > _DEEPEST:
@@ -114,11 +74,17 @@ def _read(path: Path, above: tuple[Path, ...]) -> MergedTable:
     base = own.pop(BASE, None)
     own.setdefault("name", path.stem)
     if base is None:
-        return MergedTable(own, (str(path),))
+        return own, (str(path),)
     if not isinstance(base, str):
         raise RecipeError(f"{path}: `base` is a path from here, or package:NAME, got {base!r}")
-    below = _read(recipe_path(base, path.parent), chain)
-    return MergedTable(on_top(below.table, own, str(path)), (str(path), *below.files))
+    below, files = read_merged(place_of(base, path.parent), chain)
+    return on_top(below, own, str(path)), (str(path), *files)
+
+
+def place_of(source: str | Path, beside: Path = Path()) -> Path:
+    """Where a recipe lies: a path, taken from the folder `beside` if it is not absolute, or `package:NAME`."""
+    kind, _, name = str(source).partition(":")
+    return PACKAGED / f"{name}.toml" if kind == "package" else beside / source
 
 
 def _instead(path: Path) -> str:
@@ -159,43 +125,32 @@ def load_recipe(source: str | Path, *, small: bool = False, changes: Sequence[st
         RecipeError: missing, not TOML, a base that is missing or goes in a circle, an unknown key (the nearest known
             one is named), a value out of range, or no table [small] where it is asked for.
     """
-    read = read_merged(source)
-    return _recipe(read, small=small, changes=changes)
-
-
-def parse_recipe(text: bytes, name: str) -> Recipe:
-    """Read a recipe file's content, without a base; `name` is for the message. Raises RecipeError as `load_recipe`."""
-    return _recipe(MergedTable(parsed(text, name), (name,)), small=False, changes=())
-
-
-def _recipe(read: MergedTable, *, small: bool, changes: Sequence[str]) -> Recipe:
-    require_known(read.table, _KEYS, read.place)
-    own = {key: value for key, value in read.table.items() if key not in (SMALL, WITHOUT)}
-    if not small:
-        recipe = _checked(_changed(own, changes), read.place)
-        _smaller(own, read)  # what is wrong in it is told now, not to whoever asks for it
-        return recipe
-    table = _smaller(own, read)
-    if table is None:
-        raise RecipeError(f"{read.place} has no table [small], which would say what a CPU can do; leave out --small")
-    return _checked(_changed(table, changes), read.place)
-
-
-def _smaller(own: Table, read: MergedTable) -> Table | None:
-    """The recipe as its table [small] wants it; named so, too, lest the one be taken for the other."""
-    smaller, place = read.table.get(SMALL), f"[small] of {read.place}"
-    if smaller is None:
-        return None
-    if not isinstance(smaller, dict):
-        raise RecipeError(f"{place} must be a table, got {smaller!r}")
-    table = on_top(own, {"name": f"{own.get('name')}-small", **smaller}, place)
-    _checked(table, place)
-    return table
-
-
-def _changed(table: Table, changes: Sequence[str]) -> Table:
+    read, (first, *bases) = read_merged(place_of(source))
+    place = first if not bases else f"{first} (based on {', '.join(bases)})"
+    for key in read:
+        if key not in _KEYS:
+            near = difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.5)
+            hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(_KEYS)}"
+            raise RecipeError(f"{place}: unknown key `{key}`; {hint}")
+    own = {key: value for key, value in read.items() if key not in (SMALL, WITHOUT)}
+    if small and SMALL not in read:
+        raise RecipeError(f"{place} has no table [small], which would say what a CPU can do; leave out --small")
+    table = _smaller(own, read[SMALL], place) if small else own
     for change in changes:
         table = merged(table, _change(change))
+    recipe = _checked(table, place)
+    if SMALL in read:
+        _smaller(own, read[SMALL], place)  # what is wrong in it is told now, not to whoever asks for it
+    return recipe
+
+
+def _smaller(own: Table, smaller: object, place: str) -> Table:
+    """The recipe as its table [small] wants it; named so, too, lest the one be taken for the other."""
+    place = f"[small] of {place}"
+    if not isinstance(smaller, dict):
+        raise RecipeError(f"{place} must be a table, got {smaller!r}")
+    table = on_top(own, {"name": f"{own.get('name')}-small", **cast(Table, smaller)}, place)
+    _checked(table, place)
     return table
 
 

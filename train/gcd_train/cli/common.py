@@ -1,4 +1,4 @@
-"""What all commands have in common: errors as their user sees them, what is said meanwhile, how they are stopped."""
+"""What commands have in common: options, errors as their user sees them, what is said meanwhile, how they stop."""
 
 import shlex
 import signal
@@ -7,6 +7,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated, TypeAlias
 
 import typer
 from rich.console import Console
@@ -14,6 +15,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gcd_model import ModelError, printable
 from gcd_train.errors import Interrupted, RunError, TrainError
+
+Workers: TypeAlias = Annotated[int, typer.Option(min=1, help="Processes.")]
+Ray: TypeAlias = Annotated[
+    str | None, typer.Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")
+]
+Limit: TypeAlias = Annotated[int | None, typer.Option(min=1, help="Only the first so many scenes.")]
+Steps: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="Steps of the sampler instead of the shipped number.")
+]
+NoiseSeed: TypeAlias = Annotated[int, typer.Option(min=0, help="Of the noise samples begin with.")]
+Device: TypeAlias = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
+Dtype: TypeAlias = Annotated[str | None, typer.Option(help="float32, bfloat16 or float16; by default as stored.")]
+FamilyName: TypeAlias = Annotated[
+    str | None, typer.Option("--family", help="Family of the weights, where their file does not tell.")
+]
+"""Options that several commands have."""
 
 _LONGEST = 4000  # of a message, in which a file may have put what it likes
 _OPTION = 78  # sysexits: what the model refuses here is an option or a weight file the user named
@@ -67,9 +84,9 @@ def progress_bar(what: str, total: int, *, keep: bool = False) -> Generator[Call
         yield lambda done: bar.update(task, completed=done)
 
 
-def say(line: str) -> None:
-    """A line on stderr, as it is."""
-    Console(stderr=True, highlight=False).print(line, markup=False, soft_wrap=True)
+def say(line: str, *, stderr: bool = True) -> None:
+    """A line on stderr, or stdout, as it is."""
+    Console(stderr=stderr, highlight=False).print(line, markup=False, soft_wrap=True)
 
 
 def stop_as_by_ctrl_c() -> None:

@@ -1,17 +1,45 @@
-"""Data sets looked after: repacked, verified, LeRobot sets written and read."""
+"""Data sets looked after: repacked, verified, encoded once; LeRobot sets written and read."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
-from rich.console import Console
 
 from gcd_model import printable
-from gcd_train.cli.common import errors_shown, progress_bar, say, stop_as_by_ctrl_c
+from gcd_train.cli.common import (
+    Device,
+    FamilyName,
+    Limit,
+    Ray,
+    Workers,
+    errors_shown,
+    progress_bar,
+    say,
+    stop_as_by_ctrl_c,
+)
 from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.data.files import MANIFEST, faults
-from gcd_train.errors import DataError
+from gcd_train.data.cache import CacheIndex, ClipPlan, only_writer, read_index
+from gcd_train.data.cache_writer import (
+    CacheJob,
+    DrivingPictures,
+    EncoderChoice,
+    cache_scenes,
+    identity_of,
+    load_encoders,
+)
+from gcd_train.data.compact import Compaction
+from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.files import MANIFEST, Skips, faults
+from gcd_train.data.lerobot import LeRobotPairs
+from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
+from gcd_train.data.pictures import PictureOptions
+from gcd_train.data.splits import Part, present, read_split
+from gcd_train.errors import DataError, RecipeError
+from gcd_train.files import remove_leftovers
+from gcd_train.parallel import map_items, one_thread_each
 
 data = typer.Typer(no_args_is_help=True, help="Downloaded data sets: repacking.")
 export = typer.Typer(no_args_is_help=True, help="Write data in other programs' formats.")
@@ -35,20 +63,14 @@ def compact(
     camera: Annotated[
         list[str] | None, typer.Option(help="A camera to pack; may be repeated. By default all published.")
     ] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many scenes.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    ray: Annotated[
-        str | None, typer.Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")
-    ] = None,
+    limit: Limit = None,
+    workers: Workers = 1,
+    ray: Ray = None,
 ) -> None:
     """Repack Kubric-4D or ParallelDomain-4D: WebP, depth of 16 bit, ids as they are; a twentieth of the bytes to read.
 
     A scene appears when all of it was read again and compared. Stopped at any point, the same line goes on.
     """
-    from gcd_train.data.compact import Compaction
-    from gcd_train.files import remove_leftovers
-    from gcd_train.parallel import map_items, one_thread_each
-
     stop_as_by_ctrl_c()
     with errors_shown():
         work = Compaction.of(source, out, cameras=tuple(camera or ()), gaps=gaps)
@@ -84,11 +106,18 @@ def verify_command(
         damaged: dict[Path, list[str]] = {}
         with progress_bar("scenes", len(found)) as show:
             for number, scene in enumerate(found, start=1):
-                lines = _faults_of(scene)
+                try:
+                    lines = list(faults(scene))
+                except DataError as error:
+                    lines = [str(error)]
                 if lines:
                     damaged[scene] = lines
                 show(number)
-        _tell(len(found), damaged)
+        for line in (line for lines in damaged.values() for line in lines):
+            say(printable(line), stderr=False)
+        advice = "; delete the others and run the line that made them again" if damaged else ""
+        whole = len(found) - len(damaged)
+        say(f"{whole} of {len(found)} scenes are as they were written{advice}", stderr=False)
     if damaged:
         raise typer.Exit(DataError.exit_code)
 
@@ -109,22 +138,6 @@ def _is_scene_name(name: str) -> bool:
     return kubric4d.scene_number(name) is not None or parallel_domain4d.scene_number(name) is not None
 
 
-def _faults_of(scene: Path) -> list[str]:
-    try:
-        return list(faults(scene))
-    except DataError as error:
-        return [str(error)]
-
-
-def _tell(count: int, damaged: dict[Path, list[str]]) -> None:
-    out = Console(highlight=False)
-    for line in (line for lines in damaged.values() for line in lines):
-        out.print(printable(line), markup=False, soft_wrap=True)
-    whole = f"{count - len(damaged)} of {count} scenes are as they were written"
-    advice = "; delete the others and run the line that made them again" if damaged else ""
-    out.print(whole + advice, markup=False, soft_wrap=True)
-
-
 @export.command()
 def lerobot(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set, new or empty.")],
@@ -141,8 +154,6 @@ def lerobot(
     """Tabletop episodes as a LeRobot data set (v3.0) with calibrated cameras (extras `scenes` and `lerobot`)."""
     if width % 2 or height % 2:
         raise typer.BadParameter(f"H.264 wants an even width and height, got {width} x {height}")
-    from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
-
     wanted = TabletopExport(
         seeds=range(first_seed, first_seed + episodes),
         frames=frames,
@@ -168,9 +179,7 @@ def lerobot_command(
     seed: Annotated[int, typer.Option(min=0, help="Draws the cameras and windows.")] = 0,
 ) -> None:
     """Read pairs of cameras of a LeRobot data set as training would, and say what was left out."""
-    from gcd_train.data.lerobot import LeRobotPairs
-
-    tell = Console(highlight=False, soft_wrap=True).print
+    tell = partial(say, stderr=False)
     with errors_shown():
         pairs = LeRobotPairs(folder, seed, frames=frames, fps=fps, calibration=calibration)
         rate = pairs.info.fps
@@ -182,3 +191,90 @@ def lerobot_command(
             tell(f"  {sample.scene} rows {first}..{last}: cameras {apart:.3f} m apart")
         for line in pairs.skips.lines():
             tell(line)
+
+
+def cache(
+    data: Annotated[
+        Path, typer.Argument(metavar="DATA", help="Folder with scene_000000 and so on (ParallelDomain-4D's layout).")
+    ],
+    weights: Annotated[
+        str,
+        typer.Option(
+            help="Checkpoint with the encoders: a path, package:NAME; random:driving, small ones, to try it out."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the cache; run the same line again to go on.")],
+    workers: Workers = 1,
+    ray: Ray = None,
+    split: Annotated[
+        Part | None, typer.Option(help="Part of the set, needs --split-file; the whole set if left out.")
+    ] = None,
+    split_file: Annotated[Path | None, typer.Option(help="JSON with the scenes of train, val and test.")] = None,
+    copies: Annotated[int, typer.Option(min=1, help="Differently noised latents of every source frame.")] = 4,
+    path: Annotated[
+        Literal["gradual", "direct", "both"],
+        typer.Option(help="Clips to encode for: the camera moves (gradual), or is there at once (direct)."),
+    ] = "both",
+    semantic: Annotated[bool, typer.Option("--semantic", help="Targets show the classes instead of colour.")] = False,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Draw targets from geometry.npz, which generated scenes have.")
+    ] = False,
+    limit: Limit = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the pixel noise.")] = 0,
+    family: FamilyName = None,
+    device: Device = "auto",
+    dtype: Annotated[str, typer.Option(help="Type the encoders run in: float32, bfloat16 or float16.")] = "float32",
+    batch: Annotated[
+        int, typer.Option(min=1, help="Pictures in one call of the encoder; changes memory, not the latents.")
+    ] = 2,
+) -> None:
+    """Encode a driving set once, so that training never runs the frozen encoders again."""
+    with errors_shown():
+        choice = EncoderChoice(weights=weights, family=family, device=device, dtype=dtype, batch=batch)
+        config = load_encoders(choice)[0].networks.config
+        plan = ClipPlan(clip_frames=config.frames, paths=("gradual", "direct") if path == "both" else (path,))
+        scenes = _cached_set(data, split, split_file, limit, semantic)
+        modality = "classes" if semantic else "rgb"
+        drawn = PictureOptions(size=(config.width, config.height), modality=modality, exact=exact)
+        pictures = DrivingPictures(scenes, config.frames, drawn)
+        identity = identity_of(choice, pictures, plan, copies=copies, seed=seed)
+        _cache(CacheJob(folder=out, pictures=pictures, choice=choice, identity=identity), workers, ray)
+
+
+def _cached_set(
+    root: Path, split: Part | None, split_file: Path | None, limit: int | None, semantic: bool
+) -> Dataset4D:
+    data = ParallelDomain4D(root, classes=semantic)
+    if (split is None) != (split_file is None):
+        raise RecipeError("a part of the set is named with both --split and --split-file; give both or neither")
+    scenes = data.scenes
+    if split_file is not None and split is not None:
+        skips = Skips()
+        scenes = present(read_split(split_file, split), data.scenes, skips, split_file)
+        for line in skips.lines():
+            say(line)
+    return data.only(scenes[:limit])
+
+
+def _cache(job: CacheJob, workers: int, ray: str | None) -> None:
+    folder, scenes, failed = job.folder, job.pictures.scenes, 0
+    with only_writer(folder), progress_bar("scenes", len(scenes), keep=True) as show:
+        for number, outcome in enumerate(cache_scenes(job, scenes, workers=workers, ray_address=ray), start=1):
+            if outcome.value is None:
+                failed += 1
+                say(f"{outcome.item}  left out: {outcome.error}")
+            elif outcome.value.missing:
+                say(f"{outcome.item}  {len(outcome.value.missing)} frames missing")
+            show(number)
+    index = read_index(folder, CacheIndex)
+    kept = [] if index is None else [index.scenes[name] for name in scenes if name in index.scenes]
+    if kept:
+        count, size = len(kept), sum(entry.bytes for entry in kept) / 1e6
+        seconds, missing = sum(entry.seconds for entry in kept), sum(len(entry.missing) for entry in kept)
+        say(
+            f"{folder}: {count} scenes, {size:.2f} MB, {size / count:.2f} MB and {seconds / count:.1f} s a scene, "
+            f"{missing} frames missing (named in index.json)",
+            stderr=False,
+        )
+    if failed:
+        raise DataError(f"{failed} of {len(scenes)} scenes could not be cached, see above; the others are whole")

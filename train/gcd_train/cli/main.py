@@ -7,9 +7,9 @@ from importlib import import_module
 import typer
 
 COMMANDS = {
-    "cache": ("cache:cache", "Encode a driving set once, so that training never runs the frozen encoders again."),
+    "cache": ("data:cache", "Encode a driving set once, so that training never runs the frozen encoders again."),
     "calibrate": (
-        "calibrate:calibrate_command",
+        "evaluate:calibrate_command",
         "Measure how often the truth lies within the intervals of the samples, and the scale that makes it as meant.",
     ),
     "data": ("data:data", "Downloaded data sets: repacking."),
@@ -19,11 +19,11 @@ COMMANDS = {
     ),
     "export": ("data:export", "Write data in other programs' formats."),
     "families": (
-        "weights:families_command",
+        "train:families_command",
         "List the model families: how each was trained, and what a finetuned checkpoint will accept.",
     ),
     "gallery": (
-        "gallery:gallery_command",
+        "look:gallery_command",
         "View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line.",
     ),
     "generate": ("generate:app", "Make training data with a procedural world (extra `scenes`)."),
@@ -31,13 +31,13 @@ COMMANDS = {
         "data:lerobot_command",
         "Read pairs of cameras of a LeRobot data set as training would, and say what was left out.",
     ),
-    "lora": ("weights:lora", "Adapters that a run with model.train = lora writes, and their bases."),
+    "lora": ("train:lora", "Adapters that a run with model.train = lora writes, and their bases."),
     "recipes": ("train:recipes", "List the recipes that ship, or show one whole: on its bases, with every default."),
     "report": (
-        "report:report_command",
+        "evaluate:report_command",
         "Write the paper's tables, or the same for our own clips, from what was measured; nothing is measured again.",
     ),
-    "show": ("show:show", "Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."),
+    "show": ("look:show", "Contact sheet, video, camera path and facts of one clip of a scene (extra `train`)."),
     "train": (
         "train:train",
         "Train a model on clips, or go on where a run stopped. Ctrl-C stops after the update and saves.",

@@ -1,68 +1,61 @@
-"""`gcd-train train`: from a recipe and data to a weight file; `gcd-train recipes`: what there is to train."""
+"""`gcd-train train`: from a recipe and data to a weight file; `recipes`, `lora`, `families`: what there is to train."""
 
 import logging
 import signal
-import threading
 import warnings
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Generator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar, get_args
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast, get_args
 
+import torch
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
-from typer import Argument, BadParameter, Option
+from typer import Argument, BadParameter, Option, Typer
 
-from gcd_train.cli.common import command_line, errors_shown
+from gcd_model.weights.card import precision
+from gcd_model.weights.families import FAMILIES, Family
+from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
+from gcd_model.weights.save import write_published
+from gcd_train.cli.common import Dtype, command_line, errors_shown, say
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, StageName
 from gcd_train.recipe_files import load_recipe, packaged_recipes, to_toml
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # `recipes` and `families` want none of it
     from gcd_train.data.open import DataPlaces
     from gcd_train.training.distributed import Processes
 
-Name = TypeVar("Name", bound=str)
-
-RecipeFile: TypeAlias = Annotated[
-    str, Argument(metavar="RECIPE", help="A TOML file, or package:NAME for one that ships (`gcd-train recipes`).")
+Small: TypeAlias = Annotated[
+    bool, Option("--small", help="Model, size, batch and budget of the recipe's table `small`, for a CPU.")
 ]
-Shown: TypeAlias = Annotated[
-    str | None, Argument(metavar="[RECIPE]", help="Show this one whole, with its bases and every default.")
-]
-Data: TypeAlias = Annotated[Path, Option(help="What to learn from: the recipe's data.kind says what lies there.")]
-Valid: TypeAlias = Annotated[
-    Path | None, Option(help="Held-out data of the same kind to measure on; left out, a part of --data (data.split).")
-]
-Out: TypeAlias = Annotated[Path, Option(help="Folder of the run; run again to go on.")]
-Latents: TypeAlias = Annotated[
-    Path | None, Option(help="Folder for encoded clips, shared by runs of one autoencoder; else in --out.")
-]
-Threads: TypeAlias = Annotated[int | None, Option(min=1, help="CPU threads; else torch's own choice.")]
 Changes: TypeAlias = Annotated[
     list[str] | None,
     Option("--set", metavar="KEY=VALUE", help="Change the recipe: log.save_s=60, for one; may be repeated."),
 ]
-Stage: TypeAlias = Annotated[
-    str | None,
-    Option(help=f"Only this one: {', '.join(get_args(StageName))}."),
-]
-Small: TypeAlias = Annotated[
-    bool, Option("--small", help="Model, size, batch and budget of the recipe's table `small`, for a CPU.")
-]
+
+lora = Typer(no_args_is_help=True, help="Adapters that a run with model.train = lora writes, and their bases.")
 
 
 def train(
-    recipe: RecipeFile,
-    data: Data,
-    out: Out,
-    valid: Valid = None,
-    latents: Latents = None,
-    stage: Stage = None,
-    threads: Threads = None,
+    recipe: Annotated[
+        str, Argument(metavar="RECIPE", help="A TOML file, or package:NAME for one that ships (`gcd-train recipes`).")
+    ],
+    data: Annotated[Path, Option(help="What to learn from: the recipe's data.kind says what lies there.")],
+    out: Annotated[Path, Option(help="Folder of the run; run again to go on.")],
+    valid: Annotated[
+        Path | None,
+        Option(help="Held-out data of the same kind to measure on; left out, a part of --data (data.split)."),
+    ] = None,
+    latents: Annotated[
+        Path | None, Option(help="Folder for encoded clips, shared by runs of one autoencoder; else in --out.")
+    ] = None,
+    stage: Annotated[str | None, Option(help=f"Only this one: {', '.join(get_args(StageName))}.")] = None,
+    threads: Annotated[int | None, Option(min=1, help="CPU threads; else torch's own choice.")] = None,
     small: Small = False,
     changes: Changes = None,
 ) -> None:
@@ -71,53 +64,80 @@ def train(
     warnings.filterwarnings("ignore", message="FSDP2-wrapped module|grad and param do not obey the gradient layout")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if threads is not None:
-        import torch
-
         torch.set_num_threads(threads)
-    from gcd_train.data.open import DataPlaces
-
     with errors_shown():
+        from gcd_train.data.open import DataPlaces
+
         places = DataPlaces(data=data, valid=valid)
         if is_live(recipe):
-            _train_live(recipe, places, out)
+            live = load_live_recipe(recipe)
+            with _in_processes(ComputeRecipe(device=live.device, parallel="ddp")) as processes:
+                _train_live(live, places, out, processes)
             return
         loaded = load_recipe(recipe, small=small, changes=changes or ())
-        _in_processes(loaded, places, out, latents, _stage_named(stage, get_args(StageName)))
+        if stage is not None and stage not in get_args(StageName):
+            raise BadParameter(f"no stage is called {stage!r}; there are {', '.join(get_args(StageName))}")
+        with _in_processes(loaded.compute) as processes:
+            _train(loaded, places, out, latents, cast("StageName | None", stage), processes)
 
 
-def _stop_when_asked() -> threading.Event:
+@contextmanager
+def _in_processes(compute: ComputeRecipe) -> Generator["Processes"]:
+    """Those that torchrun started, of which the first one alone logs."""
+    from gcd_train.training.distributed import processes_of
+
+    with processes_of(compute) as processes:
+        if not processes.first:
+            logging.getLogger().setLevel(logging.WARNING)
+        yield processes
+
+
+def _stop_when_asked() -> Event:
     """Set by Ctrl-C and by SIGTERM from now on; the run then stops after its update and saves."""
-    stop = threading.Event()
-
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGINT, ask)
-    signal.signal(signal.SIGTERM, ask)
+    stop = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: stop.set())
     return stop
 
 
-def _stage_named(name: str | None, known: Sequence[Name]) -> Name | None:
-    """The stage with this name, None for all of them. Raises BadParameter if there is none."""
-    if name is not None and name not in known:
-        raise BadParameter(f"no stage is called {name!r}; there are {', '.join(known)}")
-    return next((each for each in known if each == name), None)
-
-
-def _train_live(recipe: str, places: "DataPlaces", out: Path) -> None:
+def _train_live(recipe: LiveRecipe, places: "DataPlaces", out: Path, processes: "Processes") -> None:
     from gcd_train.live.training import train_live
-    from gcd_train.training.distributed import processes_of
     from gcd_train.training.monitor import RunFolder
 
-    loaded, folder = load_live_recipe(recipe), RunFolder(out)
-    with processes_of(ComputeRecipe(device=loaded.device, parallel="ddp")) as processes:
-        if not processes.first:
-            logging.getLogger().setLevel(logging.WARNING)
-        with folder.begun(loaded, command_line()) if processes.first else nullcontext():
-            train_live(loaded, places, folder, _stop_when_asked(), processes)
+    folder = RunFolder(out)
+    with folder.begun(recipe, command_line()) if processes.first else nullcontext():
+        train_live(recipe, places, folder, _stop_when_asked(), processes)
 
 
-def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None) -> None:
+def _train(
+    recipe: Recipe,
+    places: "DataPlaces",
+    out: Path,
+    latents: Path | None,
+    stage: StageName | None,
+    processes: "Processes",
+) -> None:
+    from gcd_train.data.open import open_data
+    from gcd_train.training.monitor import RunFolder, TensorBoard
+    from gcd_train.training.run import Trainer
+    from gcd_train.training.setup import family_of, run_config
+
+    stop = _stop_when_asked()
+    board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
+    folder = RunFolder(out, board)
+    opened = open_data(recipe, run_config(recipe), family_of(recipe.model), places)
+    trainer = Trainer(recipe=recipe, data=opened, folder=folder, stop=stop, latents=latents, processes=processes)
+    with folder.begun(recipe, command_line()) if processes.first else nullcontext():
+        trainer.run(stage)
+
+
+def recipes(
+    recipe: Annotated[
+        str | None, Argument(metavar="[RECIPE]", help="Show this one whole, with its bases and every default.")
+    ] = None,
+    small: Small = False,
+    changes: Changes = None,
+) -> None:
     """List the recipes that ship, or show one whole: on its bases, with every default."""
     console = Console(highlight=False, soft_wrap=True)
     with errors_shown():
@@ -134,14 +154,16 @@ def recipes(recipe: Shown = None, small: Small = False, changes: Changes = None)
         for name in packaged_recipes():
             table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
         for name in live_recipes():
-            table.add_row(f"package:{name}", *_live_row(load_live_recipe(f"package:{name}")))
+            table.add_row(f"package:{name}", *_row(load_live_recipe(f"package:{name}")))
         # a name that is cut off cannot be given to `train`: a narrow terminal breaks lines instead
         widest = console.measure(table, options=console.options.update(max_width=1000)).maximum
         console.width = max(console.width, widest)
         console.print(table)
 
 
-def _row(recipe: Recipe) -> tuple[str, ...]:
+def _row(recipe: Recipe | LiveRecipe) -> tuple[str, ...]:
+    if isinstance(recipe, LiveRecipe):
+        return "live", "live", _length(recipe.paint.budget), f"{recipe.paint.batch} views", "nothing"
     data, unet, model = recipe.data, recipe.unet, recipe.model
     kind = data.kind if data.modality == "rgb" else f"{data.kind}, classes"
     clips = f"{unet.clip_batch * unet.parts}"
@@ -149,43 +171,60 @@ def _row(recipe: Recipe) -> tuple[str, ...]:
     return kind, f"{base} ({model.family})", _length(unet.budget), clips, model.weights or "nothing"
 
 
-def _live_row(recipe: LiveRecipe) -> tuple[str, ...]:
-    return "live", "live", _length(recipe.paint.budget), f"{recipe.paint.batch} views", "nothing"
-
-
 def _length(budget: Budget) -> str:
     return f"{budget.updates}" if budget.updates is not None else f"{budget.minutes:g} min"
 
 
-def _in_processes(
-    recipe: Recipe, places: "DataPlaces", out: Path, latents: Path | None, stage: StageName | None
+@lora.callback()
+def about() -> None:
+    """Keep `lora` a command with sub-commands, however many there are."""
+
+
+@lora.command()
+def merge(
+    base: Annotated[Path, Argument(metavar="BASE", help="The weight file the adapter was trained from, any layout.")],
+    adapter: Annotated[Path, Argument(metavar="ADAPTER", help="NAME-adapter.safetensors of a run.")],
+    out: Annotated[Path, Argument(metavar="OUT", help="The file to write: .safetensors, or .ckpt.")],
+    layout: Annotated[
+        Literal["gcd-node", "gcd-ckpt"], Option(help="Our .safetensors, or the .ckpt of the released code.")
+    ] = "gcd-node",
+    dtype: Dtype = None,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace OUT if it is there.")] = False,
 ) -> None:
-    from gcd_train.training.distributed import processes_of
+    """Join an adapter with its base to plain weights. OUT appears whole or not at all."""
+    with errors_shown():
+        wanted = None if dtype is None else precision(dtype)
+        start = load_weights(base, ask_family=False)
+        joined = load_adapted(start, read_adapter(adapter))
+        networks = joined.diffusion if wanted is None else joined.diffusion.to(wanted)
+        card = replace(joined.card, trained=True, origin="")
+        if layout == "gcd-ckpt":
+            write_published(out, networks.state_dict(), card, carried=start.carried, overwrite=overwrite)
+        else:
+            save_weights(networks, out, card, overwrite=overwrite)
+    say(f"wrote {out}", stderr=False)
 
-    with processes_of(recipe.compute) as processes:
-        if not processes.first:
-            logging.getLogger().setLevel(logging.WARNING)
-        _run(recipe, places, out, latents, stage, processes)
 
-
-def _run(
-    recipe: Recipe,
-    places: "DataPlaces",
-    out: Path,
-    latents: Path | None,
-    stage: StageName | None,
-    processes: "Processes",
+def families_command(
+    name: Annotated[str | None, Argument(help="Show one family only.", metavar="FAMILY")] = None,
 ) -> None:
-    from gcd_train.data.open import open_data
-    from gcd_train.training.monitor import RunFolder, TensorBoard
-    from gcd_train.training.run import RunInputs, Trainer
-    from gcd_train.training.setup import family_of, run_config
+    """List the model families: how each was trained, and what a finetuned checkpoint will accept."""
+    if name is not None and name not in FAMILIES:
+        raise BadParameter(f"no family is called {name!r}; there are {', '.join(FAMILIES)}")
+    table = Table(title="Model families", box=SIMPLE, pad_edge=False, padding=(0, 0))
+    for column in ("family", "camera", "az / el / r", "rates", "hfov", "size"):
+        table.add_column(column, no_wrap=True)
+    for family in FAMILIES.values():
+        if name in (None, family.name):
+            table.add_row(*_family_row(family))
+    Console().print(table)
 
-    stop = _stop_when_asked()
-    board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
-    data = open_data(recipe, run_config(recipe), family_of(recipe.model), places)
-    folder = RunFolder(out, board)
-    inputs = RunInputs(recipe=recipe, data=data, latents=latents, folder=folder, stop=stop, processes=processes)
-    trainer = Trainer(inputs)
-    with folder.begun(recipe, command_line()) if processes.first else nullcontext():
-        trainer.run(stage)
+
+def _family_row(family: Family) -> tuple[str, ...]:
+    limits = family.limits
+    span = "fixed"
+    if limits is not None:
+        span = f"±{limits.azimuth_deg:g}° ±{limits.elevation_deg:g}° ±{limits.radius_m:g}"
+    rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
+    hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
+    return family.name, family.camera, span, rates, hfov, f"{family.width}x{family.height}"

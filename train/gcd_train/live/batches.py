@@ -24,7 +24,7 @@ from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
 from gcd_train.data.sample import to_network
 from gcd_train.live.clips import Camera, LiveClip, Poses, TrainingClips, decode_depth, evenly, read_clip, tensor_of
-from gcd_train.training.loop import Progress
+from gcd_train.training.loop import Task
 
 Random = np.random.Generator
 Record = TypeVar("Record")
@@ -299,17 +299,9 @@ def some_of(batch: Record, cut: slice) -> Record:
     return _mapped(lambda x: x[cut], batch)
 
 
-class LiveTask:
-    """What all stages' tasks have in common; see SharedTask."""
+class LiveTask(Task):
+    """What all stages' tasks have in common."""
 
     def __init__(self, net: nn.Module, config: LiveConfig) -> None:
-        self.module = self._network = net
+        super().__init__(net)
         self._config, self._device = config, next(net.parameters()).device
-
-    def compute_through(self, network: nn.Module) -> None:
-        """See SharedTask."""
-        self._network = network
-
-    def after_update(self, _progress: Progress) -> bool:
-        """Nothing to do."""
-        return False

@@ -27,9 +27,8 @@ from gcd_train.live.batches import (
 )
 from gcd_train.live.clips import TrainingClips, evenly, read_clip
 from gcd_train.live.recipe import LiveStage
-from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
-from gcd_train.training.optimiser import ParameterGroup
+from gcd_train.training.monitor import write_sheet
 
 _CLASS_POWER = -0.25
 _EDGE, _EDGE_WEIGHT, _THIN_WEIGHT = 0.05, 2.0, 12.0
@@ -65,10 +64,6 @@ class DepthTask(LiveTask):
         """How much a pixel of each class counts, by how often it is drawn and by its weight: [K]."""
         return self._class_weights * (1 + _THIN_WEIGHT * self._thin)
 
-    def parameter_groups(self) -> Sequence[ParameterGroup]:
-        """All weights."""
-        return [ParameterGroup(parameters=list(self._net.parameters()))]
-
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of frames."""
         pictures, ground, random = self._batches[progress.part].batch(progress.updates)
@@ -81,7 +76,7 @@ class DepthTask(LiveTask):
         pixels = torch.multinomial(weights, int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
         sweeps = pictures.sweeps(self._config.depth)
         with autocast(self._device):
-            output = self._network(inputs, sweeps, pixels)
+            output = self.network(inputs, sweeps, pixels)
         parts = self.losses(output, pictures, pixels)
         total = parts["bin"] + _OFFSET * parts["offset"] + _CLASS * parts["class"] + _MOVES * parts["moves"]
         return StepLoss(total=total, parts=parts, frames=len(pictures.lenses))

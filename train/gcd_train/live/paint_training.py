@@ -23,9 +23,9 @@ from gcd_model.live.painter import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import LiveTask, Random, autocast, class_weights, generator_on, on
 from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of
-from gcd_train.pictures import write_sheet
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import gradient_l1, ssim
+from gcd_train.training.monitor import write_sheet
 from gcd_train.training.optimiser import ParameterGroup
 
 _CLASS_POWER = -0.45
@@ -98,7 +98,7 @@ class PaintTask(_ViewTask):
         else:
             row, column = random.integers(2, size=2).tolist()
             parts = self.losses(
-                self._first_step(now.seen, self._network), now, (..., slice(row, None, 2), slice(column, None, 2))
+                self._first_step(now.seen, self.network), now, (..., slice(row, None, 2), slice(column, None, 2))
             )
         total = torch.stack(list(parts.values())).sum()
         return StepLoss(total=total, parts=parts, frames=len(now.poses))
@@ -115,7 +115,7 @@ class PaintTask(_ViewTask):
         noise = torch.randn(views.target.shape, generator=generator, device=self._device)
         noisy = views.target + sigma[:, None, None, None] * noise
         with autocast(self._device):
-            clean = self._network(views.seen, filled(views.seen), sigma, noisy)
+            clean = self.network(views.seen, filled(views.seen), sigma, noisy)
         scale = (sigma**2 + SIGMA_DATA**2) / (sigma * SIGMA_DATA) ** 2
         weight = torch.where(views.visibility > 0, _SEEN_DENOISED, 1.0) * scale[:, None, None]
         return ((clean - views.target).square().mean(dim=1) * weight).mean()

@@ -11,7 +11,7 @@ from gcd_model.small_files import read_small
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe_data import Budget, LiveStageName, LogRecipe
-from gcd_train.recipe_files import PACKAGED, read_merged, recipe_path
+from gcd_train.recipe_files import PACKAGED, place_of, read_merged
 
 
 class LiveStage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,18 +63,18 @@ class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 def is_live(source: str) -> bool:
     """Whether a recipe, by `package:NAME` or path, is a live model's."""
     try:
-        return read_merged(_placed(source)).table.get("kind") == "live"
+        return read_merged(place_of(_placed(source)))[0].get("kind") == "live"
     except RecipeError:
         return False
 
 
 def load_live_recipe(source: str) -> LiveRecipe:
     """A recipe by `package:NAME` or path. Raises RecipeError for one that cannot be read or has unknown keys."""
-    read = read_merged(_placed(source))
+    table, (place, *_) = read_merged(place_of(_placed(source)))
     try:
-        return msgspec.convert(read.table, LiveRecipe)
+        return msgspec.convert(table, LiveRecipe)
     except msgspec.ValidationError as error:
-        raise RecipeError(f"{read.place}: {explain_settings_error(str(error), LiveRecipe)}") from error
+        raise RecipeError(f"{place}: {explain_settings_error(str(error), LiveRecipe)}") from error
 
 
 def live_recipes() -> list[str]:
@@ -85,7 +85,7 @@ def live_recipes() -> list[str]:
 def live_toml(source: str) -> str:
     """The recipe's text, once it was found to be sound. Raises RecipeError."""
     load_live_recipe(source)
-    return read_small(recipe_path(_placed(source)))
+    return read_small(place_of(_placed(source)))
 
 
 def _placed(source: str) -> str:

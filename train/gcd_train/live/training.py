@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
+from threading import Event
 
 import msgspec
 import numpy as np
@@ -33,11 +34,10 @@ from gcd_train.live.recipe import LiveRecipe, LiveStage
 from gcd_train.live.views import InputShelf, ViewBatches, make_inputs
 from gcd_train.parallel import map_items
 from gcd_train.recipe_data import ComputeRecipe, LiveStageName
-from gcd_train.stop import StopSignal
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.loop import Loop, LoopOptions, Task
 from gcd_train.training.monitor import RunFolder
-from gcd_train.training.setup import compute_device, digest_of
+from gcd_train.training.setup import Precision, digest_of
 
 _log = logging.getLogger(__name__)
 _MEASURED = 8
@@ -55,7 +55,7 @@ _DOUBT = 1.1
 
 
 def train_live(
-    recipe: LiveRecipe, data: DataPlaces, folder: RunFolder, stop: StopSignal, processes: Processes = ALONE
+    recipe: LiveRecipe, data: DataPlaces, folder: RunFolder, stop: Event, processes: Processes = ALONE
 ) -> Path:
     """All stages, or what is left of them; returns the weight file.
 
@@ -71,7 +71,7 @@ def train_live(
         raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
     held_out = clip_paths(data.valid)
     _require_fit(recipe, training_paths(data.data), held_out)
-    device = compute_device(ComputeRecipe(device=recipe.device))
+    device = Precision.of(ComputeRecipe(device=recipe.device)).device
     torch.manual_seed(recipe.seed)
     networks = _networks(recipe).to(device, memory_format=layout(device))  # pyright: ignore
     clips, measured = TrainingClips(data.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
@@ -152,7 +152,7 @@ def _require_fit(recipe: LiveRecipe, learned: Sequence[Path], held_out: Sequence
 def _train(
     recipe: LiveRecipe,
     folder: RunFolder,
-    stop: StopSignal,
+    stop: Event,
     name: LiveStageName,
     stage: LiveStage,
     task: Task,
@@ -162,9 +162,7 @@ def _train(
     options = LoopOptions(
         stage=name,
         identity=digest_of(recipe.model.depth, recipe.model.paint, recipe.seed, name),
-        budget=stage.budget,
-        optimiser=stage.optimiser,
-        ema=stage.ema,
+        table=stage,
         log=recipe.log,
         stop=stop,
         frames_per_clip=recipe.model.frames,
@@ -177,7 +175,7 @@ def _train(
 
 
 def _make_all_inputs(
-    out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: StopSignal, workers: int
+    out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: Event, workers: int
 ) -> None:
     """Inputs of every clip that has none yet."""
     missing = [path for path in paths if not (out / path.parent.name / path.name).exists()]
@@ -194,7 +192,7 @@ def _make_all_inputs(
 
 def _inputs_of(out: Path, net: DepthNet | None, recipe: LiveRecipe, paths: list[Path]) -> None:
     if net is not None:
-        net.to(compute_device(ComputeRecipe(device=recipe.device))).eval()
+        net.to(Precision.of(ComputeRecipe(device=recipe.device)).device).eval()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

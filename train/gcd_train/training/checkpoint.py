@@ -52,18 +52,11 @@ class DamagedStateError(RunError):
         super().__init__(f"the state {folder} is damaged: {reason}")
 
 
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """How far a stage is: updates done, seconds spent on them."""
-
-    updates: int
-    seconds: float
-
-
 class StateNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a state says of itself.
 
-    identity: what it belongs to: model, seed and what was trained before; another one is not resumed. files: SHA-256.
+    identity: what it belongs to: model, seed and what was trained before; another one is not resumed. updates: done.
+    seconds: spent on them. files: SHA-256.
     """
 
     format: int = _FORMAT
@@ -154,33 +147,40 @@ class States:
         self._closing: Future[None] | None = None
         self._closer = ThreadPoolExecutor(1, thread_name_prefix="state")
 
-    def save(self, mark: Mark) -> None:
+    def save(self, updates: int, seconds: float) -> None:
         """Write a state, beside training if the recipe says so. Raises RunError if it cannot be written."""
-        if self._newest == mark.updates:
+        if self._newest == updates:
             return
-        unfinished = self._folder / f"{mark.updates:07d}.part"
+        note = StateNote(stage=self._stage, identity=self._identity, updates=updates, seconds=seconds)
+        unfinished = self._folder / f"{updates:07d}.part"
         with self._written():
             if self._processes.first:
                 shutil.rmtree(unfinished, ignore_errors=True)
                 unfinished.mkdir(parents=True)
             self._processes.told(None)
-            self._write(unfinished, mark)
-        self._newest = mark.updates
+            self._write(unfinished, note)
+        self._newest = updates
 
-    def restore(self) -> Mark | None:
+    def restore(self) -> StateNote | None:
         """Put the newest good state into what is trained; None if there is none. Raises RunError if it does not fit.
 
         The first process chooses for all, and puts damaged ones aside.
         """
-        chosen = cast("tuple[Path, StateNote] | str | None", self._processes.told(self._choose()))
-        if chosen is None:
-            return None
+        chosen: tuple[Path, StateNote] | str | None = None
+        if self._processes.first:
+            try:
+                chosen = self._newest_good()
+            except (RunError, OSError) as error:  # told to the others, too, which wait for it
+                chosen = str(error)
+        chosen = cast("tuple[Path, StateNote] | str | None", self._processes.told(chosen))
         if isinstance(chosen, str):
             raise RunError(chosen)
+        if chosen is None:
+            return None
         folder, note = chosen
         _load(folder, self._trained.ready_for(set(_metadata(folder))), self._processes)
         self._newest = note.updates
-        return Mark(note.updates, note.seconds)
+        return note
 
     def finish(self) -> None:
         """Wait until all is written. Raises RunError if it cannot be."""
@@ -200,7 +200,7 @@ class States:
                 f"cannot write a state in {self._folder}: {_told(error)}; free some space, or choose --out"
             ) from error
 
-    def _write(self, unfinished: Path, mark: Mark) -> None:
+    def _write(self, unfinished: Path, note: StateNote) -> None:
         tensors = {name: value.contiguous() for name, value in self._trained.tensors().items()}
         files = _files_of(tensors) if all("@" not in name for name in tensors) else None
         writer = HuggingFaceStorageWriter(str(unfinished), files, save_distributed=True)
@@ -209,42 +209,28 @@ class States:
             warnings.filterwarnings("ignore", message="torch.distributed is disabled")  # as it should be
             if self._log.save == "async":
                 written = async_save(cast(Any, tensors), storage_writer=writer, process_group=group, no_dist=alone)
-                self._closing = self._closer.submit(self._close, unfinished, mark, cast("Future[object]", written))
+                self._closing = self._closer.submit(self._close, unfinished, note, cast("Future[object]", written))
             else:
                 save(cast(Any, tensors), storage_writer=writer, process_group=group, no_dist=alone)
-                self._close(unfinished, mark)
+                self._close(unfinished, note)
                 self._processes.told(None)
 
-    def _close(self, unfinished: Path, mark: Mark, written: "Future[object] | None" = None) -> None:
+    def _close(self, unfinished: Path, note: StateNote, written: "Future[object] | None" = None) -> None:
         """Once all processes have written, the first one gives the folder its name, and deletes old ones."""
         if written is not None:
             written.result()
         if self._processes.first:
-            note = StateNote(stage=self._stage, identity=self._identity, updates=mark.updates, seconds=mark.seconds)
             close_folder(unfinished, note)
-            self._prune()
-
-    def _prune(self) -> None:
-        """Delete all but the newest ones and those that are kept for ever."""
-        keep_every = self._log.keep_every
-        for path in listed(self._folder)[self._log.keep :]:
-            if not keep_every or int(path.name) % keep_every:
-                path.rename(path.with_suffix(".going"))
-        self._sweep()
+            keep_every = self._log.keep_every
+            for path in listed(self._folder)[self._log.keep :]:
+                if not keep_every or int(path.name) % keep_every:
+                    path.rename(path.with_suffix(".going"))
+            self._sweep()
 
     def _sweep(self) -> None:
         """Delete what is half written or half deleted."""
         for path in [*self._folder.glob("*.going"), *self._folder.glob("*.part")]:
             shutil.rmtree(path)
-
-    def _choose(self) -> "tuple[Path, StateNote] | str | None":
-        """The newest good state; None without any, or in other processes; a message where none can be used."""
-        if not self._processes.first:
-            return None
-        try:
-            return self._newest_good()
-        except (RunError, OSError) as error:  # told to the others, too, which wait for it
-            return str(error)
 
     def _newest_good(self) -> "tuple[Path, StateNote] | None":
         """Damaged ones before it are put aside. Raises RunError where all are damaged, or the newest does not fit."""

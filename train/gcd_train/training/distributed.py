@@ -6,7 +6,9 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
-from typing import TypeVar
+from functools import partial
+from threading import Event
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -24,7 +26,6 @@ from gcd_model.layers import Dormant
 from gcd_model.unet import Stage
 from gcd_train.errors import Interrupted, RecipeError, TrainError
 from gcd_train.recipe_data import ComputeRecipe
-from gcd_train.stop import StopSignal
 
 _POLL_S = 0.2
 
@@ -102,7 +103,7 @@ class Processes:
             dist.broadcast_object_list(holder, src=0, group=self.control)
         return holder[0]
 
-    def by_the_first(self, work: Callable[[], None], stop: StopSignal) -> None:
+    def by_the_first(self, work: Callable[[], None], stop: Event) -> None:
         """Let the first process do something that may take hours, while the others wait.
 
         Raises Interrupted in a waiting process that was asked to stop, TrainError if the first one is gone.
@@ -153,8 +154,15 @@ def processes_of(compute: ComputeRecipe) -> Generator[Processes]:
         yield ALONE
         return
     rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-    with _device(compute) as backend:
-        timeout = timedelta(seconds=compute.timeout_s)
+    on_cpu = compute.device == "cpu" or not torch.cuda.is_available()
+    local, there = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+    if not on_cpu and local >= there:
+        raise RecipeError(
+            f"torchrun started process {local + 1} of this machine, which has {there} CUDA devices; "
+            f"start at most {there} with --nproc-per-node, one for each"
+        )
+    with nullcontext() if on_cpu else torch.cuda.device(local):
+        timeout, backend = timedelta(seconds=compute.timeout_s), "gloo" if on_cpu else "nccl"
         store, _, _ = next(rendezvous("env://", rank, count, timeout=timeout))
         dist.init_process_group(backend, store=PrefixStore("c10d", store), rank=rank, world_size=count, timeout=timeout)
         yield Processes(rank, count, store, _small_group(timeout), _small_group(timeout))
@@ -165,27 +173,6 @@ def _small_group(timeout: timedelta) -> ProcessGroup:
     made = dist.new_group(backend="gloo", timeout=timeout)
     assert isinstance(made, ProcessGroup), "all processes are in it"
     return made
-
-
-@contextmanager
-def _device(compute: ComputeRecipe) -> Generator[str]:
-    """Makes this process's own CUDA device the current one; gives the backend."""
-    if compute.device == "cpu" or not torch.cuda.is_available():
-        with nullcontext():
-            yield "gloo"
-        return
-    local, there = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
-    if local >= there:
-        raise RecipeError(
-            f"torchrun started process {local + 1} of this machine, which has {there} CUDA devices; "
-            f"start at most {there} with --nproc-per-node, one for each"
-        )
-    with torch.cuda.device(local):
-        yield "nccl"
-
-
-_Forward = Callable[[Tensor, Tensor, Tensor | None, int | None], Tensor]
-Module = TypeVar("Module", bound=nn.Module)
 
 
 def stages_of(module: nn.Module) -> list[Stage]:
@@ -208,18 +195,13 @@ def recompute_blocks(module: nn.Module, every: int) -> None:
     Trades a second forward pass of those blocks for their activations. Gradients stay the same.
     """
     for stage in stages_of(module)[every - 1 :: every]:
-        stage.forward = _recomputed(stage.forward)  # pyright: ignore[reportAttributeAccessIssue]
+        stage.forward = partial(_recomputed, stage.forward)
 
 
-def _recomputed(forward: _Forward) -> _Forward:
-    def twice(x: Tensor, embedding: Tensor, cross: Tensor | None, frames: int | None) -> Tensor:
-        if not torch.is_grad_enabled():
-            return forward(x, embedding, cross, frames)
-        done = checkpoint(forward, x, embedding, cross, frames, use_reentrant=False, preserve_rng_state=False)
-        assert isinstance(done, Tensor), "a block returns one tensor"
-        return done
-
-    return twice
+def _recomputed(forward: Callable[..., Any], *given: Any) -> Any:
+    if not torch.is_grad_enabled():
+        return forward(*given)
+    return checkpoint(forward, *given, use_reentrant=False, preserve_rng_state=False)
 
 
 def whole(value: Tensor) -> Tensor:
@@ -245,7 +227,8 @@ def share_out(module: nn.Module, processes: Processes) -> None:
     What a block lays ready before its forward pass (projected embeddings, image tokens) is gathered by itself, as it
     is called by itself.
     """
-    mesh = init_device_mesh(_device_type(module), (processes.count,))
+    device = next(parameter.device.type for parameter in module.parameters() if parameter.requires_grad)
+    mesh = init_device_mesh(device, (processes.count,))
     idle = {parameter for part in _dormant(module) for parameter in part.parameters()}
     for parameter in module.parameters():
         if parameter not in idle:
@@ -277,11 +260,6 @@ def _called_early(stage: Stage) -> list[nn.Module]:
     return [part for part in parts if part is not None]
 
 
-def _device_type(module: nn.Module) -> str:
-    """Where what is trained lies."""
-    return next(parameter.device.type for parameter in module.parameters() if parameter.requires_grad)
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Engine:
     """How a stage computes. The default is one process with float32 weights, as they are."""
@@ -309,12 +287,3 @@ class Engine:
             return replicated(module)
         share_out(module, self.processes)
         return module
-
-    def share_of_loss(self, parts: int) -> float:
-        """What a batch's loss is multiplied with, so that an update's gradient is the mean over its `parts` batches."""
-        return self.processes.count / parts  # the processes' gradients are averaged
-
-    def seed_rounding(self, seed: int) -> None:
-        """Let stochastic rounding follow from the number of the update: the same in every copy, and when resumed."""
-        if self.compute.weights == "bfloat16":
-            torch.manual_seed(seed)

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +20,13 @@ from gcd_model.weights.save import write_adapter, write_published
 from gcd_train.data.sample import Clips, to_network
 from gcd_train.errors import RunError
 from gcd_train.evaluation.metrics import NO_CLASS, mean_iou, named_confusion, psnr
-from gcd_train.pictures import write_sheet
 from gcd_train.recipe import ExportRecipe
-from gcd_train.training.monitor import RunFolder
+from gcd_train.training.monitor import RunFolder, write_sheet
 from gcd_train.training.setup import copy_of
 
+_log = logging.getLogger(__name__)
 _SHOWN_CLIPS = 4
+_ADAPTER = "-adapter.safetensors"
 
 
 class Validation:
@@ -58,7 +58,7 @@ class Validation:
                 counts = met if counts is None else counts + met
                 rows += [self._painted(view.classes[0]), self._painted(truth)]
             if number < _SHOWN_CLIPS:
-                shown += _excerpt(rows)
+                shown += [[video[t] for video in rows] for t in (len(source) // 2, len(source) - 1)]
         write_sheet(picture, shown)
         table = torch.stack(scores)  # [clips, T - 1]
         values = {"psnr": float(table.mean()), "psnr_last": float(table[:, -1].mean())}
@@ -87,60 +87,45 @@ class Validation:
         return colours[ids.long().cpu()].permute(0, 3, 1, 2)
 
 
-def _excerpt(rows: list[Tensor]) -> list[list[Tensor]]:
-    frames = rows[0].shape[0]
-    return [[video[t] for video in rows] for t in (frames // 2, frames - 1)]
-
-
-_log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ExportJob:
-    """What is written under which name.
-
-    move_time: frame in which the goal pose is reached. updates: of the U-Net, for the published layout.
-    leftovers: gives weights of the file training started from that nothing here uses, for the published layout.
-    adapter: of a run that trained one, by the card of base and adapter together; None otherwise.
-    """
-
-    name: str
-    family: Family
-    move_time: int
-    updates: int
-    recipe: ExportRecipe
-    leftovers: Callable[[], Mapping[str, Tensor]]
-    adapter: Callable[[Card], Adapter] | None = None
-
-
-def export(networks: Networks, folder: RunFolder, job: ExportJob, validation: Validation) -> None:
+def export(
+    networks: Networks,
+    folder: RunFolder,
+    card: Card,
+    recipe: ExportRecipe,
+    validation: Validation,
+    *,
+    updates: int,
+    leftovers: Callable[[], Mapping[str, Tensor]],
+    adapter: Callable[[Card], Adapter] | None,
+) -> None:
     """Write `NAME.safetensors` into the run's folder, and measure what a user would load from it.
 
     Beside it `NAME.ckpt` in the published layout where the recipe asks for it, and `NAME-adapter.safetensors` of a run
-    with adapters, which are merged into the others. Files of an earlier export are replaced. Raises RunError.
+    with adapters, which are merged into the others. Files of an earlier export are replaced.
+
+    Args:
+        updates: of the U-Net, for the published layout.
+        leftovers: gives weights of the file training started from that nothing here uses, for the published layout.
+        adapter: of a run that trained one, by the card of base and adapter together.
+    Raises:
+        RunError: a file cannot be written.
     """
-    networks, path = networks.cpu(), folder.path / f"{job.name}.safetensors"
-    card = Card(name=job.name, config=networks.config, family=job.family.name, move_time=job.move_time, trained=True)
+    networks = networks.cpu()
+    path, published, apart = (folder.path / f"{card.name}{end}" for end in (".safetensors", ".ckpt", _ADAPTER))
+    written = [path]
     try:
-        others = _write_others(networks, folder.path, card, job)
-        save_weights(networks.to(precision(job.recipe.dtype)), path, card, overwrite=True)
+        if "gcd-ckpt" in recipe.layouts:  # in float32, while the networks are
+            weights = networks.state_dict()
+            write_published(published, weights, card, carried=leftovers(), updates=updates, overwrite=True)
+            written.append(published)
+        if adapter is not None:
+            write_adapter(apart, adapter(card), overwrite=True)
+            written.append(apart)
+        save_weights(networks.to(precision(recipe.dtype)), path, card, overwrite=True)
         loaded = load_weights(path)
     except ModelError as error:
         raise RunError(f"cannot export to {path}: {error}") from error
     values = validation.measure(loaded.diffusion.float(), folder.stage("export") / "samples.png")
     size = {"bytes": path.stat().st_size, "sha256_12": loaded.sha256_12}
     folder.record("export", "measured", {**size, **values})
-    _log.info("wrote %s", ", ".join([str(path), *(str(other) for other in others)]))
-
-
-def _write_others(networks: Networks, folder: Path, card: Card, job: ExportJob) -> list[Path]:
-    """What is written in float32, while the networks are; returns the files."""
-    written = list[Path]()
-    if "gcd-ckpt" in job.recipe.layouts:
-        out, weights, carried = folder / f"{job.name}.ckpt", networks.state_dict(), job.leftovers()
-        write_published(out, weights, card, carried=carried, updates=job.updates, overwrite=True)
-        written.append(out)
-    if job.adapter is not None:
-        written.append(folder / f"{job.name}-adapter.safetensors")
-        write_adapter(written[-1], job.adapter(card), overwrite=True)
-    return written
+    _log.info("wrote %s", ", ".join(map(str, written)))

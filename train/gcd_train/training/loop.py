@@ -9,7 +9,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -17,8 +16,7 @@ from torch import Tensor, nn
 from gcd_train.errors import Interrupted
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe_data import AnyStageName, Budget, LogRecipe
-from gcd_train.stop import StopSignal
-from gcd_train.training.checkpoint import Mark, States, Trained
+from gcd_train.training.checkpoint import States, Trained
 from gcd_train.training.distributed import Engine, held_back, whole
 from gcd_train.training.monitor import FiniteGuard, RunFolder
 from gcd_train.training.optimiser import Ema, ParameterGroup, build_optimiser, set_rate
@@ -46,47 +44,30 @@ class StepLoss:
     ids: tuple[str, ...] = ()
 
 
-class Task(Protocol):
-    """What a stage trains."""
+class Task:
+    """What a stage trains. module: all that is saved. network: the module as the engine wraps it, to compute losses."""
 
-    @property
-    def module(self) -> nn.Module:
-        """All that is saved."""
-        ...
+    def __init__(self, module: nn.Module) -> None:
+        self.module, self.network = module, module
 
     def parameter_groups(self) -> Sequence[ParameterGroup]:
         """All that is trained."""
-        ...
+        return [ParameterGroup(parameters=[each for each in self.module.parameters() if each.requires_grad])]
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """The loss of the next update; a function of the weights and of the progress."""
-        ...
+        raise NotImplementedError
 
     def after_update(self, progress: Progress) -> bool:
         """Called with the progress after each update; True if it rewrote weights, so that averages start anew."""
-        ...
+        return False
 
     def measure(self, picture: Path) -> dict[str, float]:
         """Metrics with the weights as they are; writes a sample picture there. Called in the first process alone."""
-        ...
-
-
-@runtime_checkable
-class SharedTask(Task, Protocol):
-    """A task that several processes can train."""
-
-    def compute_through(self, network: nn.Module) -> None:
-        """Compute losses through this from now on: the task's module, as the engine wraps it."""
-        ...
-
-
-@runtime_checkable
-class ShardedTask(SharedTask, Protocol):
-    """One whose weights the processes may hold in parts."""
+        raise NotImplementedError
 
     def gather(self) -> None:
-        """Take part where the first process gathers the weights to measure them."""
-        ...
+        """Take part where the first process gathers weights of which each has a share, to measure them."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,7 +81,7 @@ class LoopOptions:
     optimiser: OptimiserRecipe
     ema: EmaRecipe | None
     log: LogRecipe
-    stop: StopSignal
+    stop: Event
     frames_per_clip: int
     parts: int = 1
     engine: Engine = field(default_factory=Engine)
@@ -138,18 +119,16 @@ class Loop:
         self._updates, self._seconds = 0, 0.0
         engine, stage = options.engine, options.stage
         self._processes, self._mine = engine.processes, engine.processes.batches(options.parts)
-        self._network = engine.prepare(task.module)
-        if isinstance(task, SharedTask):
-            task.compute_through(self._network)
+        task.network = engine.prepare(task.module)
         self._optimiser = build_optimiser(task.parameter_groups(), options.optimiser, engine.compute.weights)
         self._ema = None if options.ema is None else Ema(task.module, options.ema)
         trained = Trained(task.module, self._optimiser, self._ema)
         self._states = States(folder.stage(stage), trained, stage, options.identity, options.log, engine.processes)
         self._window = _Window()
         self._guard = FiniteGuard(options.stage, folder.stage(options.stage) / "not_finite.json")
-        mark = self._states.restore()
-        if mark is not None:
-            self._updates, self._seconds = mark.updates, mark.seconds
+        note = self._states.restore()
+        if note is not None:
+            self._updates, self._seconds = note.updates, note.seconds
 
     @property
     def progress(self) -> Progress:
@@ -208,11 +187,12 @@ class Loop:
         progress = self.progress
         set_rate(self._optimiser, progress.updates, progress.share, recipe)
         self._optimiser.zero_grad(set_to_none=True)
-        engine, parts = self._options.engine, self._options.parts
+        processes, parts = self._processes, self._options.parts
         for turn, (part, share) in enumerate(self._mine, 1):
-            with held_back(self._network, last=turn == len(self._mine)):
+            with held_back(self._task.network, last=turn == len(self._mine)):
                 loss = self._task.step_loss(replace(progress, part=part))
-                (loss.total * (share * engine.share_of_loss(parts))).backward()
+                # the gradient is the mean over the parts, and that of the processes is averaged
+                (loss.total * (share * (processes.count / parts))).backward()
             kept = {name: value.detach() for name, value in loss.parts.items()}
             self._guard.saw(progress.updates, "loss", loss.total, loss.ids)
             if share:  # and not one that only keeps the others company
@@ -220,7 +200,9 @@ class Loop:
         norm = self._clipped()
         self._window.norms.append(norm)
         self._guard.saw(progress.updates, "gradient", norm)
-        engine.seed_rounding(progress.updates)
+        if self._options.engine.compute.weights == "bfloat16":
+            # stochastic rounding follows from the number of the update: the same in every copy, and when resumed
+            torch.manual_seed(progress.updates)
         self._optimiser.step()
         self._updates += 1
         if self._ema is not None:
@@ -271,7 +253,7 @@ class Loop:
         """Save, then measure in the first process; the others hand over what they hold of the weights, and wait."""
         self._save()
         with torch.no_grad(), nullcontext() if self._ema is None else self._ema.applied():
-            if not self._processes.first and isinstance(self._task, ShardedTask):
+            if not self._processes.first:
                 self._task.gather()
             self._processes.by_the_first(self._measured, Event())  # a stop is agreed on after this
 
@@ -289,7 +271,7 @@ class Loop:
 
     def _save(self) -> None:
         self._speak()  # a loss that is no number must not be saved
-        self._states.save(Mark(self._updates, self._seconds))
+        self._states.save(self._updates, self._seconds)
 
 
 def _duration(seconds: float) -> str:

@@ -5,13 +5,14 @@ import json
 import logging
 import math
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
 import cv2
+import numpy as np
 from msgspec import Struct
 from torch import Tensor
 
@@ -19,10 +20,13 @@ from gcd_model.errors import FileError
 from gcd_model.small_files import decode_toml, read_small
 from gcd_train.errors import RecipeError, RunError, TrainError
 from gcd_train.files import write_whole
+from gcd_train.pictures import png
 from gcd_train.recipe_data import AnyStageName
 from gcd_train.recipe_files import to_toml
 
 _log = logging.getLogger(__name__)
+_NAMED = 6
+_GAP = 4  # pixels between the pictures of a sheet
 
 
 class TensorBoard:
@@ -58,9 +62,6 @@ class TensorBoard:
     def close(self) -> None:
         """Write what is left."""
         self._writer.close()
-
-
-_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +159,16 @@ def _changes(was: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
     return [f"{key} was {was.get(key, 'not given')}, is {now.get(key, 'not given')}" for key in keys]
 
 
-Values = Mapping[str, float | int | str]
+def write_sheet(path: Path, rows: Sequence[Sequence[Tensor]]) -> None:
+    """Write pictures [3, H, W] in [-1, 1], all of one size, row by row as one PNG. Raises RunError."""
+    height, width = rows[0][0].shape[-2:]
+    sheet = np.full((len(rows) * (height + _GAP), max(map(len, rows)) * (width + _GAP), 3), 255, np.uint8)
+    for y, row in enumerate(rows):
+        for x, picture in enumerate(row):
+            top, left = y * (height + _GAP), x * (width + _GAP)
+            pixels = (picture.detach().float().cpu().clamp(-1, 1) + 1) * 127.5
+            sheet[top : top + height, left : left + width] = pixels.round().byte().permute(1, 2, 0).numpy()
+    write_whole(path, png(sheet))
 
 
 @dataclass(frozen=True, slots=True)

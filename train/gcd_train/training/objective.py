@@ -1,10 +1,9 @@
-"""The diffusion objective on one batch, through the networks that are shipped.
+"""What the U-Net learns, through the networks that are shipped: the diffusion objective, and a student's.
 
 Source: Van Hoorick et al. 2024 (GCD), section 3: noise level per clip, v-prediction, conditioning dropped per frame,
 conditioning augmentation in pixel space; x0-prediction, fixed noise levels, shared noise and the class map are ours.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -13,16 +12,15 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model.conditioning import CameraEmbedder
-from gcd_model.config import Prediction
-from gcd_model.diffusion import preconditioning
+from gcd_model.config import ModelConfig, Prediction
+from gcd_model.diffusion import RenderOptions, Schedule, preconditioning, sample
 from gcd_model.networks import Networks
 from gcd_model.unet import VideoUNet
-from gcd_train.recipe import FocalBlendName, LossRecipe, NoiseRecipe, UNetRecipe
+from gcd_train.recipe import FocalBlendName, LossRecipe, NoiseRecipe, StudentRecipe, UNetRecipe
 from gcd_train.training.draws import Draws
 from gcd_train.training.export import Validation
-from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.losses import PLAIN_BLEND, RELEASED_BLEND, FocalBlend, edm_weight, focal_fraction, frame_losses
-from gcd_train.training.optimiser import ParameterGroup
 from gcd_train.training.setup import Precision
 from gcd_train.training.trainable import keep_trained_alone, plain_weights
 
@@ -130,22 +128,16 @@ def drop_streams(
     if recipe.dropout == 0:
         return condition, tokens
     each = frames if recipe.dropout_per == "clip" else 1
-    kept = _drawn_kept(draws, recipe.dropout, condition.shape[0], each)
-    condition = _kept(condition, kept)
+
+    def drawn() -> Tensor:
+        """Whether a row is kept, [N]."""
+        return ~draws.chance(recipe.dropout, condition.shape[0] // each).repeat_interleave(each)
+
+    kept = drawn()
+    dropped = condition * _column(kept).to(condition.dtype)
     if tokens is None:
-        return condition, None
-    if not recipe.dropout_joint:
-        kept = _drawn_kept(draws, recipe.dropout, tokens.shape[0], each)
-    return condition, _kept(tokens, kept)
-
-
-def _drawn_kept(draws: Draws, probability: float, rows: int, each: int) -> Tensor:
-    """One flag for every `each` rows, [N]."""
-    return ~draws.chance(probability, rows // each).repeat_interleave(each)
-
-
-def _kept(rows: Tensor, kept: Tensor) -> Tensor:
-    return rows * kept.view(-1, *[1] * (rows.ndim - 1)).to(rows.dtype)
+        return dropped, None
+    return dropped, tokens * (kept if recipe.dropout_joint else drawn())[:, None].to(tokens.dtype)
 
 
 def diffusion_loss(
@@ -188,8 +180,14 @@ def _column(values: Tensor) -> Tensor:
     return values.view(-1, 1, 1, 1)
 
 
-class UNetTask:
-    """See `Task`."""
+class UNetTask(Task):
+    """Trains the U-Net to denoise, or a student, which takes few steps without guidance, through its own sampler.
+
+    channel_weights: [C] of the latents, or None.
+    Source of the student: Martin Garcia et al. 2024, end-to-end finetuning of few-step diffusion.
+    """
+
+    module: Denoiser
 
     def __init__(
         self,
@@ -200,37 +198,26 @@ class UNetTask:
         channel_weights: Tensor | None,
         precision: Precision,
         seed: int,
+        student: StudentRecipe | None = None,
     ) -> None:
+        super().__init__(precision.placed(denoiser_of(networks)))
         self._networks, self._batches, self._validation = networks, batches, validation
         self._recipe, self._weights, self._precision, self._seed = recipe, channel_weights, precision, seed
-        self._denoiser = precision.placed(denoiser_of(networks))
-        self._network: nn.Module = self._denoiser
-        keep_trained_alone(self._denoiser)
-
-    @property
-    def module(self) -> nn.Module:
-        """U-Net and camera embedder."""
-        return self._denoiser
-
-    def parameter_groups(self) -> Sequence[ParameterGroup]:
-        """Everything that can be trained."""
-        trained = [parameter for parameter in self._denoiser.parameters() if parameter.requires_grad]
-        return [ParameterGroup(parameters=trained)]
-
-    def compute_through(self, network: nn.Module) -> None:
-        """See `SharedTask`."""
-        self._network = network
+        self._student = student
+        keep_trained_alone(self.module)
 
     def step_loss(self, progress: Progress) -> StepLoss:
-        """The diffusion loss on single frames or on whole clips."""
-        recipe = self._recipe
-        draws = Draws(self._seed, "unet", progress.updates * recipe.parts + progress.part, self._precision.device)
+        """The diffusion loss on single frames or on whole clips; of a student, see `_student_loss`."""
+        recipe, stage = self._recipe, "unet" if self._student is None else "student"
+        draws = Draws(self._seed, stage, progress.updates * recipe.parts + progress.part, self._precision.device)
         if progress.share < recipe.image_share:
             batch = self._batches.single_frames(draws, recipe.image_batch)
         else:
             batch = self._batches.whole_clips(draws, recipe.clip_batch)
+        if self._student is not None:
+            return self._student_loss(self._student, batch, draws)
         return diffusion_loss(
-            self._network,
+            self.network,
             batch,
             draws,
             self._precision,
@@ -240,14 +227,39 @@ class UNetTask:
             step=progress.updates,
         )
 
-    def after_update(self, progress: Progress) -> bool:
-        """Nothing to do."""
-        return False
+    def _student_loss(self, student: StudentRecipe, batch: Batch, draws: Draws) -> StepLoss:
+        """How far samples from fresh noise are from their pairs, in latents."""
+        config = self._networks.config
+        steps = student.learned_steps or (config.sampling.steps,)
+        schedule = schedule_of(config, steps[int(draws.below(len(steps), 1))])
+        noise = draw_noise(draws, batch.target.shape, batch.frames, float(config.sampling.shared_noise))
+        with self._precision.arithmetic():
+            made = sampled(self.network, batch, noise, schedule)
+        rows = frame_losses(made, batch.target, fraction=1.0, emphasis=batch.emphasis, channel_weights=self._weights)
+        total = rows.mean()
+        return StepLoss(total, {"latent": total.detach()}, batch.target.shape[0], batch.ids)
 
     def measure(self, picture: Path) -> dict[str, float]:
         """Held-out clips through the shipped synthesizer."""
         return self._validation.measure(self._networks, picture)
 
     def gather(self) -> None:
-        """See `ShardedTask`."""
+        """See `Task`."""
         plain_weights(self._networks)
+
+
+def schedule_of(config: ModelConfig, steps: int) -> Schedule:
+    """The shipped sampler's schedule for that many steps, without guidance."""
+    return Schedule.of(config, RenderOptions(steps=steps, guidance=(1.0, 1.0)))
+
+
+def sampled(denoiser: nn.Module, batch: Batch, noise: Tensor, schedule: Schedule) -> Tensor:
+    """From noise to a sample, as the synthesizer does it; gradients reach the weights through all steps.
+
+    Args:
+        noise: unit, [N, C, h, w].
+    Returns:
+        Latents [N, C, h, w], scaled.
+    """
+    steps, start = schedule.steps, schedule.start(noise[None], 1)[0]
+    return sample(lambda x, i: denoiser(x, x.new_full(x.shape[:1], steps[i].sigma), batch), start, steps)

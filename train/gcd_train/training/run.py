@@ -2,9 +2,9 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Protocol
 
 import msgspec
@@ -22,10 +22,8 @@ from gcd_train.data.sample import Clips
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
 from gcd_train.recipe_data import AnyStageName, Budget
-from gcd_train.stop import StopSignal
-from gcd_train.training.distill import StudentTask
 from gcd_train.training.distributed import ALONE, Engine, Processes
-from gcd_train.training.export import ExportJob, Validation, export
+from gcd_train.training.export import Validation, export
 from gcd_train.training.loop import Loop, LoopOptions, Task
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import BatchSource, UNetTask
@@ -58,45 +56,42 @@ class StageTable(Protocol):
     def ema(self) -> EmaRecipe | None: ...
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RunInputs:
-    """What a run works with. stop: asked between updates.
-
-    latents: a folder for encoded clips that several runs share; None for the run's own.
-    processes: this one among those of the run.
-    """
-
-    recipe: Recipe
-    data: RunData
-    folder: RunFolder
-    stop: StopSignal
-    latents: Path | None = None
-    processes: Processes = ALONE
-
-
 class Trainer:
     """The stages of one run in their order; each goes on where it stopped."""
 
-    def __init__(self, inputs: RunInputs) -> None:
-        """Raises RecipeError if the recipe's model cannot be built or exported, its device is not there, or a student
-        is to learn in several processes."""
-        if inputs.recipe.student is not None and inputs.processes.count > 1:
+    def __init__(
+        self,
+        *,
+        recipe: Recipe,
+        data: RunData,
+        folder: RunFolder,
+        stop: Event,
+        latents: Path | None = None,
+        processes: Processes = ALONE,
+    ) -> None:
+        """stop: asked between updates. latents: a folder for encoded clips that several runs share; None for the run's
+        own. processes: this one among those of the run.
+
+        Raises RecipeError if the recipe's model cannot be built or exported, its device is not there, or a student is
+        to learn in several processes.
+        """
+        if recipe.student is not None and processes.count > 1:
             raise RecipeError("a distillation is the work of one process; start it without torchrun")
-        self._inputs, self._recipe, self._folder = inputs, inputs.recipe, inputs.folder
-        self._family = family_of(inputs.recipe.model)
+        self._recipe, self._data, self._folder, self._stop = recipe, data, folder, stop
+        self._family = family_of(recipe.model)
         self._config = self._trained_config()
-        require_exportable(inputs.recipe, self._config)
-        self._precision = Precision.of(inputs.recipe.compute)
-        self._engine = Engine(processes=inputs.processes, compute=inputs.recipe.compute)
+        require_exportable(recipe, self._config)
+        self._precision = Precision.of(recipe.compute)
+        self._engine = Engine(processes=processes, compute=recipe.compute)
         self._encodings = Encodings(
-            recipe=inputs.recipe,
+            recipe=recipe,
             config=self._config,
             family=self._family,
             precision=self._precision,
-            clips=inputs.data.clips,
-            folder=inputs.folder.stage("latents"),
-            shared=inputs.latents,
-            stop=inputs.stop,
+            clips=data.clips,
+            folder=folder.stage("latents"),
+            shared=latents,
+            stop=stop,
         )
 
     def run(self, only: AnyStageName | None = None) -> None:
@@ -114,7 +109,7 @@ class Trainer:
             if stage == _DENOISER:
                 steps[stage]()
             else:
-                self._inputs.processes.by_the_first(steps[stage], self._inputs.stop)
+                self._engine.processes.by_the_first(steps[stage], self._stop)
 
     def _steps(self) -> dict[AnyStageName, Callable[[], None]]:
         """The stages that the recipe has, in their order."""
@@ -127,7 +122,7 @@ class Trainer:
 
     def _trained_config(self) -> ModelConfig:
         """The networks' config, by the recipe. Raises DataError for clips that do not fit it."""
-        recipe, data = self._recipe, self._inputs.data
+        recipe, data = self._recipe, self._data
         config = run_config(recipe)
         if recipe.student is None:
             if self._family.output == "semantic" and data.valid.classes:
@@ -181,7 +176,7 @@ class Trainer:
             optimiser=table.optimiser,
             ema=table.ema,
             log=self._recipe.log,
-            stop=self._inputs.stop,
+            stop=self._stop,
             frames_per_clip=self._config.frames,
             parts=parts,
             engine=self._engine if stage == _DENOISER else Engine(),
@@ -190,65 +185,53 @@ class Trainer:
 
     def _train_vae(self, recipe: VAERecipe) -> None:
         networks = start_networks(self._recipe.model, self._config, self._recipe.seed)
-        data = self._inputs.data
-        task = VAETask(networks, data.clips, data.valid, recipe, self._precision, self._recipe.seed)
+        task = VAETask(networks, self._data.clips, self._data.valid, recipe, self._precision, self._recipe.seed)
         self._loop(task, "vae", recipe, self._vae_identity())
 
     def _train_denoiser(self) -> None:
-        networks = self._start()
+        recipe, networks, precision = self._recipe.unet, self._start(), self._precision
         identity = self._identity(networks)
         let_train(networks, self._recipe.model, self._recipe.seed)
-        source = self._recipe.unet.source
-        clips = self._encodings.opened(networks) if source == "latents" else None
+        clips = self._encodings.opened(networks) if recipe.source == "latents" else None
         if self._recipe.compute.frozen == "bfloat16":
             halve_frozen(networks)
-        self._precision.placed(networks if source == "pixels" else networks.unet)  # encoders only to encode
-        self._train(networks, self._batches(networks, clips), clips, identity)
-
-    def _train(self, networks: Networks, batches: BatchSource, clips: LatentClips | None, identity: str) -> None:
-        """Train networks that lie ready. clips: encoded ones, where batches are made of such."""
-        recipe, seed = self._recipe.unet, self._recipe.seed
-        weights = self._weights(clips) if recipe.loss.sensitivity else None
-        student, precision = self._recipe.student, self._precision
-        task: Task
-        if student is None:
-            task = UNetTask(networks, batches, self._validation(), recipe, weights, precision, seed)
-        else:
-            task = StudentTask(networks, batches, self._validation(), recipe, student, weights, precision, seed)
+        precision.placed(networks if recipe.source == "pixels" else networks.unet)  # encoders only to encode
+        weights = None  # of latent channels, by what the decoder makes of them
+        if recipe.loss.sensitivity and clips is not None:
+            weights = torch.tensor(clips.meta.sensitivity, device=precision.device)
+        batches, seed, student = self._batches(networks, clips), self._recipe.seed, self._recipe.student
+        task = UNetTask(networks, batches, self._validation(), recipe, weights, precision, seed, student)
         self._loop(task, _DENOISER, recipe, identity, recipe.parts)
 
-    def _export(self) -> None:
-        recipe, networks, start = self._recipe, self._start(), self._recipe.model.weights
-        updates = self._fill_denoiser(networks)
-        merge_lora(networks)
-        thaw(networks)
-        job = ExportJob(
-            name=recipe.name,
-            family=self._family,
-            move_time=recipe.data.goal_frame(self._config.frames),
-            updates=updates,
-            recipe=recipe.export,
-            leftovers=lambda: {} if start is None else loaded_base(start, self._config).carried,
-            adapter=self._adapter if recipe.model.train == "lora" else None,
-        )
-        export(networks, self._folder, job, self._validation())
-
-    def _validation(self) -> Validation:
-        return Validation(self._inputs.data.valid, self._family, count=self._recipe.log.valid_clips)
-
     def _batches(self, networks: Networks, clips: LatentClips | None) -> BatchSource:
-        recipe = self._recipe.unet
+        """clips: encoded ones, where batches are made of such."""
+        recipe, data = self._recipe.unet, self._data
         if clips is not None:
             return EncodedBatches(clips, self._config, recipe, self._precision)
-        data = self._inputs.data
         if data.batches is not None:
             return data.batches(networks, self._precision)
         loader, seed = self._recipe.data.loader, self._recipe.seed
         return SampleBatches(data.clips, networks, recipe, self._family, self._precision, loader, seed)
 
-    def _weights(self, clips: LatentClips | None) -> torch.Tensor | None:
-        """Of latent channels, by what the decoder makes of them."""
-        return None if clips is None else torch.tensor(clips.meta.sensitivity, device=self._precision.device)
+    def _export(self) -> None:
+        recipe, networks, config = self._recipe, self._start(), self._config
+        start, updates = recipe.model.weights, self._fill_denoiser(networks)
+        merge_lora(networks)
+        thaw(networks)
+        goal = recipe.data.goal_frame(config.frames)
+        export(
+            networks,
+            self._folder,
+            Card(name=recipe.name, config=config, family=self._family.name, move_time=goal),
+            recipe.export,
+            self._validation(),
+            updates=updates,
+            leftovers=lambda: {} if start is None else loaded_base(start, config).carried,
+            adapter=self._adapter if recipe.model.train == "lora" else None,
+        )
+
+    def _validation(self) -> Validation:
+        return Validation(self._data.valid, self._family, count=self._recipe.log.valid_clips)
 
 
 def require_fit(clips: Clips, config: ModelConfig, fps: float) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import weights_path
-from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, CameraControl, ModelConfig
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import LoadedWeights, Networks, empty_networks
 from gcd_model.weights.adapter import DIFFUSION, carried_over
@@ -38,7 +38,17 @@ _PREFIXES: dict[AnyStageName, tuple[str, ...]] = {
 
 def model_config(recipe: ModelRecipe) -> ModelConfig:
     """The networks a recipe asks for. Raises RecipeError where its changes contradict each other."""
-    base = _steered(_BASES[recipe.base], _camera(recipe))
+    base, family = _BASES[recipe.base], family_of(recipe)
+    camera, paints = recipe.camera or (base.camera if base.is_ours else family.camera), family.output == "semantic"
+    if (family.camera == "none") != (camera == "none"):
+        raise RecipeError(
+            f"the recipe's [model] is steered by camera = {camera!r}, its family {family.name} by {family.camera!r}; "
+            "change model.camera or model.family"
+        )
+    if camera != base.camera:  # as published: 128 of 768
+        width = 0 if camera == "none" else base.unet.camera_width or base.unet.vector_width // 6
+        unet = msgspec.structs.replace(base.unet, camera_width=width)
+        base = msgspec.structs.replace(base, camera=camera, unet=unet)
     try:
         changed = msgspec.structs.replace(
             base,
@@ -49,7 +59,7 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
             frames=recipe.frames or base.frames,
             height=recipe.height or base.height,
             width=recipe.width or base.width,
-            semantic_classes=DRIVING_CLASSES if recipe.base == "plain-small" and _paints(recipe) else (),
+            semantic_classes=DRIVING_CLASSES if recipe.base == "plain-small" and paints else (),
         )
         # msgspec does not check what `replace` makes; a round trip does
         config = msgspec.json.decode(msgspec.json.encode(changed), type=ModelConfig)
@@ -100,10 +110,6 @@ def student_config(teacher: ModelConfig, recipe: StudentRecipe) -> ModelConfig:
     return msgspec.structs.replace(teacher, sampling=changed)
 
 
-def _paints(recipe: ModelRecipe) -> bool:
-    return family_of(recipe).output == "semantic"
-
-
 def require_exportable(recipe: Recipe, config: ModelConfig) -> None:
     """Raises RecipeError, before anything is trained, if [export] asks for a layout that cannot hold these networks."""
     if "gcd-ckpt" not in recipe.export.layouts:
@@ -114,26 +120,6 @@ def require_exportable(recipe: Recipe, config: ModelConfig) -> None:
         raise RecipeError(
             f'export.layouts asks for "gcd-ckpt", but {error}; leave it out: --set \'export.layouts=["gcd-node"]\''
         ) from error
-
-
-def _steered(base: ModelConfig, camera: CameraControl) -> ModelConfig:
-    """The base with that camera control."""
-    if camera == base.camera:
-        return base
-    width = 0 if camera == "none" else base.unet.camera_width or base.unet.vector_width // 6  # as published: 128 of 768
-    return msgspec.structs.replace(base, camera=camera, unet=msgspec.structs.replace(base.unet, camera_width=width))
-
-
-def _camera(recipe: ModelRecipe) -> CameraControl:
-    """How the model is steered. Raises RecipeError if its family has another kind of view."""
-    base, family = _BASES[recipe.base], family_of(recipe)
-    camera = recipe.camera or (base.camera if base.is_ours else family.camera)
-    if (family.camera == "none") != (camera == "none"):
-        raise RecipeError(
-            f"the recipe's [model] is steered by camera = {camera!r}, its family {family.name} by {family.camera!r}; "
-            "change model.camera or model.family"
-        )
-    return camera
 
 
 def sampled_as_trained(config: ModelConfig, recipe: UNetRecipe) -> ModelConfig:
@@ -163,21 +149,6 @@ def family_of(recipe: ModelRecipe) -> Family:
 def digest_of(*values: object) -> str:
     """Eight digits that name plain values or structs: what a state belongs to."""
     return hashlib.sha256(msgspec.json.encode(values, order="deterministic")).hexdigest()[:8]
-
-
-def compute_device(recipe: ComputeRecipe) -> torch.device:
-    """Where to compute. Raises RecipeError if CUDA is asked for and missing."""
-    there = torch.cuda.is_available()
-    if recipe.device == "cuda" and not there:
-        raise RecipeError('compute.device is "cuda" but this machine has no CUDA device; use "auto" or "cpu"')
-    return torch.device("cuda" if there and recipe.device != "cpu" else "cpu")
-
-
-def to_channels_last(module: nn.Module) -> None:
-    """Let 2D convolution kernels have their channels innermost: faster on the CPU and with half precision."""
-    for parameter in module.parameters():
-        if parameter.ndim == 4:
-            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
 
 
 def fill(networks: Networks, folder: RunFolder, stage: AnyStageName, identity: str) -> int:
@@ -231,7 +202,10 @@ class Precision:
     @classmethod
     def of(cls, recipe: ComputeRecipe) -> "Precision":
         """As a recipe asks. Raises RecipeError for a device that is not there."""
-        device = compute_device(recipe)
+        there = torch.cuda.is_available()
+        if recipe.device == "cuda" and not there:
+            raise RecipeError('compute.device is "cuda" but this machine has no CUDA device; use "auto" or "cpu"')
+        device = torch.device("cuda" if there and recipe.device != "cpu" else "cpu")
         # CPU kernels are slow in it, so only weights kept in it make a CPU compute in it
         kept = "bfloat16" in (recipe.weights, recipe.frozen)
         half = kept or (recipe.precision == "bfloat16" and device.type == "cuda")
@@ -242,10 +216,11 @@ class Precision:
         return torch.autocast(self.device.type, torch.bfloat16) if self.half else nullcontext()
 
     def placed(self, module: Module) -> Module:
-        """The module on the device, in training mode."""
+        """The module on the device, in training mode; if asked for with channels innermost, which is faster."""
         module.to(self.device).train()
-        if self.channels_last:
-            to_channels_last(module)
+        for parameter in module.parameters() if self.channels_last else ():
+            if parameter.ndim == 4:
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
         return module
 
     def frames(self, rows: Tensor) -> Tensor:

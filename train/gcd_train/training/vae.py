@@ -1,6 +1,5 @@
 """The autoencoder, on crops of source and target frames."""
 
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -10,19 +9,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_model.clip import nearest_classes
-from gcd_model.config import ModelConfig
 from gcd_model.layers import zeroed
 from gcd_model.networks import Networks
 from gcd_model.vae import Encoder, Posterior, TemporalDecoder
 from gcd_train.data.sample import Bytes, Clips, to_network
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.metrics import mean_iou, named_confusion, psnr
-from gcd_train.pictures import write_sheet
 from gcd_train.recipe import VAERecipe
 from gcd_train.training.draws import Draws
-from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.losses import gradient_l1, kl_to_normal, ssim
-from gcd_train.training.optimiser import ParameterGroup
+from gcd_train.training.monitor import write_sheet
 from gcd_train.training.setup import Precision
 
 _STATISTICS_CLIPS, _MEASURED_CLIPS = 16, 4
@@ -40,8 +37,10 @@ class Autoencoder(nn.Module):
         self.register_buffer("normalised", torch.zeros((), dtype=torch.bool))
 
 
-class VAETask:
-    """See `Task`."""
+class VAETask(Task):
+    """Trains encoder and decoder; `normalise_at` of the budget on, their latents have zero mean and unit spread."""
+
+    module: Autoencoder
 
     def __init__(
         self,
@@ -53,23 +52,15 @@ class VAETask:
         seed: int,
     ) -> None:
         config = networks.config
-        _require_shared(config)
+        if not config.vae.shared:
+            raise RecipeError("the VAE stage trains models with one shared autoencoder; this one has two: leave it out")
         self._precision, self._seed, self._recipe, self._valid = precision, seed, recipe, valid
         self._painted = config.semantic_classes
         order = Draws(seed, "vae-pool", 0, torch.device("cpu")).order(len(clips))
         self._pool, self._sample = order[: recipe.pool], cache(clips.sample)  # decoded once
         if config.vae.linear:
             start_from_components(networks.target_encoder, networks.decoder, self._some_frames(_STATISTICS_CLIPS))
-        self._pair = precision.placed(Autoencoder(networks))
-
-    @property
-    def module(self) -> nn.Module:
-        """Encoder and decoder."""
-        return self._pair
-
-    def parameter_groups(self) -> Sequence[ParameterGroup]:
-        """Everything."""
-        return [ParameterGroup(parameters=list(self._pair.parameters()))]
+        super().__init__(precision.placed(Autoencoder(networks)))
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """L1, gradients, structural similarity and the Kullback-Leibler term on one batch of crops."""
@@ -78,18 +69,18 @@ class VAETask:
         run = 1 if apart else recipe.frames
         crops = self._crops(draws, recipe.clips * recipe.frames // run, run)
         with self._precision.arithmetic():
-            posterior = self._pair.target_encoder(crops)
+            posterior = self.module.target_encoder(crops)
             noise = draws.normal(*posterior.mean.shape)
-            decoded = self._pair.decoder(posterior.sample(noise), None if apart else run)
+            decoded = self.module.decoder(posterior.sample(noise), None if apart else run)
         return self._loss(crops, decoded.float(), Posterior(posterior.mean.float(), posterior.log_variance.float()))
 
     def after_update(self, progress: Progress) -> bool:
         """Normalises the latents once, when the time has come."""
-        if self._pair.normalised or progress.share < self._recipe.normalise_at:
+        if self.module.normalised or progress.share < self._recipe.normalise_at:
             return False
         mean, std = self._statistics()
-        normalise_latents(self._pair.target_encoder, self._pair.decoder, mean, std)
-        self._pair.normalised.fill_(True)
+        normalise_latents(self.module.target_encoder, self.module.decoder, mean, std)
+        self.module.normalised.fill_(True)
         return True
 
     def measure(self, picture: Path) -> dict[str, float]:
@@ -101,13 +92,14 @@ class VAETask:
         for number in range(min(len(self._valid), _MEASURED_CLIPS)):
             sample = self._valid.sample(number)
             frames = to_network(sample.target).to(self._precision.device)
-            latents = self._pair.target_encoder(frames).mean
-            decoded = self._pair.decoder(latents, frames.shape[0]).clamp(-1, 1)
+            latents = self.module.target_encoder(frames).mean
+            decoded = self.module.decoder(latents, frames.shape[0]).clamp(-1, 1)
             scores.append(psnr((decoded + 1) / 2, (frames + 1) / 2).mean())
             means.append(latents)
             if self._painted:
                 truth = torch.from_numpy(np.array(sample.target_classes))
-                counts.append(named_confusion(self._classes(decoded), truth, [kind.name for kind in self._painted]))
+                classes = nearest_classes(((decoded + 1) / 2).cpu(), self._painted)
+                counts.append(named_confusion(classes, truth, [kind.name for kind in self._painted]))
             shown += [[decoded[0], decoded[-1]], [frames[0], frames[-1]]]
         write_sheet(picture, shown)
         spread = torch.cat(means).transpose(0, 1).flatten(1).std(1)
@@ -117,10 +109,6 @@ class VAETask:
             "latent_std_most": float(spread.max()),
         }
         return {**values, "miou_full": mean_iou(torch.stack(counts).sum(0))} if counts else values
-
-    def _classes(self, decoded: Tensor) -> Tensor:
-        """Class ids [T, H, W] of painted frames [T, 3, H, W] in [-1, 1]."""
-        return nearest_classes(((decoded + 1) / 2).cpu(), self._painted)
 
     def _loss(self, crops: Tensor, decoded: Tensor, posterior: Posterior) -> StepLoss:
         recipe = self._recipe
@@ -165,7 +153,7 @@ class VAETask:
     def _statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of each latent channel, [C], over whole frames of some clips."""
         frames = self._some_frames(_STATISTICS_CLIPS)
-        rows = [self._pair.target_encoder(self._precision.frames(part)).mean for part in frames.split(8)]
+        rows = [self.module.target_encoder(self._precision.frames(part)).mean for part in frames.split(8)]
         values = torch.cat(rows).transpose(0, 1).flatten(1)  # [C, everything]
         return values.mean(1), values.std(1).clamp(min=1e-4)
 
@@ -226,8 +214,3 @@ def start_from_components(encoder: Encoder, decoder: TemporalDecoder, frames: Te
 def _bias(layer: nn.Conv2d) -> Tensor:
     assert layer.bias is not None
     return layer.bias
-
-
-def _require_shared(config: ModelConfig) -> None:
-    if not config.vae.shared:
-        raise RecipeError("the VAE stage trains models with one shared autoencoder; this one has two: leave it out")
