@@ -65,12 +65,21 @@ class CudaEngine(TorchEngine):
         options = CudaOptions.of_device(networks.unet.stem.weight.device) if options is None else options
         networks.requires_grad_(False)
         prepare(networks)
-        _settle_decoder(networks, options.decoder)
+        if options.decoder == "bfloat16":
+            networks.decoder = copy.deepcopy(networks.decoder).to(torch.bfloat16)  # others may share its weights
+        elif options.decoder == "checked":
+            networks.decoder, psnr = checked_decoder(networks)
+            _LOG.info("decoder in %s: %.1f dB from float32 in bfloat16", networks.decoder.stem.weight.dtype, psnr)
         if options.channels_last:
             channels_last(networks)
         prepare(networks)
         super().__init__(networks)
-        self._update = _compiled(networks, options)
+        self._update: Update = solved
+        if options.backend is not None:
+            if options.backend == "inductor":
+                keep_compiled(cache_folder())
+            compile_regions(networks, options.backend)
+            self._update = torch.compile(solved, backend=options.backend, fullgraph=True, dynamic=False)
         on_gpu = options.graphs and self.like.device.type == "cuda"
         self._recorder = recorder or (CudaGraphs() if on_gpu else Recorder())
         self._memories: Recent[StepMemory] = Recent()
@@ -117,23 +126,6 @@ class CudaEngine(TorchEngine):
                     done.record()
                     done.synchronize()  # of the event alone: the device does not notice
             return memory.result()
-
-
-def _settle_decoder(networks: Networks, precision: str) -> None:
-    if precision == "bfloat16":
-        networks.decoder = copy.deepcopy(networks.decoder).to(torch.bfloat16)  # others may share its weights
-    elif precision == "checked":
-        networks.decoder, psnr = checked_decoder(networks)
-        _LOG.info("decoder in %s: %.1f dB from float32 in bfloat16", networks.decoder.stem.weight.dtype, psnr)
-
-
-def _compiled(networks: Networks, options: CudaOptions) -> Update:
-    if options.backend is None:
-        return solved
-    if options.backend == "inductor":
-        keep_compiled(cache_folder())
-    compile_regions(networks, options.backend)
-    return torch.compile(solved, backend=options.backend, fullgraph=True, dynamic=False)
 
 
 # --- compiling networks region by region -----------------------------------------------------------------------------
