@@ -89,7 +89,12 @@ class Encoder(nn.Module):
         self.levels = nn.Sequential(
             *(EncoderLevel(widths[max(level - 1, 0)], level, config) for level in range(len(widths)))
         )
-        self.middle = _image_middle(widths[-1], config.norm_groups)
+        width, groups = widths[-1], config.norm_groups
+        self.middle = nn.Sequential(
+            ResBlock(width, width, groups=groups, eps=1e-6),
+            PixelAttention(width, groups),
+            ResBlock(width, width, groups=groups, eps=1e-6),
+        )
         self.norm_out = nn.GroupNorm(config.norm_groups, widths[-1], eps=1e-6)
         self.conv_out = nn.Conv2d(widths[-1], moments, 3, padding=1)
         self.quant = nn.Conv2d(moments, moments, 1) if quant else None
@@ -105,14 +110,6 @@ class Encoder(nn.Module):
             straight = self.linear(frames)  # [N, C, h, w], of the mean; the log-variance gets none
             moments = moments + F.pad(straight, (0, 0, 0, 0, 0, straight.shape[1]))
         return Posterior.of_moments(moments if self.quant is None else self.quant(moments))
-
-
-def _image_middle(channels: int, groups: int) -> nn.Sequential:
-    return nn.Sequential(
-        ResBlock(channels, channels, groups=groups, eps=1e-6),
-        PixelAttention(channels, groups),
-        ResBlock(channels, channels, groups=groups, eps=1e-6),
-    )
 
 
 def _video_block(in_channels: int, out_channels: int, config: VAEConfig) -> VideoResBlock:
@@ -162,7 +159,9 @@ class TemporalDecoder(nn.Module):
         colours = 3 * self.patch**2
         self.conv_out = nn.Conv2d(widths[0], colours, 3, padding=1)
         self.mix_frames = FrameConv(colours, colours)
-        _keep_frames_apart(self.mix_frames)
+        assert self.mix_frames.bias is not None
+        nn.init.dirac_(self.mix_frames.weight)  # the identity, so that what decodes single frames decodes clips alike
+        nn.init.zeros_(self.mix_frames.bias)
         self.block = config.down_factor
         self.linear = nn.Conv2d(config.latent_channels, 3 * self.block**2, 1) if config.linear else None
 
@@ -181,13 +180,6 @@ class TemporalDecoder(nn.Module):
             x = self.mix_frames(video).transpose(1, 2).flatten(0, 1)
         x = x if self.patch == 1 else F.pixel_shuffle(x, self.patch)
         return x if self.linear is None else x + F.pixel_shuffle(self.linear(latents), self.block)
-
-
-def _keep_frames_apart(mix: nn.Conv3d) -> None:
-    """Start as the identity, so that a decoder trained on single frames decodes clips alike."""
-    assert mix.bias is not None
-    nn.init.dirac_(mix.weight)
-    nn.init.zeros_(mix.bias)
 
 
 def to_pixels(decoded: Tensor) -> Tensor:
