@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 from driving_plane import PlaneClips
-from test_start import given, write
+from test_start import given, published, write
 
-from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View
+from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View, convert_weights
 from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.geometry import CameraMount
@@ -24,8 +24,12 @@ SIZE = (16, 32)
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = write(tmp_path_factory.mktemp("weights") / "svd.safetensors", given("none"))
-    return path.rename(path.with_name("blob.safetensors"))
+    config, folder = published(), tmp_path_factory.mktemp("weights")
+    assert config.image_encoder is not None
+    path = write(folder / "svd.safetensors", given("none")).rename(folder / "small.safetensors")
+    heads = {"head_width": config.unet.head_width, "image_heads": config.image_encoder.heads}
+    convert_weights(path, folder / "blob.safetensors", **heads)
+    return folder / "blob.safetensors"
 
 
 @pytest.fixture(scope="module")

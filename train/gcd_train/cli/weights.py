@@ -34,12 +34,14 @@ def merge(
     """Join an adapter with its base to plain weights. OUT appears whole or not at all."""
     with errors_shown():
         from gcd_model.weights.card import precision
-        from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
+        from gcd_model.weights.load import load_adapted, read_adapter, save_weights
         from gcd_model.weights.save import write_published
+        from gcd_train.training.setup import loaded_base
 
         wanted = None if dtype is None else precision(dtype)
-        start = load_weights(base, ask_family=False)
-        joined = load_adapted(start, read_adapter(adapter))
+        given = read_adapter(adapter)
+        start = loaded_base(str(base), given.card.diffusion)
+        joined = load_adapted(start, given)
         networks = joined.diffusion if wanted is None else joined.diffusion.to(wanted)
         card = replace(joined.card, trained=True, origin="")
         if layout == "gcd-ckpt":
