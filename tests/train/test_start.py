@@ -69,10 +69,11 @@ def assert_from(networks: Networks, source: Networks, anew: tuple[str, ...]) -> 
 
 
 @pytest.mark.parametrize("name", ["gcd.ckpt", "own.safetensors"])
-def test_a_model_of_the_same_kind_gives_all_its_weights(tmp_path: Path, name: str) -> None:
+def test_the_same_model_gives_all_its_weights(tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
     source = given()
     networks = start_networks(starting(write(tmp_path / name, source)), published(), SEED)
     assert_from(networks, source, ("nothing",))
+    assert caplog.text == ""
 
 
 def test_the_base_model_gives_all_but_the_camera(tmp_path: Path) -> None:
@@ -94,11 +95,6 @@ def test_a_file_of_another_model_is_refused_by_its_first_weight(tmp_path: Path) 
     wide = msgspec.structs.replace(published(), unet=msgspec.structs.replace(published().unet, embedding_width=64))
     with pytest.raises(RecipeError, match=r"own.safetensors holds another model .* misshapen, first: unet\."):
         start_networks(starting(path), wide, SEED)
-
-
-def test_starting_from_a_file_needs_no_family_of_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    start_networks(starting(write(tmp_path / "mine.ckpt", given())), published(), SEED)
-    assert caplog.text == ""
 
 
 # --- what is trained -------------------------------------------------------------------------------------------------

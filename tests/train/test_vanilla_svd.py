@@ -7,12 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 from driving_plane import PlaneClips
-from test_start import given, published, write
+from msgspec import structs
+from test_start import given
 
-from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View, convert_weights
+from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View
 from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.geometry import CameraMount
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import save_weights
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import BaselineSettings, VanillaSVD, baselines
 from gcd_train.evaluation.clips import PairedSet
@@ -24,12 +27,11 @@ SIZE = (16, 32)
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config, folder = published(), tmp_path_factory.mktemp("weights")
-    assert config.image_encoder is not None
-    path = write(folder / "svd.safetensors", given("none")).rename(folder / "small.safetensors")
-    heads = {"head_width": config.unet.head_width, "image_heads": config.image_encoder.heads}
-    convert_weights(path, folder / "blob.safetensors", **heads)
-    return folder / "blob.safetensors"
+    networks, path = given("none"), tmp_path_factory.mktemp("weights") / "blob.safetensors"
+    sampling = structs.replace(networks.config.sampling, guidance=(1.0, 2.5))
+    config = structs.replace(networks.config, frames=14, height=576, width=1024, sampling=sampling)
+    save_weights(networks, path, Card(name="", config=config, family=None, move_time=config.frames - 1))
+    return path
 
 
 @pytest.fixture(scope="module")
