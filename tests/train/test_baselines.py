@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip, seen_of
-from test_start import given, write
+from msgspec import structs
+from test_start import given
 
 from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View, load_synthesizer
 from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
+from gcd_model.weights.card import Card
+from gcd_model.weights.load import save_weights
 from gcd_train.data.pairs import PairedClip
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import (
@@ -152,8 +155,11 @@ SIZE = (16, 32)
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = write(tmp_path_factory.mktemp("weights") / "svd.safetensors", given("none"))
-    return path.rename(path.with_name("blob.safetensors"))
+    networks, path = given("none"), tmp_path_factory.mktemp("weights") / "blob.safetensors"
+    sampling = structs.replace(networks.config.sampling, guidance=(1.0, 2.5))
+    config = structs.replace(networks.config, frames=14, height=576, width=1024, sampling=sampling)
+    save_weights(networks, path, Card(name="", config=config, family=None, move_time=config.frames - 1))
+    return path
 
 
 @pytest.fixture(scope="module")

@@ -173,7 +173,7 @@ def _head_width(attends: tuple[bool, ...], widths: tuple[int, ...], hints: Hints
     raise CheckpointError(f"a U-Net of widths {list(widths)} does not tell its attention heads; {_GIVE_WIDTH}")
 
 
-_GIVE_WIDTH = "give the width of one with --head-width"
+_GIVE_WIDTH = "give the width of one with --head-width; `gcd-node weights convert` writes a file that states it"
 
 
 def _camera_control(probe: _Probe, camera_width: int) -> CameraControl:
@@ -214,7 +214,8 @@ def _image_encoder(probe: _Probe, context_width: int | None, hints: Hints) -> Im
     published = ImageEncoderConfig()
     if hints.image_heads is None and width != published.width:
         raise CheckpointError(
-            f"an image tower {width} wide does not tell its attention heads; give their number with --image-heads"
+            f"an image tower {width} wide does not tell its attention heads; give their number with --image-heads; "
+            "`gcd-node weights convert` writes a file that states it"
         )
     return ImageEncoderConfig(
         image_size=round((tokens - 1) ** 0.5) * patch,

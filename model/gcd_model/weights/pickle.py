@@ -103,23 +103,23 @@ class _Reader(pickle.Unpickler):
         self._storages: dict[str, UntypedStorage] = {}
 
     def find_class(self, module_name: str, global_name: str, /) -> object:
-        """What a name of the file stands for; nothing is looked up but torch's dtypes."""
+        """What a name of the file stands for; nothing is looked up but torch's dtypes, for which storages stand too."""
         if (module_name, global_name) == ("collections", "OrderedDict"):
             return OrderedDict
         if module_name == "torch._utils" and global_name in _REBUILDING:
             return _Rebuild()
+        if module_name in ("torch", "torch.storage") and global_name.endswith("Storage"):
+            return _STORAGES.get(global_name, torch.uint8)
         dtype = vars(torch).get(global_name) if module_name == "torch" else None
         return dtype if isinstance(dtype, torch.dtype) else _placeholder_class(f"{module_name}.{global_name}")
 
     def persistent_load(self, pid: object) -> object:
-        """A storage, by (kind, class, key, device, number of elements)."""
+        """A storage, by (kind, type, key, device, number of elements)."""
         match pid:
-            case ("storage", kind, str(key), _, int(count)):
-                name = str(getattr(kind, "origin", "")).rpartition(".")[2]
-                dtype = _STORAGES.get(name, torch.uint8)
+            case ("storage", torch.dtype() as dtype, str(key), _, int(count)):
                 return _Storage(self._mapped(key, dtype.itemsize * count), dtype)
             case _:
-                raise CheckpointError(f"its pickle refers to {pid!r}, which is no tensor: refused")
+                raise CheckpointError("its pickle refers to what is no tensor: refused")
 
     def _mapped(self, key: str, claimed: int) -> UntypedStorage:
         """The record's bytes. A short one would be read past its end."""

@@ -41,14 +41,14 @@ def whole(out: Path, *, replaces: bool) -> Generator[Path]:
         if partial.is_file():
             with partial.open("rb+") as file:
                 os.fsync(file.fileno())
-        if out.is_dir() and not out.is_symlink():
+        if out.is_dir():
             out.rename(former)
         partial.replace(out)
+        former.unlink() if former.is_symlink() else shutil.rmtree(former, ignore_errors=True)
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{out}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     finally:
-        partial.unlink(missing_ok=True) if partial.is_file() else shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(former, ignore_errors=True)
+        partial.unlink() if partial.is_file() else shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_safetensors(

@@ -18,7 +18,7 @@ from typer import Argument, BadParameter, Option, Typer
 
 from gcd_model.weights.card import precision
 from gcd_model.weights.families import FAMILIES, Family
-from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
+from gcd_model.weights.load import load_adapted, read_adapter, save_weights
 from gcd_model.weights.save import write_published
 from gcd_train.cli.common import Dtype, command_line, errors_shown, say
 from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
@@ -194,8 +194,11 @@ def merge(
     """Join an adapter with its base to plain weights. OUT appears whole or not at all."""
     with errors_shown():
         wanted = None if dtype is None else precision(dtype)
-        start = load_weights(base, ask_family=False)
-        joined = load_adapted(start, read_adapter(adapter))
+        from gcd_train.training.setup import loaded_base
+
+        given = read_adapter(adapter)
+        start = loaded_base(str(base), given.card.diffusion)
+        joined = load_adapted(start, given)
         networks = joined.diffusion if wanted is None else joined.diffusion.to(wanted)
         card = replace(joined.card, trained=True, origin="")
         if layout == "gcd-ckpt":

@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Self
 
 import msgspec
@@ -36,7 +37,6 @@ from gcd_train.data.cache import (
 from gcd_train.data.sample import Clips, numbers_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.recipe import LatentsRecipe, Recipe
-from gcd_train.stop import StopSignal
 from gcd_train.training.conditioner import Conditioner, mirrored_path
 from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
@@ -167,7 +167,7 @@ class Encodings:
     clips: Clips
     folder: Path
     shared: Path | None
-    stop: StopSignal
+    stop: Event
 
     def encode(self, networks: Networks) -> None:
         """Write the folder of latents, or what is missing of it.
