@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -286,17 +287,25 @@ def halved(record: Record) -> Record:
 
 def on(device: torch.device, record: Record) -> Record:
     """A record with its tensors on a device."""
-    return _mapped(lambda x: x.to(device, non_blocking=True) if isinstance(x, Tensor) else x, record)
+
+    def moved(value: Any) -> Any:
+        return value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
+
+    return _mapped(moved, record)
 
 
 def joined(parts: Sequence[Record]) -> Record:
     """Records of pictures as one batch."""
-    return _mapped(lambda *xs: torch.cat(xs) if isinstance(xs[0], Tensor) else tuple(chain(*xs)), *parts)
+
+    def together(*values: Any) -> Any:
+        return torch.cat(values) if isinstance(values[0], Tensor) else tuple(chain(*values))
+
+    return _mapped(together, *parts)
 
 
 def some_of(batch: Record, cut: slice) -> Record:
     """Some pictures of a record of them."""
-    return _mapped(lambda x: x[cut], batch)
+    return _mapped(itemgetter(cut), batch)
 
 
 class LiveTask(Task):

@@ -29,7 +29,7 @@ from gcd_model.small_files import decode_json
 from gcd_train.errors import DataError
 
 _log = logging.getLogger(__name__)
-CAMERAS = ("source", "target")
+CAMERAS: tuple[str, ...] = ("source", "target")
 _HELD_OUT_SEED = 1_000_000
 """Scenes from here on are not learned from."""
 _NEAREST_M, _CODES = 0.02, 65534
@@ -83,11 +83,6 @@ class LiveClip:
     name: str
     arrays: dict[str, Array]
     facts: dict[str, Any]
-
-    @property
-    def world(self) -> str:
-        """Its name."""
-        return str(self.facts["world"])
 
     def lens(self, camera: str) -> Intrinsics:
         """Of "source" or "target"; its pictures or labels have to be read."""

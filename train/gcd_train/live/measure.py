@@ -108,7 +108,7 @@ class ExactSplat:
         covered, votes = (
             torch.stack(each) for each in zip(*((s.coverage, s.votes.argmax(0)) for s in made), strict=True)
         )
-        label = commonest_class(self.training, clip.world)
+        label = commonest_class(self.training, str(clip.facts["world"]))
         return MethodViews(
             video=torch.stack(video),
             classes=torch.where(covered > 0, votes, label).to(torch.uint8),

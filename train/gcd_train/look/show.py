@@ -262,17 +262,16 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
     if clips.mount is None:
         orbit = clips.orbit(index)
         azimuth_deg, elevation_deg, radius_m = orbit.change
-        told = f"{azimuth_deg:+.1f}° azimuth, {elevation_deg:+.1f}° elevation, {radius_m:+.1f} m radius, gradual"
+        words = f"{azimuth_deg:+.1f}° azimuth, {elevation_deg:+.1f}° elevation, {radius_m:+.1f} m radius, gradual"
         numbers = orbit.frame_numbers
     else:
-        told = "the driving path, up and back at a sine pace"
-        vehicle_from_source = clips.mount.vehicle_from_camera.numpy()
-        world_from_source = np.repeat(vehicle_from_source[None], clips.frames, axis=0)
-        world_from_target = vehicle_from_source @ np.linalg.inv(sources) @ targets
+        words = "the driving path, up and back at a sine pace"
+        world_from_source = np.tile(clips.mount.vehicle_from_camera.numpy(), (clips.frames, 1, 1))
+        world_from_target = world_from_source @ np.linalg.inv(sources) @ targets
     return Footage(
         title=f"pair shard, {_world_name(clips.world.name)}, seed {clip.seed}",
         folder=str(shard),
-        path=told,
+        path=words,
         scene=f"{numbers[-1] + 1} frames at {clips.fps * clips.world.stride:g} fps, 2 cameras",
         frame_numbers=numbers,
         fps=clips.fps,
