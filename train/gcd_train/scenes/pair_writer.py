@@ -42,11 +42,12 @@ _CLEAR_M = 1.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DrawnClip:
-    """facts: of the scene. cameras: "source" and "target", world_from_camera [T, 4, 4]. orbit: None in driving."""
+    """facts: of the scene and its lens. cameras: "source" and "target", world_from_camera [T, 4, 4]. orbit: None in
+    driving.
+    """
 
     seed: int
     facts: dict[str, float | str]
-    hfov_deg: float
     cameras: dict[str, NDArray[np.float64]]
     views: dict[str, list[Rendering]]
     orbit: Orbit | None = None
@@ -120,7 +121,7 @@ def write_shard(out: Path, world: World, seeds: range) -> None:
 def _store(archive: zipfile.ZipFile, clip: DrawnClip) -> None:
     name = f"{clip.seed:08d}"
     poses = {camera: np.round(poses, 6).tolist() for camera, poses in clip.cameras.items()}
-    scene: dict[str, Any] = {"facts": {**clip.facts, "hfov_deg": clip.hfov_deg}, "world_from_camera": poses}
+    scene: dict[str, Any] = {"facts": clip.facts, "world_from_camera": poses}
     if clip.orbit is not None:
         scene["orbit"] = msgspec.to_builtins(clip.orbit)
     archive.writestr(f"{name}/scene.json", json.dumps(scene))
@@ -154,9 +155,8 @@ def drawn_clips(renderer: Renderer, world: World, seeds: Sequence[int]) -> Itera
 def _fixed(renderer: Renderer, world: World, seed: int) -> DrawnClip:
     mount = CameraMount(height_m=world.options.height_m, tilt_deg=world.options.tilt_deg)
     scene = driving_scene(seed, frames=world.frames, mount=mount, move_time=world.move_time)
-    return DrawnClip(
-        seed=seed, facts=scene.facts, hfov_deg=scene.hfov_deg, cameras=scene.cameras, views=renderer.render(scene)
-    )
+    facts = {**scene.facts, "hfov_deg": scene.hfov_deg}
+    return DrawnClip(seed=seed, facts=facts, cameras=scene.cameras, views=renderer.render(scene))
 
 
 def _orbits(renderer: Renderer, world: World, scene_seed: int, seeds: list[int]) -> Iterator[DrawnClip]:
@@ -178,8 +178,7 @@ def _orbits(renderer: Renderer, world: World, scene_seed: int, seeds: list[int])
             steps = slice(clip * world.frames, (clip + 1) * world.frames)
             yield DrawnClip(
                 seed=seeds[clip],
-                facts=scene.facts,
-                hfov_deg=world.hfov_deg,
+                facts={**scene.facts, "hfov_deg": world.hfov_deg},
                 cameras={name: poses[steps] for name, poses in cameras.items()},
                 views=views,
                 orbit=_orbit(draws[clip]),
