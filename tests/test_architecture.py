@@ -26,7 +26,7 @@ MOST = [
     ("gcd_node", 59, 13_519),
     ("tests/node", 82, 14_236),
     ("train/gcd_train", 138, 28_967),
-    ("tests/train", 88, 14_838),
+    ("tests/train", 88, 14_832),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 
