@@ -157,6 +157,7 @@ class TestEncodings:
         with image.open(tmp_path / "rgba.png") as opened:
             assert opened.mode == "RGBA"
             np.testing.assert_array_equal(np.asarray(opened)[..., :3], drawing().rgb)
+            assert np.asarray(opened)[..., 3].min() == 255
 
     @pytest.mark.parametrize("encode", [encodings.id_png, encodings.packed_id_png])
     def test_ids_are_told_by_red(self, encode: Any) -> None:

@@ -147,18 +147,11 @@ def driving_file(layer: str) -> str:
     return f"{layer}/yaw-60/000000000000000015.{'npz' if layer == 'depth' else 'png'}"
 
 
-def expect_kubric_fault(scene: Path, path: str, match: str) -> None:
-    dataset = open_kubric(scene.parent, instances=True)
+def expect_fault(scene: Path, path: str, match: str) -> None:
+    opened = open_kubric if scene.name.startswith("scn0") else open_driving
+    dataset = opened(scene.parent, instances=True)
     with pytest.raises(FileFault, match=match) as caught:
-        dataset.views("scn00007", 1)
-    assert caught.value.path == scene / path
-    assert str(scene / path) in str(caught.value)
-
-
-def expect_driving_fault(scene: Path, path: str, match: str) -> None:
-    dataset = open_driving(scene.parent, instances=True)
-    with pytest.raises(FileFault, match=match) as caught:
-        dataset.views("scene_000004", 1)
+        dataset.views(scene.name, 1)
     assert caught.value.path == scene / path
     assert str(scene / path) in str(caught.value)
 
@@ -174,8 +167,8 @@ def test_a_missing_or_cut_off_file_is_named(driving: Path, kubric: Path, layer: 
         if share is not None:
             path.write_bytes(content[: int(share * len(content))])
     said = "is missing" if share is None else "is empty" if share == 0 else "damaged"
-    expect_driving_fault(driving, driving_file(layer), said)
-    expect_kubric_fault(kubric, kubric_layer, said)
+    expect_fault(driving, driving_file(layer), said)
+    expect_fault(kubric, kubric_layer, said)
 
 
 @pytest.mark.parametrize(
@@ -191,30 +184,30 @@ def test_depth_that_is_none_is_named(driving: Path, value: float, pixels: int | 
     depth = np.full((36, 48), 5.0, np.float32)
     depth.flat[:pixels] = value
     np.savez(driving / driving_file("depth"), data=depth)
-    expect_driving_fault(driving, driving_file("depth"), said)
+    expect_fault(driving, driving_file("depth"), said)
 
 
 def test_a_missing_view_is_named(kubric: Path, driving: Path) -> None:
     shutil.rmtree(kubric / "frames_p0_v3")
-    expect_kubric_fault(kubric, "frames_p0_v3/rgba_00001.png", "is missing")
+    expect_fault(kubric, "frames_p0_v3/rgba_00001.png", "is missing")
     (kubric / "scn00007_p0_v1.json").unlink()
-    expect_kubric_fault(kubric, "scn00007_p0_v1.json", "is missing")
+    expect_fault(kubric, "scn00007_p0_v1.json", "is missing")
     shutil.rmtree(driving / "rgb" / "camera0")
-    expect_driving_fault(driving, "rgb/camera0/000000000000000015.png", "is missing")
+    expect_fault(driving, "rgb/camera0/000000000000000015.png", "is missing")
     shutil.rmtree(driving / "rgb" / "yaw-0")
-    expect_driving_fault(driving, "rgb/yaw-0", "is missing")
+    expect_fault(driving, "rgb/yaw-0", "is missing")
 
 
 def test_mixed_sizes_are_named(kubric: Path, driving: Path) -> None:
     write_png(driving / driving_file("rgb"), np.zeros((30, 40, 3), np.uint8))
-    expect_driving_fault(driving, driving_file("rgb"), "40 x 30 where .* 48 x 36: sizes are mixed")
+    expect_fault(driving, driving_file("rgb"), "40 x 30 where .* 48 x 36: sizes are mixed")
     write_png(kubric / kubric_file("rgba"), np.zeros((30, 40, 3), np.uint8), alpha=True)
-    expect_kubric_fault(kubric, kubric_file("rgba"), "40 x 30 where .* 48 x 32: sizes are mixed")
+    expect_fault(kubric, kubric_file("rgba"), "40 x 30 where .* 48 x 32: sizes are mixed")
     path = kubric / "scn00007_p0_v2.json"
     told = json.loads(path.read_text())
     told["scene"]["resolution"] = [96, 64]
     path.write_text(json.dumps(told))
-    expect_kubric_fault(kubric, "scn00007_p0_v2.json", "96 x 64 pixels, .* sizes are mixed")
+    expect_fault(kubric, "scn00007_p0_v2.json", "96 x 64 pixels, .* sizes are mixed")
 
 
 @pytest.mark.parametrize(
@@ -232,13 +225,13 @@ def test_damaged_kubric_metadata_is_named(kubric: Path, change: object, match: s
     told = json.loads(path.read_text())
     change(told)  # pyright: ignore[reportCallIssue]
     path.write_text(json.dumps(told))
-    expect_kubric_fault(kubric, "scn00007_p0_v1.json", match)
+    expect_fault(kubric, "scn00007_p0_v1.json", match)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"scene": {}}', b"\xff\xfe", b"null"])
 def test_json_that_is_none_is_named(kubric: Path, driving: Path, content: bytes) -> None:
     (kubric / "scn00007_p0_v1.json").write_bytes(content)
-    expect_kubric_fault(kubric, "scn00007_p0_v1.json", "is empty|is damaged")
+    expect_fault(kubric, "scn00007_p0_v1.json", "is empty|is damaged")
     dataset = open_driving(driving.parent)
     (driving / "ontology" / "d4e5f6.json").write_bytes(content)
     with pytest.raises(FileFault, match=r"d4e5f6\.json is (empty|no ontology)"):
@@ -267,7 +260,7 @@ def test_a_damaged_calibration_is_named(driving: Path, change: object, match: st
     told = json.loads(path.read_text())
     change(told)  # pyright: ignore[reportCallIssue]
     path.write_text(json.dumps(told))
-    expect_driving_fault(driving, "calibration/a1b2c3.json", match)
+    expect_fault(driving, "calibration/a1b2c3.json", match)
 
 
 def test_a_scene_with_another_ontology_is_refused(driving_root: Path, tmp_path: Path) -> None:
