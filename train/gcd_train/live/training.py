@@ -168,9 +168,7 @@ def _stage(
     options = LoopOptions(
         stage=name,
         identity=hashlib.sha256(told).hexdigest()[:12],
-        budget=stage.budget,
-        optimiser=stage.optimiser,
-        ema=stage.ema,
+        table=stage,
         log=recipe.log,
         stop=stop,
         frames_per_clip=recipe.model.frames,
