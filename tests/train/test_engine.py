@@ -6,6 +6,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+import msgspec
 import pytest
 import torch
 from tiny_world import After, tiny_recipe
@@ -106,8 +107,10 @@ class Square(BaseTask):
 
 def square_trained(path: Path, kind: Any, weights: Any, stop_at: int | None) -> torch.Tensor:
     task, stop = Square(), Event() if stop_at is None else After(stop_at + 1)
-    chosen = replace(options(ALONE, stop, LOG, weights=weights), budget=Budget(updates=6))
-    chosen = replace(chosen, optimiser=OptimiserRecipe(rate=1e-3, kind=kind))
+    table = msgspec.structs.replace(
+        recipe_of().unet, budget=Budget(updates=6), optimiser=OptimiserRecipe(rate=1e-3, kind=kind)
+    )
+    chosen = replace(options(ALONE, stop, LOG, weights=weights), table=table)
     with suppress(Interrupted):
         Loop(task, RunFolder(path), chosen).run()
     return task.module.weight.detach()

@@ -18,7 +18,7 @@ from torch import nn
 from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
 
 from gcd_train.errors import RunError
-from gcd_train.recipe import EmaRecipe, OptimiserRecipe
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, LogRecipe
 from gcd_train.training.checkpoint import DamagedStateError, StateNote, close_folder, newest_weights, read_weights
 from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss, Task
@@ -61,9 +61,7 @@ def run(
     options = LoopOptions(
         stage="unet",
         identity=identity,
-        budget=Budget(updates=updates),
-        optimiser=OptimiserRecipe(rate=0.1),
-        ema=ema,
+        table=UNetRecipe(budget=Budget(updates=updates), optimiser=OptimiserRecipe(rate=0.1), ema=ema),
         log=log,
         stop=Event(),
         frames_per_clip=1,

@@ -15,7 +15,7 @@ from torch.testing import assert_close
 
 from gcd_model.networks import Networks, random_networks
 from gcd_train.errors import TrainError
-from gcd_train.recipe import OptimiserRecipe
+from gcd_train.recipe import OptimiserRecipe, VAERecipe
 from gcd_train.recipe_data import Budget, LogRecipe
 from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss, Task
 from gcd_train.training.monitor import RunFolder
@@ -76,9 +76,7 @@ def options(budget: Budget, clock: Clock) -> LoopOptions:
     return LoopOptions(
         stage="vae",
         identity="x",
-        budget=budget,
-        optimiser=OptimiserRecipe(rate=0.1),
-        ema=None,
+        table=VAERecipe(budget=budget, optimiser=OptimiserRecipe(rate=0.1)),
         log=LogRecipe(log_s=1000.0, save_s=1000.0, measure_s=1000.0),
         stop=Event(),
         frames_per_clip=4,

@@ -96,7 +96,8 @@ class Told(Task):
 def to_be_killed(folder: Path) -> None:
     """A run that appends the loss of every update to a file, and saves after each."""
     log = msgspec.structs.replace(LOG, save_s=1e-9)
-    chosen = replace(options(ALONE, Event(), log), budget=Budget(updates=KILLED_UPDATES))
+    longer = msgspec.structs.replace(recipe_of().unet, budget=Budget(updates=KILLED_UPDATES))
+    chosen = replace(options(ALONE, Event(), log), table=longer)
     Loop(Told(folder / "losses.jsonl"), RunFolder(folder), chosen).run()
 
 
@@ -140,13 +141,10 @@ def recipe_of(batch: int = 2) -> Recipe:
 
 
 def options(processes: Processes, stop: Event, log: LogRecipe, **compute: object) -> LoopOptions:
-    recipe = recipe_of()
     return LoopOptions(
         stage="unet",
         identity="tiny",
-        budget=recipe.unet.budget,
-        optimiser=recipe.unet.optimiser,
-        ema=recipe.unet.ema,
+        table=recipe_of().unet,
         log=log,
         stop=stop,
         frames_per_clip=FRAMES,

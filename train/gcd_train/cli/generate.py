@@ -83,33 +83,22 @@ def _add(world: SceneWorld, about: str, *, clips_a_scene: int, clips_a_shard: in
             if on_road and clips_per_scene != clips_a_scene:
                 raise RecipeError("a pair of driving has a simulation of its own; leave out --clips-per-scene")
             stop_as_by_ctrl_c()
+            size = {"width": width, "height": height, "frames": frames, "oversample": oversample}
+            given = {name: number for name, number in size.items() if number is not None}
             if not (pairs or mounted or clips is not None):
-                form = SceneFormat(
-                    width=width or world.width,
-                    height=height or world.height,
-                    frames=frames or world.frames,
-                    oversample=oversample,
-                    compact=compact,
-                )
+                published = {"width": world.width, "height": world.height, "frames": world.frames}
+                form = SceneFormat(compact=compact, **{**published, **given})
                 _make_scenes(world, place, form, range(first_seed, first_seed + (scenes or 1)), processes, ray)
                 return
             if scenes is not None or compact:
                 raise RecipeError(
                     "--scenes and --compact make whole scenes; --clips, --pairs, a mount and a path pairs; give one"
                 )
-            usual = PairForm()
-            pair = PairForm(
-                width=width or usual.width,
-                height=height or usual.height,
-                frames=frames or usual.frames,
-                oversample=oversample,
-                clips_per_shard=clips_per_shard,
-            )
-            made = (
-                driving_world(pair, mount, path)
-                if on_road
-                else orbit_world(world, pair, clips_per_scene=clips_per_scene)
-            )
+            pair = PairForm(clips_per_shard=clips_per_shard, **given)
+            if on_road:
+                made = driving_world(pair, mount, path)
+            else:
+                made = orbit_world(world, pair, clips_per_scene=clips_per_scene)
             seeds = made.seeds_of(first_seed, clips or 100)
             with progress_bar("clips", len(seeds), keep=True) as show:
                 for done in generate(place, made, seeds, processes, ray):

@@ -195,7 +195,7 @@ def recompute_blocks(module: nn.Module, every: int) -> None:
     Trades a second forward pass of those blocks for their activations. Gradients stay the same.
     """
     for stage in stages_of(module)[every - 1 :: every]:
-        stage.forward = partial(_recomputed, stage.forward)
+        stage.forward = partial(_recomputed, stage.forward)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _recomputed(forward: Callable[..., Any], *given: Any) -> Any:

@@ -9,6 +9,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -70,6 +71,17 @@ class Task:
         """Take part where the first process gathers weights of which each has a share, to measure them."""
 
 
+class StageTable(Protocol):
+    """What the tables of all training stages state."""
+
+    @property
+    def budget(self) -> Budget: ...
+    @property
+    def optimiser(self) -> OptimiserRecipe: ...
+    @property
+    def ema(self) -> EmaRecipe | None: ...
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LoopOptions:
     """How a stage runs. identity: see StateNote. frames_per_clip: for the log. parts: batches
@@ -77,9 +89,7 @@ class LoopOptions:
 
     stage: AnyStageName
     identity: str
-    budget: Budget
-    optimiser: OptimiserRecipe
-    ema: EmaRecipe | None
+    table: StageTable
     log: LogRecipe
     stop: Event
     frames_per_clip: int
@@ -120,8 +130,8 @@ class Loop:
         engine, stage = options.engine, options.stage
         self._processes, self._mine = engine.processes, engine.processes.batches(options.parts)
         task.network = engine.prepare(task.module)
-        self._optimiser = build_optimiser(task.parameter_groups(), options.optimiser, engine.compute.weights)
-        self._ema = None if options.ema is None else Ema(task.module, options.ema)
+        self._optimiser = build_optimiser(task.parameter_groups(), options.table.optimiser, engine.compute.weights)
+        self._ema = None if options.table.ema is None else Ema(task.module, options.table.ema)
         trained = Trained(task.module, self._optimiser, self._ema)
         self._states = States(folder.stage(stage), trained, stage, options.identity, options.log, engine.processes)
         self._window = _Window()
@@ -133,7 +143,7 @@ class Loop:
     @property
     def progress(self) -> Progress:
         """Updates done, and share of the budget."""
-        return Progress(self._updates, self._options.budget.share(self._updates, self._seconds))
+        return Progress(self._updates, self._options.table.budget.share(self._updates, self._seconds))
 
     def run(self) -> None:
         """Train to the end of the budget.
@@ -183,7 +193,7 @@ class Loop:
         return otherwise if every is None else self._updates % every == 0
 
     def _update(self) -> None:
-        started, recipe = self._options.clock(), self._options.optimiser
+        started, recipe = self._options.clock(), self._options.table.optimiser
         progress = self.progress
         set_rate(self._optimiser, progress.updates, progress.share, recipe)
         self._optimiser.zero_grad(set_to_none=True)
@@ -216,7 +226,7 @@ class Loop:
     def _clipped(self) -> Tensor:
         """The norm of the whole gradient, which is then no longer than the recipe allows."""
         trained = [p for group in self._optimiser.param_groups for p in group["params"]]
-        limit = self._options.optimiser.clip
+        limit = self._options.table.optimiser.clip
         if limit is not None:
             return whole(nn.utils.clip_grad_norm_(trained, limit))
         return whole(nn.utils.get_total_norm([p.grad for p in trained if p.grad is not None]))

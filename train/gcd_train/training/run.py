@@ -5,7 +5,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import Protocol
 
 import msgspec
 import torch
@@ -20,11 +19,11 @@ from gcd_train.data.latents import Encodings, LatentClips
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, VAERecipe
-from gcd_train.recipe_data import AnyStageName, Budget
+from gcd_train.recipe import Recipe, VAERecipe
+from gcd_train.recipe_data import AnyStageName
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.export import Validation, export
-from gcd_train.training.loop import Loop, LoopOptions, Task
+from gcd_train.training.loop import Loop, LoopOptions, StageTable, Task
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import BatchSource, UNetTask
 from gcd_train.training.setup import (
@@ -43,17 +42,6 @@ from gcd_train.training.vae import VAETask
 
 _log = logging.getLogger(__name__)
 _DENOISER: AnyStageName = "unet"  # the stage that several processes share
-
-
-class StageTable(Protocol):
-    """What the tables of all training stages state."""
-
-    @property
-    def budget(self) -> Budget: ...
-    @property
-    def optimiser(self) -> OptimiserRecipe: ...
-    @property
-    def ema(self) -> EmaRecipe | None: ...
 
 
 class Trainer:
@@ -172,9 +160,7 @@ class Trainer:
         options = LoopOptions(
             stage=stage,
             identity=identity,
-            budget=table.budget,
-            optimiser=table.optimiser,
-            ema=table.ema,
+            table=table,
             log=self._recipe.log,
             stop=self._stop,
             frames_per_clip=self._config.frames,
