@@ -97,9 +97,21 @@ def test_a_table_of_the_paper_has_its_rows_and_nobody_is_given_a_printed_figure(
     for name in ("HexPlane", "4D-GS", "DynIBaR", "Vanilla SVD", "ZeroNVS", "Reproject RGB-D"):
         (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
         assert line.count("not run") == 5
-    assert len(ablation.rows) == 8
+    assert len(ablation.rows) == 8 + 3
     direct = next(row for row in lines(to_csv(ablation)) if row["row"] == "GCD (direct, max 90, finetuned)")
     assert (direct["method"], direct["PSNR all"], direct["PSNR all paper"]) == ("not run", "", "17.23")
+
+
+def test_the_papers_means_over_variants_are_rows_where_all_were_measured() -> None:
+    better = {"gradual": 0.5, "max90": 0.25, "finetuned": 1.0}
+    names = [f"{path}-{most}-{start}" for path in ("direct", "gradual") for most in ("max90", "max180")
+             for start in ("scratch", "finetuned")]  # fmt: skip
+    every = [records(name, sum(gain for word, gain in better.items() if word in name)) for name in names]
+    for measured_, shown in ((every, ["0.50", "0.25", "1.00"]), (every[1:], ["not run"] * 3)):
+        ablation, _ = main_tables(measured(*measured_, kind="kubric", protocol="paper"))
+        gains = ablation.rows[-3:]
+        assert [str(row.cells[0]) for row in gains] == shown
+        assert [row.printed.split(",")[0] for row in gains] == ["1.17", "0.55", "1.34"]
 
 
 def test_the_papers_tables_hold_all_it_prints() -> None:

@@ -151,6 +151,7 @@ def main_tables(of: EvaluatedSet, spans: Sequence[Span] = ("2-last", "last")) ->
             rows += [_row(of, each, paper.columns, paper.frames, label, printed) for each in found]
             if not found:
                 rows.append(Row(label=label, cells=tuple(Cell(note=NOT_RUN, paper=value) for value in printed)))
+        rows += [_gain(rows, *gain) for gain in paper.gains]
         apart = dict.fromkeys(label for label in labels.values() if label not in paper.rows)
         below = [
             _row(
@@ -242,6 +243,16 @@ def _row(
         )
     clips = f"{len(method.records)} of {len(of.clips)}"
     return Row(label=label, method=method.starred, clips=clips, cells=tuple(cells))
+
+
+def _gain(rows: Sequence[Row], better: str, worse: str, printed: float) -> Row:
+    """The mean difference of the first column between variants that differ in this alone, where all were measured; of
+    several methods in a row the first."""
+    first = {row.label: row.cells[0].figure for row in reversed(rows)}
+    apart = [first[label].value - first[label.replace(better, worse)].value for label in first if better in label]
+    figure = Interval(value=sum(apart) / len(apart))  # not known as soon as one is not
+    cell = Cell(figure=figure, note=NOT_RUN, paper=printed)
+    return Row(label=f"{better} over {worse}, mean of variants", cells=(cell, *[Cell()] * (len(rows[0].cells) - 1)))
 
 
 def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
