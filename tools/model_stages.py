@@ -142,7 +142,10 @@ def load_measured(
 ) -> Synthesizer:
     """What `load_synthesizer` loads, or FULL. stages: of FULL, networks of stages not asked for are small ones."""
     if weights == FULL:
-        return placed_synthesizer(_full_size(stages), device_named(device), dtype=dtype)
+        place = device_named(device)
+        with place:  # drawn where it is used: on one thread of a CPU that takes a minute
+            full = _full_size(stages)
+        return placed_synthesizer(full, place, dtype=dtype)
     made = load_synthesizer(weights, device=device, dtype=dtype)
     if isinstance(made, LiveSynthesizer):
         raise OptionError(f"{made.traits.name} {NO_DIFFUSION}")
