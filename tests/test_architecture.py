@@ -25,8 +25,8 @@ MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_expor
 MOST = [
     ("gcd_node", 59, 13_519),
     ("tests/node", 82, 14_236),
-    ("train/gcd_train", 146, 29_440),
-    ("tests/train", 88, 15_043),
+    ("train/gcd_train", 137, 28_870),
+    ("tests/train", 83, 14_663),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 
