@@ -259,10 +259,7 @@ def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Netwo
 
 
 def loaded_base(path: str, config: ModelConfig | None = None) -> LoadedWeights:
-    """A weight file of any layout, or `package:NAME`, whatever its family. Raises CheckpointError.
-
-    config: of the model it is to start, for its heads, which published layouts do not tell.
-    """
+    """A weight file of any layout, or `package:NAME`, with the config's heads if it has none. See `load_weights`."""
     tower, width = (None, None) if config is None else (config.image_encoder, config.unet.head_width)
     heads = None if tower is None else tower.heads
     return load_weights(weights_path(path), ask_family=False, head_width=width, image_heads=heads)

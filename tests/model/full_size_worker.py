@@ -1,0 +1,145 @@
+"""One guided full-size U-Net step in a process of its own, so that its time and its peak memory are its own.
+
+    python full_size_worker.py write|ours|diffusers FOLDER
+
+`write` puts random weights under diffusers' names into FOLDER/unet.safetensors; the other two map them into memory,
+run both branches of 14 frames at 32x48 latents in one batch, float32, store the result, and print a line of JSON:
+seconds of the step, CPU seconds (of user and system) of the step and of building, peak resident memory with mapped
+pages, peak private memory, both in GB.
+"""
+
+import json
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import torch
+from naming import from_diffusers_unet
+from safetensors.torch import load_file, save_file
+from small_models import draw, give_published_epsilon, randomise
+from torch import Tensor, nn
+
+from gcd_model.conditioning import micro_conditioning
+from gcd_model.config import SVD_14
+from gcd_model.engines.torch import arrange
+from gcd_model.layers import prepare
+from gcd_model.unet import VideoUNet
+
+FRAMES, HEIGHT, WIDTH, BRANCHES = 14, 32, 48, 2
+MICRO = (12.0, 127.0, 0.02)
+NOISE_LABEL = 0.3
+
+Step = Callable[[Tensor, Tensor], Tensor]
+"""Latents [2*T, 8, h, w] and tokens [2, 1024] -> [2*T, 4, h, w]."""
+
+
+def _diffusers_unet() -> nn.Module:
+    """On the meta device, with the published epsilon in the blocks where diffusers has another.
+
+    Imported here, so that our own process does not hold diffusers in memory.
+    """
+    from diffusers.models.unets.unet_spatio_temporal_condition import UNetSpatioTemporalConditionModel
+
+    with torch.device("meta"):
+        unet = UNetSpatioTemporalConditionModel(num_frames=FRAMES)
+    give_published_epsilon(unet)
+    return unet.eval()
+
+
+def _write(folder: Path) -> None:
+    unet = _diffusers_unet().to_empty(device="cpu")
+    with torch.no_grad():
+        for name, parameter in unet.named_parameters():
+            parameter.fill_(1.0 if "norm" in name and name.endswith(".weight") else 0.0)
+    randomise(unet)
+    save_file(unet.state_dict(), folder / "unet.safetensors")
+
+
+def _ours(weights: dict[str, Tensor]) -> Step:
+    config = msgspec.structs.replace(SVD_14.unet, camera_width=0)
+    with torch.device("meta"):
+        unet = VideoUNet(config, FRAMES)
+    unet.load_state_dict(from_diffusers_unet(weights, unet), assign=True)
+    prepare(unet)
+    arrange(unet)
+
+    def step(latents: Tensor, tokens: Tensor) -> Tensor:
+        vector = micro_conditioning(*MICRO, config.vector_width).expand(FRAMES, -1)
+        per_frame = tokens.repeat_interleave(FRAMES, dim=0)
+        plan = unet.plan(torch.tensor([NOISE_LABEL]), vector, None, per_frame, repeats=BRANCHES)
+        return unet(latents[:, :4], latents[:, 4:], plan.step(0))
+
+    return step
+
+
+def _diffusers(weights: dict[str, Tensor]) -> Step:
+    unet = _diffusers_unet()
+    unet.load_state_dict(weights, assign=True)
+
+    def step(latents: Tensor, tokens: Tensor) -> Tensor:
+        clips, label = latents.unflatten(0, (BRANCHES, FRAMES)), torch.tensor(NOISE_LABEL)
+        return unet(clips, label, tokens[:, None], torch.tensor([MICRO] * BRANCHES)).sample.flatten(0, 1)
+
+    return step
+
+
+@dataclass(slots=True)
+class _Private:
+    peak_bytes: int = 0
+
+
+def _private_bytes() -> int:
+    """Memory that is this process's own: mapped weights do not count, what was copied from them does."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:"))
+
+
+@contextmanager
+def _private_watched() -> Generator[_Private]:
+    """The largest private memory seen meanwhile; the kernel keeps no peak of it, so it is read 50 times a second."""
+    seen, over = _Private(), threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.02):
+            seen.peak_bytes = max(seen.peak_bytes, _private_bytes())
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    yield seen
+    over.set()
+    watcher.join()
+
+
+def _measure(folder: Path, build: Callable[[dict[str, Tensor]], Step], name: str) -> None:
+    started = time.process_time()
+    with torch.inference_mode(), _private_watched() as private:
+        step = build(load_file(folder / "unet.safetensors"))
+        prepared, wall = time.process_time(), time.perf_counter()
+        # the unconditional branch gets a token of zeros
+        tokens = torch.cat([torch.zeros(1, 1024), draw(1, 1024, seed=2)])
+        result = step(draw(BRANCHES * FRAMES, 8, HEIGHT, WIDTH, seed=1), tokens)
+        wall = time.perf_counter() - wall
+    save_file({"result": result.contiguous()}, folder / f"{name}.safetensors")
+    line = {
+        "wall_s": wall,
+        "cpu_s": time.process_time() - prepared,
+        "build_cpu_s": prepared - started,
+        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9,
+        "private_gb": private.peak_bytes / 1e9,
+        "threads": torch.get_num_threads(),
+    }
+    sys.stdout.write(json.dumps(line) + "\n")
+
+
+if __name__ == "__main__":
+    task, target = sys.argv[1], Path(sys.argv[2])
+    if task == "write":
+        _write(target)
+    else:
+        _measure(target, _ours if task == "ours" else _diffusers, task)
