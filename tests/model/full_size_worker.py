@@ -72,8 +72,8 @@ def _ours(weights: dict[str, Tensor]) -> Step:
     def step(latents: Tensor, tokens: Tensor) -> Tensor:
         vector = micro_conditioning(*MICRO, config.vector_width).expand(FRAMES, -1)
         per_frame = tokens.repeat_interleave(FRAMES, dim=0)
-        plan = unet.plan(torch.tensor([NOISE_LABEL]), vector, None, per_frame, repeats=BRANCHES)
-        return unet(latents[:, :4], latents[:, 4:], plan.step(0))
+        plan = unet.plan(torch.tensor([NOISE_LABEL]), vector, None, per_frame)
+        return unet(latents[:, :4], latents[:, 4:], *plan.step(0, BRANCHES))
 
     return step
 
