@@ -10,6 +10,7 @@ import msgspec
 import pytest
 import torch
 from live_room import FRAMES, HEIGHT, WIDTH, one_thread, path, room  # noqa: F401  a fixture
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.testing import assert_close
@@ -37,6 +38,7 @@ from gcd_model.geometry import driving_trajectory
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.networks import LiveNetworks, random_networks
+from gcd_model.weights.card import packed, unpacked
 from gcd_model.weights.load import load_weights
 
 
@@ -296,11 +298,10 @@ def test_weights_survive_their_file(tmp_path: Path) -> None:
 def resaved(path: Path, change: Callable[[dict[str, str], dict[str, Tensor]], None]) -> Path:
     save_live(path, LiveNetworks(LIVE_TINY), "mine", overwrite=True)
     tensors = load_file(path)
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-        metadata: dict[str, str] = json.loads(file.read(length))["__metadata__"]
+    with safe_open(path, framework="pt") as file:
+        metadata = unpacked(file.metadata())
     change(metadata, tensors)
-    save_file(tensors, path, metadata=metadata)
+    save_file(tensors, path, metadata=packed(metadata))
     return path
 
 
