@@ -20,7 +20,6 @@ from pathlib import Path
 
 import msgspec
 import torch
-from naming import from_diffusers_unet
 from safetensors.torch import load_file, save_file
 from small_models import draw, give_published_epsilon, randomise
 from torch import Tensor, nn
@@ -30,6 +29,7 @@ from gcd_model.config import SVD_14
 from gcd_model.engines.torch import arrange
 from gcd_model.layers import prepare
 from gcd_model.unet import VideoUNet
+from gcd_model.weights.names import Levels, published_names
 
 FRAMES, HEIGHT, WIDTH, BRANCHES = 14, 32, 48, 2
 MICRO = (12.0, 127.0, 0.02)
@@ -65,7 +65,9 @@ def _ours(weights: dict[str, Tensor]) -> Step:
     config = msgspec.structs.replace(SVD_14.unet, camera_width=0)
     with torch.device("meta"):
         unet = VideoUNet(config, FRAMES)
-    unet.load_state_dict(from_diffusers_unet(weights, unet), assign=True)
+    theirs = {name: published_names(f"unet.{name}", "diffusers", Levels())[0] for name in unet.state_dict()}
+    ours = {name: weights[published.removeprefix("unet/")] for name, published in theirs.items()}
+    unet.load_state_dict(ours, assign=True)
     prepare(unet)
     arrange(unet)
 
