@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from rig import service_manager
 
 from gcd_model.errors import CheckpointError
 from gcd_model.weights.adapter import Adapter, base_digest
-from gcd_model.weights.card import Card
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import write_adapter
 from gcd_node.cli.main import run_app
@@ -218,7 +218,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     layer = next(names).removesuffix(".weight")
     width = state[f"{layer}.weight"].shape[0]
     factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
-    card = Card(name="adapted", config=loaded.networks.config, family=loaded.family.name, move_time=loaded.move_time)
+    card = replace(loaded.card, name="adapted")
     for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
         adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)
         write_adapter(folder / f"{name}.safetensors", adapter, overwrite=False)

@@ -10,14 +10,13 @@ import pytest
 import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip, seen_of
 from msgspec import structs
-from test_start import given
+from test_start import given, write
 
 from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View, load_synthesizer
 from gcd_model.clip import Augmentation, Clip
 from gcd_model.conditioning import SourceFeatures
+from gcd_model.config import SamplingConfig
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
-from gcd_model.weights.card import Card
-from gcd_model.weights.load import save_weights
 from gcd_train.data.pairs import PairedClip
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import (
@@ -155,11 +154,9 @@ SIZE = (16, 32)
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    networks, path = given("none"), tmp_path_factory.mktemp("weights") / "blob.safetensors"
-    sampling = structs.replace(networks.config.sampling, guidance=(1.0, 2.5))
-    config = structs.replace(networks.config, frames=14, height=576, width=1024, sampling=sampling)
-    save_weights(networks, path, Card(name="", config=config, family=None, move_time=config.frames - 1))
-    return path
+    networks, sampling = given("none"), SamplingConfig(guidance=(1.0, 2.5))
+    networks.config = structs.replace(networks.config, frames=14, height=576, width=1024, sampling=sampling)
+    return write(tmp_path_factory.mktemp("weights") / "blob.safetensors", networks)
 
 
 @pytest.fixture(scope="module")
