@@ -58,8 +58,6 @@ _STAGE_HFOV_DEG = math.degrees(2 * math.atan(0.5))
 _DRIVING_HFOV_DEG = 85.0
 _STAGE_STRIDE = 2
 _SMALL_M, _SMALL_DEG = 0.15, 15.0
-_CLEAR_UNITS = 1.0
-"""Cameras keep this far from the sphere about any thing on a stage."""
 _ATTEMPTS = 60
 _SAME_SURFACE = 0.02
 """Depths that differ by less than this share belong to one surface."""
@@ -372,10 +370,5 @@ def _moved_little(random: Random, source: Poses, metres_a_unit: float) -> Poses:
 def _clear(scene: Scene, draw: LiveDraw) -> bool:
     """Whether the cameras keep off all things, and above the lowest sheet."""
     eyes = np.stack([poses[:, :3, 3] for poses in draw.cameras.values()])
-    for thing in scene.objects:
-        middle = thing.positions[draw.steps] + rotations(thing.quaternions[draw.steps]) @ np.array(thing.middle)
-        reach = np.linalg.norm(thing.size) / 2 + _CLEAR_UNITS
-        if bool((np.linalg.norm(eyes - middle, axis=-1) < reach).any()):
-            return False
     floor = min((float(sheet.corners[..., 2].min()) for sheet in scene.sheets), default=0.0)
-    return bool((eyes[..., 2] > floor + 0.4).all())
+    return scene.clear_of_things(eyes, draw.steps) and bool((eyes[..., 2] > floor + 0.4).all())

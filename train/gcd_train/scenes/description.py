@@ -251,6 +251,19 @@ class Scene:
         """T."""
         return self.poses.shape[0]
 
+    def clear_of_things(self, eyes: Doubles, steps: Sequence[int]) -> bool:
+        """Whether cameras at `eyes` [C, S, 3] at time steps [S] keep a unit away from the sphere about any thing.
+
+        Nearer, one thing would fill the picture.
+        """
+        times = list(steps)
+        for thing in self.objects:
+            middle = thing.positions[times] + rotations(thing.quaternions[times]) @ np.array(thing.middle)
+            reach = np.linalg.norm(thing.size) / 2 + 1.0
+            if bool((np.linalg.norm(eyes - middle, axis=-1) < reach).any()):
+                return False
+        return True
+
 
 def upright(rows: NDArray[Any]) -> NDArray[Any]:
     """Bodies that only turn about the vertical: x, y, z, yaw [..., 4] as world_from_body [..., 3, 4]."""

@@ -28,7 +28,7 @@ from gcd_model.geometry import CameraMount
 from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RenderError
 from gcd_train.parallel import map_items, one_thread_each
-from gcd_train.scenes.description import Scene, rotations
+from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
@@ -36,8 +36,6 @@ from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, agree, scene_wor
 
 _ABANDONED_S = 3600.0  # no shard takes so long
 _ATTEMPTS = 100
-_CLEAR_M = 1.0
-"""A camera stays this far from the sphere about any thing; nearer, one thing would fill the picture."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -197,20 +195,10 @@ def orbit_draw(scene: Scene, world: World, seed: int) -> Draw:
     for attempt in range(_ATTEMPTS):
         random = np.random.default_rng([scene_seed, clip, attempt, salt])
         draw = sampling.draw(random, scene.frames, world.fps * world.stride)
-        if _clear(scene, draw):
+        still = np.tile(draw.world_from_source[:3, 3], (len(draw.frame_numbers), 1))
+        if scene.clear_of_things(np.stack([still, draw.world_from_target[:, :3, 3]]), draw.frame_numbers):
             return draw
     raise RenderError(f"{world.name} scene {scene_seed}: no path leaves the cameras clear of all things; skip it")
-
-
-def _clear(scene: Scene, draw: Draw) -> bool:
-    steps = list(draw.frame_numbers)
-    eyes = np.stack([np.tile(draw.world_from_source[:3, 3], (len(steps), 1)), draw.world_from_target[:, :3, 3]])
-    for thing in scene.objects:
-        middle = thing.positions[steps] + rotations(thing.quaternions[steps]) @ np.array(thing.middle)
-        reach = np.linalg.norm(thing.size) / 2 + _CLEAR_M
-        if bool((np.linalg.norm(eyes - middle, axis=-1) < reach).any()):
-            return False
-    return True
 
 
 def _orbit(draw: Draw) -> Orbit:
