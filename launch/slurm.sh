@@ -7,7 +7,7 @@
 #SBATCH --time=24:00:00
 #SBATCH --signal=TERM@300
 #SBATCH --open-mode=append
-# Any `gcd-train` command on a Slurm cluster: `train` and `distill` by torchrun, one process a GPU on every node;
+# Any `gcd-train` command on a Slurm cluster: `train` by torchrun, one process a GPU on every node;
 # what takes --ray (generate, data compact, cache, evaluate) on a Ray cluster of the job's nodes. Stopped or out of time,
 # the same line goes on. Folders must be seen by all nodes; gcd-train must be on PATH, for Ray with the extra `cluster`.
 #
@@ -28,7 +28,7 @@ PORT=${PORT:-$((20000 + JOB % 20000))}
 HEAD=$(scontrol show hostnames "${SLURM_JOB_NODELIST:-$(hostname)}" | head -n 1)
 
 case ${1:?a gcd-train command} in
-train | distill)
+train)
   exec srun torchrun --nnodes "$NODES" --nproc-per-node "$GPUS" --rdzv-backend c10d --rdzv-id "$JOB" \
     --rdzv-endpoint "$HEAD:$PORT" -m gcd_train "$@"
   ;;

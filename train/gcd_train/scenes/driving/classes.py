@@ -1,4 +1,4 @@
-"""The driving world's classes: our ids, what the packaged model's class head calls them, and ParallelDomain-4D's."""
+"""The driving world's classes: our ids, what the models' ontology calls them, and ParallelDomain-4D's."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 class Label(IntEnum):
     """What a pixel shows.
 
-    The first thirteen are the ontology of the class head (`gcd_model.DRIVING_CLASSES`), in its order; the others tell
+    The first thirteen are the models' ontology (`gcd_model.config.DRIVING_CLASSES`), in its order; the others tell
     apart what that one calls alike.
     """
 
@@ -55,7 +55,7 @@ _ROAD_USERS = {
 
 
 def coarse(label: int) -> int:
-    """What the packaged model's class head calls a label; the thirteen that it knows stay."""
+    """What the models' ontology calls a label; the thirteen that it knows stay."""
     return _COARSE.get(label, label)
 
 

@@ -93,7 +93,7 @@ def driving_drive(seed: int, frames: int = 50) -> Scene:
 def driving_scene(
     seed: int, *, frames: int = 14, mount: CameraMount | None = None, move_time: int | None = None
 ) -> Scene:
-    """A scene for pairs, seen by a source and a target camera that ride on the vehicle, in the class head's thirteen
+    """A scene for pairs, seen by a source and a target camera that ride on the vehicle, in the models' thirteen
     classes; the arguments decide it all.
 
     Args:
