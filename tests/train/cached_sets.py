@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from gcd_train.data.cache import CacheIdentity, ClipPlan, FrozenEncoders, SceneShard, only_writer
-from gcd_train.data.cache_writer import CacheJob, EncoderChoice, cache_scenes, load_encoders
+from gcd_train.data.cache_writer import CacheJob, EncoderChoice, cache_scenes, load_encoders, missing_scenes
 from gcd_train.errors import DataError
 from gcd_train.parallel import Outcome
 
@@ -72,7 +72,7 @@ def cached(folder: Path, pictures: FakePictures | None = None, **identity: objec
     pictures = pictures or FakePictures()
     job = CacheJob(folder=folder, pictures=pictures, choice=CHOICE, identity=tiny_identity(**identity))  # pyright: ignore[reportArgumentType]
     with only_writer(folder):
-        return list(cache_scenes(job, pictures.scenes))
+        return list(cache_scenes(job, missing_scenes(job, pictures.scenes)))
 
 
 # a child that kills itself at the n-th time something settles on the disk

@@ -60,6 +60,7 @@ def test_recipes_are_listed_whole_and_one_is_shown_with_all_it_says() -> None:
         (["train", "package:distill-kubric"], 78, "kubric_gradual_max90.ckpt"),
         (["train", "package:tabletop", "--small", "--set=unet.clip_bath=2"], 78, "clip_batch"),
         (["train", "package:tabletop", "--small"], 66, "none"),
+        (["train", "package:live-small"], 78, "give --valid"),
         (["evaluate", "--no-baselines"], 66, "no[where]"),
     ],
 )
@@ -67,6 +68,7 @@ def test_what_is_wrong_is_one_line_and_an_exit_code(tmp_path: Path, words: list[
     data = tmp_path / ("no[where]" if words[0] == "evaluate" else "none")
     found, output = ran(*words, f"--data={data}", f"--out={tmp_path / 'out'}")
     assert (found, said in output) == (code, True), output
+    assert code != 78 or not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("of the device"), RuntimeError("can't allocate memory")])

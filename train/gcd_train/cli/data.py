@@ -28,6 +28,7 @@ from gcd_train.data.cache_writer import (
     cache_scenes,
     identity_of,
     load_encoders,
+    missing_scenes,
 )
 from gcd_train.data.compact import Compaction
 from gcd_train.data.dataset4d import Dataset4D
@@ -259,7 +260,10 @@ def _cached_set(
 def _cache(job: CacheJob, workers: int, ray: str | None) -> None:
     folder, scenes, failed = job.folder, job.pictures.scenes, 0
     with only_writer(folder), progress_bar("scenes", len(scenes), keep=True) as show:
-        for number, outcome in enumerate(cache_scenes(job, scenes, workers=workers, ray_address=ray), start=1):
+        missing = missing_scenes(job, scenes)
+        show(there := len(scenes) - len(missing))
+        outcomes = cache_scenes(job, missing, workers=workers, ray_address=ray)
+        for number, outcome in enumerate(outcomes, start=there + 1):
             if outcome.value is None:
                 failed += 1
                 say(f"{outcome.item}  left out: {outcome.error}")

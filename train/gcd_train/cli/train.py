@@ -101,9 +101,10 @@ def _stop_when_asked() -> Event:
 
 
 def _train_live(recipe: LiveRecipe, places: "DataPlaces", out: Path, processes: "Processes") -> None:
-    from gcd_train.live.training import train_live
+    from gcd_train.live.training import train_live, valid_folder
     from gcd_train.training.monitor import RunFolder
 
+    valid_folder(places)
     folder = RunFolder(out)
     with folder.begun(recipe, command_line()) if processes.first else nullcontext():
         train_live(recipe, places, folder, _stop_when_asked(), processes)
@@ -193,9 +194,9 @@ def merge(
 ) -> None:
     """Join an adapter with its base to plain weights. OUT appears whole or not at all."""
     with errors_shown():
-        wanted = None if dtype is None else precision(dtype)
         from gcd_train.training.setup import loaded_base
 
+        wanted = None if dtype is None else precision(dtype)
         given = read_adapter(adapter)
         start = loaded_base(str(base), given.card.diffusion)
         joined = load_adapted(start, given)

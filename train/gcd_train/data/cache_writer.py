@@ -238,16 +238,21 @@ def identity_of(
     )
 
 
-def cache_scenes(
-    job: CacheJob, scenes: Sequence[str], *, workers: int = 1, ray_address: str | None = None
-) -> Iterator[Outcome[str, SceneShard]]:
-    """Make the shards that are missing or damaged; each scene ends in the index or is reported with its error.
+def missing_scenes(job: CacheJob, scenes: Sequence[str]) -> list[str]:
+    """Those whose shards are missing or damaged. The caller holds `only_writer`.
 
-    The caller holds `only_writer`. Raises: RunError if the folder holds another cache or cannot be written.
+    Raises: RunError if the folder holds another cache or cannot be written.
     """
     index = _begun(job)
-    todo = [scene for scene in scenes if scene not in index.scenes]
-    for outcome in map_items(job, todo, workers=workers, ray_address=ray_address):
+    return [scene for scene in scenes if scene not in index.scenes]
+
+
+def cache_scenes(
+    job: CacheJob, missing: Sequence[str], *, workers: int = 1, ray_address: str | None = None
+) -> Iterator[Outcome[str, SceneShard]]:
+    """Make the shards of `missing_scenes`; each scene ends in the index or is reported with its error."""
+    index = read_index(job.folder, CacheIndex) or CacheIndex(identity=job.identity)
+    for outcome in map_items(job, missing, workers=workers, ray_address=ray_address):
         if outcome.value is not None:
             scenes_now = sorted({**index.scenes, outcome.item: outcome.value}.items())
             index = msgspec.structs.replace(index, scenes=dict(scenes_now))

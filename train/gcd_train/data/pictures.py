@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from gcd_train.scenes.frozen import FrozenScene
     from gcd_train.scenes.renderer import Renderer, Rendering
 
-Number = TypeVar("Number", bound=np.generic)
 Doubles = NDArray[np.float64]
 Modality = Literal["rgb", "classes"]
 

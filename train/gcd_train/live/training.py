@@ -54,6 +54,13 @@ _DOUBT = 1.1
 """A source counts as another world's from so many times the highest score of a held-out clip."""
 
 
+def valid_folder(data: DataPlaces) -> Path:
+    """That of the held-out clips. Raises: RecipeError if none is given."""
+    if data.valid is None:
+        raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
+    return data.valid
+
+
 def train_live(
     recipe: LiveRecipe, data: DataPlaces, folder: RunFolder, stop: Event, processes: Processes = ALONE
 ) -> Path:
@@ -67,9 +74,7 @@ def train_live(
         RecipeError: no folder of held-out clips, or an update's parts cannot be shared.
         Interrupted: `stop` was set; the state is saved.
     """
-    if data.valid is None:
-        raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
-    held_out = clip_paths(data.valid)
+    held_out = clip_paths(valid_folder(data))
     _require_fit(recipe, training_paths(data.data), held_out)
     device = Precision.of(ComputeRecipe(device=recipe.device)).device
     torch.manual_seed(recipe.seed)
