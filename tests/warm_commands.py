@@ -85,7 +85,7 @@ def _import_what_commands_import() -> None:
     train.new_app(train.COMMANDS)
     for name in ("check", "image_io", "demo", "viewer.server"):
         import_module(f"gcd_node.{name}")
-    for name in ("evaluation.report", "look.gallery", "look.open_scene", "training.run"):
+    for name in ("evaluation.report", "look.gallery", "look.show", "training.run"):
         import_module(f"gcd_train.{name}")
 
 
