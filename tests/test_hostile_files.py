@@ -16,7 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import msgspec
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -25,6 +27,7 @@ from warm_commands import LIMIT_MB, LIMIT_S, WarmCommands
 from gcd_model.config import PLAIN_SMALL
 from gcd_model.weights.card import Card
 from gcd_node.auth import new_key_pair, write_key_pair
+from gcd_train.data.parallel_domain4d import frame_path
 from gcd_train.evaluation.store import RunNote
 
 pytestmark = pytest.mark.timeout(900)
@@ -158,6 +161,15 @@ def folders(*names: str) -> Prepare:
 DRIVING = ("rgb/yaw-0", "rgb/camera0", "calibration", "ontology")
 driving_scene = folders(*(f"scene_000000/{name}" for name in DRIVING))
 labelled_scene = folders(*(f"scene_000000/{name}" for name in (*DRIVING, "semantic_segmentation_2d")))
+
+
+def pictured_scene(here: Path) -> None:
+    """Its first picture is read before the calibration."""
+    driving_scene(here)
+    path = frame_path(here / "scene_000000", "yaw-0", "rgb", 0)
+    path.write_bytes(cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+
+
 NOTE = RunNote(
     command="x", made="x", versions={}, data=(), data_identity="x", kind="orbit", modality="rgb", protocol="pairs",
     frames=4, height=8, width=8, seed=0, methods={"copy": {}},
@@ -225,7 +237,7 @@ TEXT_DOORS = {
     "scene_manifest": Door("json", "scn00000/gcd-manifest.json", "gcd-train verify scn00000", KUBRIC),
     "kubric_metadata": Door("json", "scn00000/scn00000_p0_v4.json", "gcd-train show scn00000", KUBRIC),
     "driving_ontology": Door("json", "scene_000000/ontology/ontology.json", PARALLEL, labelled_scene),
-    "driving_calibration": Door("json", "scene_000000/calibration/calibration.json", PARALLEL, driving_scene),
+    "driving_calibration": Door("json", "scene_000000/calibration/calibration.json", PARALLEL, pictured_scene),
     "run_note": Door("json", "run/run.json", REPORT, folders("run")),
     "run_record": Door("json", "run/records/copy/clip.json", REPORT, noted_run),
     "controls": Door("json", "controls.json", f"{EVALUATE} --controls controls.json", folders("scenes/scn00000")),
