@@ -17,12 +17,11 @@ PACKAGES = {
     "gcd_train": ROOT / "train" / "gcd_train",
 }
 SOCKET_FILES = {"publisher.py", "control.py", "auth.py", "sources/push.py"}
-MOST_LINES = {"gcd_client": 1383}
-"""May only fall. It rose once, by what pushes frames (frames.py)."""
 OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "write_text", "write_bytes"}
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
+    ("client/gcd_client", 7, 1_383),
     ("model/gcd_model", 47, 10_189),
     ("tests/model", 42, 6_826),
     ("gcd_node", 59, 13_502),
@@ -31,6 +30,7 @@ MOST = [
     ("tests/train", 77, 13_948),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
+MOST_DOCS, MOST_README = (14, 1_900), 90
 
 
 def files(package: str) -> list[Path]:
@@ -149,11 +149,6 @@ def test_the_client_stands_alone_on_every_system() -> None:
     assert offenders(files("gcd_client"), "cv2", "asyncio", "zmq.asyncio", top_level_only=True) == []
 
 
-@pytest.mark.parametrize("package", MOST_LINES)
-def test_a_package_only_shrinks(package: str) -> None:
-    assert sum(len(path.read_text().splitlines()) for path in files(package)) <= MOST_LINES[package]
-
-
 def test_nothing_imports_launch_tools_or_tests() -> None:
     everything = [path for package in PACKAGES for path in files(package)]
     scripts = [path.stem for path in (ROOT / "tools").glob("*.py")]
@@ -167,6 +162,13 @@ def test_what_is_to_shrink_does_not_grow(folder: str, most_files: int, most_line
     paths = list((ROOT / folder).rglob("*.py"))
     lines = sum(len(path.read_text().splitlines()) for path in paths)
     assert (len(paths) <= most_files, lines <= most_lines) == (True, True), f"{len(paths)} files, {lines} lines"
+
+
+def test_the_documentation_is_read_in_half_an_hour() -> None:
+    pages = [len(path.read_text().splitlines()) for path in (ROOT / "docs").glob("*.md")]
+    assert len(pages) <= MOST_DOCS[0]
+    assert sum(pages) <= MOST_DOCS[1]
+    assert len((ROOT / "README.md").read_text().splitlines()) <= MOST_README
 
 
 def test_functions_fit_a_screen() -> None:
