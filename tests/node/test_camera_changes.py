@@ -19,8 +19,7 @@ from gcd_client.protocol import EndMessage, StatusMessage, ViewMessage, decode
 from gcd_client.subscriber import ReceivedView
 from gcd_model import RenderOptions
 from gcd_node.errors import SourceLostError
-from gcd_node.sources import OakSource, SourceConfig
-from gcd_node.sources.live import LiveCamera
+from gcd_node.sources import OakSource
 
 GUARD_S = 30.0
 WHOLE, HALF, SQUARE, TINY = (384, 256), (192, 128), (256, 256), (48, 32)
@@ -143,30 +142,6 @@ def test_a_camera_that_returns_too_slow_is_refused_and_the_next_one_taken(tmp_pa
         lose(rig, slow, 2)
         view_of(rig, bench.plug(Even()), 2)
     assert len({view.header.src.epoch for view in rig.of()}) == 2  # none of what was refused
-
-
-def test_a_node_can_be_stopped_and_started_while_its_camera_takes_for_ever_to_open(tmp_path: Path) -> None:
-    first, late, answer = Even(), Even(), threading.Event()
-    asked: list[SourceConfig] = []
-
-    def open_source(config: SourceConfig) -> LiveCamera:
-        asked.append(config)
-        if len(asked) == 2:
-            return LiveCamera("slow", lambda: answer.wait(60), open_timeout_s=60.0, hint="wait")
-        return first if len(asked) == 1 else late
-
-    with Rig(tmp_path, open_source) as rig:
-        rig.await_state("active")
-        view_of(rig, first, 0)
-        lose(rig, first)
-        until(lambda: len(asked) == 2)
-        assert rig.ask("deactivate").code is Code.ACCEPTED
-        rig.await_state("inactive")
-        assert rig.ask("activate").code is Code.ACCEPTED
-        rig.await_state("active")
-        view_of(rig, late, 2)
-        answer.set()
-    assert not rig.node.left_behind
 
 
 @pytest.mark.parametrize("stated", [None, "192.168.1.20"])

@@ -30,11 +30,11 @@ from cameras import (
     flat,
     pushing,
     ramp,
+    serving,
     until,
     write_pictures,
     write_video,
 )
-from rtsp_server import serving, write_transport_stream
 
 from gcd_client import FramePusher
 from gcd_node.errors import SourceAbsentError, SourceError
@@ -108,9 +108,9 @@ def open_v4l2_camera(folder: Path, slow: bool) -> Generator[Opened]:
 
 @contextmanager
 def open_rtsp(folder: Path, slow: bool) -> Generator[Opened]:
-    with serving(write_transport_stream(folder / "live.ts", [RED] * 600)) as server:
-        source = open_source(RtspSource(url=server.url, open_timeout_s=OPEN_S))
-        with closing(source, server.stall) as opened:
+    with serving([RED] * 600) as (url, awake):
+        source = open_source(RtspSource(url=url, open_timeout_s=OPEN_S))
+        with closing(source, awake.clear) as opened:
             yield opened
 
 
