@@ -19,7 +19,7 @@ from cameras import Bench, Camera, environment, flat, pushing, until, write_vide
 from fakes import FakeSynthesizer, painting_traits
 from msgspec.structs import replace
 from rig import Rig
-from wire_messages import class_map, depth, visibility
+from wire_messages import class_map, depth, received, visibility
 
 from gcd_client import AuthError, ClientKeys, FramePusher
 from gcd_client.frames import encode_frame
@@ -207,11 +207,6 @@ def test_the_planner_follows_a_node_to_its_end_and_into_its_next_life(tmp_path: 
     awareness.close()
 
 
-def arrived(message: Any, **how: object) -> ReceivedView:
-    said = {"age_ms": message.header.age_ms, "expired": False, "skipped": 0, "restarted": False, **how}
-    return ReceivedView(message=message, **said)
-
-
 class Scripted:
     """A subscriber that gives what a test lists, or leaves out a stale view."""
 
@@ -231,10 +226,10 @@ def test_the_planner_drops_what_is_stale_late_or_of_another_epoch(tmp_path: Path
     message = class_map(drawn=np.ones((14, 4, 6), np.uint8))
     message = replace(message, header=replace(message.header, classes=classes))
     src = replace(message.header.src, epoch=message.header.src.epoch + 1)
-    good, jumped = arrived(message), arrived(replace(message, header=replace(message.header, src=src)))
+    good, jumped = received(message), received(replace(message, header=replace(message.header, src=src)))
     awareness = planner()["Awareness"](f"ipc://{tmp_path}/data", "main")
     awareness.close()
-    awareness._views = Scripted(good, None, "stale", good, jumped, arrived(message, expired=True))
+    awareness._views = Scripted(good, None, "stale", good, jumped, received(message, expired=True))
     assert awareness.poll() is good
     assert awareness.poll() is good  # nothing new, and not run out yet
     assert awareness.poll() is None
@@ -253,7 +248,7 @@ def seen_by(vis: np.ndarray, inverse: np.ndarray, **header: object) -> list[Rece
     messages = visibility(seen=vis), depth(inverse=inverse.astype("<f2"))
     changes = {"source_from_view": (tuple(pose.ravel().tolist()),) * 2, "pose_units": "m"}
     changes["quality"] = replace(messages[0].header.quality, ood=())
-    return [arrived(replace(each, header=replace(each.header, **changes | header))) for each in messages]
+    return [received(replace(each, header=replace(each.header, **changes | header))) for each in messages]
 
 
 def test_obstacles_are_what_was_seen_now_where_it_was_and_never_of_two_windows(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from gcd_node.publisher import Publisher
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs the Python package selenium, of the extra `dev`")
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.timeout(120),
     pytest.mark.skipif(not CHROMIUM.exists(), reason="needs the Debian package chromium"),
     pytest.mark.skipif(not DRIVER.exists(), reason="needs the Debian package chromium-driver"),

@@ -15,10 +15,9 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console, RenderableType
-from wire_messages import BOOT, CLASSES, class_map, depth, end, numbers, origin, pixels, visibility, window
+from wire_messages import BOOT, CLASSES, class_map, depth, end, numbers, origin, pixels, received, visibility, window
 
 from gcd_client.protocol import EndMessage, OriginHeader, StatusMessage, StatusTopic, ViewMessage
-from gcd_client.subscriber import ReceivedView
 from gcd_model import hatched
 from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
@@ -43,10 +42,6 @@ def text_of(renderable: RenderableType, width: int = 140) -> str:
 
 
 # Views.
-
-
-def received(message: ViewMessage, *, skipped: int = 0) -> ReceivedView:
-    return ReceivedView(message=message, age_ms=40.0, expired=False, skipped=skipped, restarted=False)
 
 
 def read_video(path: Path) -> np.ndarray:
