@@ -5,6 +5,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import re
 import subprocess
 import threading
 import time
@@ -178,14 +179,13 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
         assert rig.ask("record_stop").code is Code.WRONG_STATE
         assert rig.client.request("record_start", dry_run=True).code is Code.OK
         assert not folder.exists()
-        assert rig.ask("record_start").code is Code.ACCEPTED
+        assert [rig.ask("record_start").code for _ in range(2)] == [Code.ACCEPTED, Code.WRONG_STATE]
         begun = rig.await_event("REC_STARTED")
-        assert rig.ask("record_start").code is Code.WRONG_STATE
         camera.run(28)
         rig.await_views(2)
         status = rig.await_status(lambda status: status["rec"].get("written", 0) >= 2 * 28)
-        rig.ask("set_view", {"view": "main", "azimuth_deg": 20.0})
-        rig.ask("set_view", {"view": "main", "azimuth_deg": 900.0})
+        for azimuth_deg in (20.0, 900.0):
+            rig.ask("set_view", {"view": "main", "azimuth_deg": azimuth_deg})
         rig.ask("state")
         assert rig.ask("record_stop").code is Code.ACCEPTED
         stopped = rig.await_event("REC_STOPPED")
@@ -193,20 +193,20 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
         assert rig.ask("record_start").code is Code.ACCEPTED
         rig.await_event("REC_STARTED", 2)
     first, second = files(folder)
-    assert begun["file"] == f"{first.parent.name}/{first.name}"
-    assert (status["rec"]["state"], status["rec"]["file"]) == ("recording", begun["file"])
+    name = f"{first.parent.name}/{first.name}"
+    assert (begun["file"], status["rec"]["file"], status["rec"]["state"]) == (name, name, "recording")
     assert status["rec"]["dropped"] == {}
-    assert (stopped["reason"], stopped["finished"], stopped["level"]) == ("ASKED", True, 0)
     heard = said(first)
-    assert (stopped["bytes"], stopped["written"]) == (first.stat().st_size, len(heard))
-    told = [(each.told["verb"], each.told["role"], each.told["code"]) for each in of(heard, "/gcd/command")]
-    assert told == [  # no questions
+    ending = [stopped[key] for key in ("reason", "finished", "level", "bytes", "written")]
+    assert ending == ["ASKED", True, 0, first.stat().st_size, len(heard)]
+    commands = [each.told for each in of(heard, "/gcd/command")]
+    assert [(each["verb"], each["role"], each["code"]) for each in commands] == [  # no questions
         ("record_start", "operator", "ACCEPTED"),
         ("record_start", "operator", "WRONG_STATE"),
         ("set_view", "operator", "OK"),
         ("set_view", "operator", "OUT_OF_RANGE"),
     ]
-    assert of(heard, "/gcd/command")[-1].told["args"] == {"view": "main", "azimuth_deg": 900.0}
+    assert commands[-1]["args"] == {"view": "main", "azimuth_deg": 900.0}
     assert "VIEW_SET" in [each.told["code"] for each in of(heard, "/gcd/event")]
     assert rig.events("REC_STOPPED")[1]["reason"] == "SHUTDOWN"
     assert said(second)
@@ -215,7 +215,6 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
     assert [each.sequence for each in inputs] == list(range(3, 31))
     assert all(before_ns <= each.stamp_ns == each.log_ns <= time.time_ns() for each in inputs)
     assert all(abs(b.stamp_ns - a.stamp_ns - SECOND_NS / FPS) <= 1_000_000 for a, b in pairwise(inputs))
-    assert views
     assert {each.stamp_ns for each in views} <= set(captured_ns)
     by_number = {each.sequence: each.stamp_ns for each in of(heard, "/src/image")}
     near = [abs(each.stamp_ns - by_number[each.sequence]) for each in views if each.sequence in by_number]
@@ -265,6 +264,7 @@ def record_for_ever(folder: Path) -> None:
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_after_kill_9_everything_written_is_readable_and_plays(tmp_path: Path) -> None:
     recorder = multiprocessing.get_context("spawn").Process(target=record_for_ever, args=(tmp_path,))
     recorder.start()
@@ -388,6 +388,7 @@ def test_what_cannot_be_written_is_counted_and_the_rest_goes_on(
 
 
 Run: TypeAlias = tuple[list[Said], Box, Path]
+PICTURES = ("image", "camera_info", "classes", "std", "visibility", "depth")
 
 
 @pytest.fixture(scope="module")
@@ -405,8 +406,7 @@ def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(whole: Run) 
     heard, _, path = whole
     counts, found = Counter(each.topic for each in heard), summary(path)
     assert {each.topic: found.statistics.channel_message_counts[key] for key, each in found.channels.items()} == counts
-    pictures = ("image", "camera_info", "classes", "std", "visibility", "depth")
-    wanted = {"/src/image": 30, "/src/camera_info": 30, "/tf": 2} | {f"/view/main/{name}": 28 for name in pictures}
+    wanted = {"/src/image": 30, "/src/camera_info": 30, "/tf": 2} | {f"/view/main/{name}": 28 for name in PICTURES}
     wanted |= {f"/view/main/{name}": 2 for name in ("header", "std_header", "age_ms")}
     assert {name: counts[name] for name in counts if not name.startswith(("/gcd", "/diag"))} == wanted
     assert counts["/gcd/status"] == counts["/diagnostics"] > 0
@@ -421,17 +421,13 @@ def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(whole: Run) 
 
 def test_stamps_are_those_of_the_capture_and_numbers_those_of_the_source(whole: Run) -> None:
     heard, box, _ = whole
-    inputs, views = of(heard, "/src/image"), of(heard, "/view/main/image")
-    assert [each.stamp_ns for each in inputs] == [round(i * 1e8) for i in range(30)]
-    assert [each.sequence for each in inputs] == list(range(30))
-    headers = [message.header for message in box.of("win")]
-    assert [each.stamp_ns for each in views] == [stamp for header in headers for stamp in header.t_capture_ns]
-    assert [each.sequence for each in views] == [number for header in headers for number in header.src.seq]
-    for topic in ("classes", "std", "camera_info"):
-        assert [each.stamp_ns for each in of(heard, f"/view/main/{topic}")] == [each.stamp_ns for each in views]
-    assert [each.stamp_ns for each in of(heard, "/src/camera_info")] == [each.stamp_ns for each in inputs]
-    assert {each.publish_ns for each in views} == {header.t_publish_ns for header in headers}
-    assert all(abs(each.log_ns - time.time_ns()) < 600 * SECOND_NS for each in heard)
+    topics = dict.fromkeys(("/src/image", "/src/camera_info"), 30) | {f"/view/main/{name}": 28 for name in PICTURES}
+    for topic, number in topics.items():
+        found = of(heard, topic)
+        assert [(each.stamp_ns, each.sequence) for each in found] == [(round(i * 1e8), i) for i in range(number)]
+        assert all(abs(each.log_ns - time.time_ns()) < 600 * SECOND_NS for each in found)
+    sent_ns = {message.header.t_publish_ns for message in box.of("win")}
+    assert {each.publish_ns for each in of(heard, "/view/main/image")} == sent_ns
 
 
 def test_pictures_and_maps_are_what_was_seen_and_published(whole: Run) -> None:
@@ -539,21 +535,12 @@ def test_camera_info_says_what_is_known_of_the_camera_and_a_replay_knows_as_much
 
 
 def test_the_layout_that_ships_shows_topics_that_are_recorded(whole: Run) -> None:
-    layout = json.loads((Path(__file__).parents[2] / "launch" / "foxglove-layout.json").read_text())
-    panels = layout["configById"]
-
-    def shown(node: Any) -> list[str]:
-        return [node] if isinstance(node, str) else [*shown(node["first"]), *shown(node["second"])]
-
-    assert sorted(shown(layout["layout"])) == sorted(panels)
-    modes = [panel["imageMode"] for panel in panels.values() if "imageMode" in panel]
-    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
-    named = {mode[key] for mode in modes for key in ("imageTopic", "calibrationTopic") if key in mode}
-    named |= {path.split(".")[0] for path in paths}
-    named |= {panel[key] for panel in panels.values() for key in ("topicToRender", "topicPath") if key in panel}
+    layout = (Path(__file__).parents[2] / "launch" / "foxglove-layout.json").read_text().replace("/topdown/", "/main/")
+    topics = {each.topic for each in whole[0]}
+    named = set(re.findall(r'"(/\w[\w/]+)', layout))
     assert len(named) >= 8
-    assert {name.replace("/topdown/", "/main/") for name in named} <= {each.topic for each in whole[0]}
+    assert named <= topics
     parts = {status.name for each in of(whole[0], "/diagnostics") for status in each.value.status}
-    drawn = {path.split('"')[1] for path in paths if "name==" in path}
-    assert drawn == {"gcd: node", "gcd: source", "gcd: model", "gcd: rec"}
-    assert drawn <= parts
+    assert (
+        set(re.findall(r'name==\\"([^\\]+)', layout)) == {"gcd: node", "gcd: source", "gcd: model", "gcd: rec"} <= parts
+    )
