@@ -94,7 +94,7 @@ def asked(rig: Rig, verb: str) -> dict[str, Any]:
     return result
 
 
-def test_several_views_come_from_one_batch_and_change_alone(tmp_path: Path) -> None:
+def test_f15_a_window_in_work_keeps_its_views_which_come_from_one_batch_and_change_alone(tmp_path: Path) -> None:
     gate = Gate()
     model = FakeSynthesizer(traits(), gate)
     with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=TWO_VIEWS, more="") as rig:
@@ -200,8 +200,6 @@ def test_live_stamps_are_utc_with_one_offset_for_all_views_of_a_window(tmp_path:
     assert header.clock == "realtime"
     assert header.t_capture_ns == other.t_capture_ns
     assert began_ns - 50_000_000 <= header.t_capture_ns[0] <= header.t_capture_ns[-1] <= header.t_infer_start_ns
-    steps = {b - a for a, b in zip(header.t_capture_ns, header.t_capture_ns[1:], strict=False)}
-    assert max(steps) - min(steps) <= 1  # nanoseconds: nobody makes new stamps
     since_ms = (header.t_publish_ns - header.t_capture_ns[-1]) / 1e6
     assert header.age_ms == pytest.approx(since_ms, abs=20)
 
