@@ -1,7 +1,7 @@
 """Each row of the failure table as a test named after it, through real sockets: `pytest tests/node -k f9_`.
 
-F5, F6, F9, F20, F23 and F25 are in test_fault_processes.py, F7 in test_camera_changes.py, F16 to F19 with control and
-security, F15 in test_node_life.py, F22 in test_recorder.py.
+F5, F9, F23 and F25 are in test_fault_processes.py, F6 in test_source_conformance.py, F7 in test_camera_changes.py, F15
+in test_node_life.py, F16 to F19 with control and security, F20 in test_publisher.py, F22 in test_recorder.py.
 """
 
 import gc

@@ -344,7 +344,7 @@ def test_a_video_cut_short_gives_what_is_left_and_says_so(tmp_path: Path, caplog
     assert "truncated" in caplog.text
 
 
-def test_a_bad_video_is_refused_in_one_line_when_it_is_opened(tmp_path: Path) -> None:
+def test_f6_a_bad_video_is_refused_in_one_line_when_it_is_opened(tmp_path: Path) -> None:
     whole = write_video(tmp_path / "whole.mp4", ramp(10)).read_bytes()
     data_at = whole.index(b"mdat") + 4
     data_end = data_at - 8 + int.from_bytes(whole[data_at - 8 : data_at - 4], "big")
