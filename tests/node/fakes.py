@@ -196,7 +196,6 @@ class Box:
     views: list[ViewMessage] = field(default_factory=list)
     ends: list[EndMessage] = field(default_factory=list)
     notes: list[tuple[str, Mapping[str, Any]]] = field(default_factory=list)
-    hurried: bool = False
 
     def send(self, message: ViewMessage) -> bool:
         self.views.append(message)
@@ -212,7 +211,7 @@ class Box:
         self.views.append(made())
 
     def stop_waiting(self) -> None:
-        self.hurried = True
+        """It never waits."""
 
     @property
     def stats(self) -> PublisherStats:

@@ -443,6 +443,7 @@ for path in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_hostile_logs_are_refused_in_one_line_in_time_and_memory(tmp_path: Path) -> None:
     paths = [tmp_path / f"{number}.mcap" for number in range(len(HOSTILE))]
     for path, content in zip(paths, HOSTILE.values(), strict=True):

@@ -19,8 +19,6 @@ import numpy as np
 import pytest
 from cameras import Bench, Camera, environment, until
 from fakes import fake_config
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from msgspec.structs import replace
 from rig import Rig
 from viewer_clients import (
@@ -43,7 +41,6 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from wire_messages import class_map, depth, jpeg_window, pixels, received, visibility, window
 
 from gcd_client.images import colours, decode_jpegs, images
-from gcd_client.protocol import MessageError
 from gcd_node.auth import Role, new_key_pair, write_key_pair
 from gcd_node.config import PublishConfig
 from gcd_node.errors import ConfigError, EndpointError
@@ -51,7 +48,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
 from gcd_node.viewer import feed as feed_module
 from gcd_node.viewer import server as server_module
-from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, parse_request, picture
+from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, picture
 from gcd_node.viewer.server import HEADERS, MOST_BROWSERS, ViewerServer, load_page
 
 
@@ -59,13 +56,6 @@ from gcd_node.viewer.server import HEADERS, MOST_BROWSERS, ViewerServer, load_pa
 def viewer(tmp_path: Path) -> Iterator[ViewerServer]:
     with viewer_of(tmp_path) as opened:
         yield opened
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.text(max_size=80) | st.binary(max_size=80))
-def test_what_is_no_request_of_the_page_is_refused(text: str | bytes) -> None:
-    with pytest.raises(MessageError):
-        parse_request(text)
 
 
 def silent_browser() -> Browser:
