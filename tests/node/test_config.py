@@ -79,19 +79,16 @@ def test_launch_files_know_the_models_qualities_and_solvers() -> None:
 # Changes, and text again.
 
 
-@pytest.mark.parametrize(
-    ("url", "shown"),
-    [
+def test_passwords_are_not_printed() -> None:
+    for url, shown in (
         ("rtsp://me:secret@host:554/a?token=secret", "rtsp://me:***@host:554/a?***"),
         ("rtsp://host/a", "rtsp://host/a"),
         ("rtsp://me:sec@ret@host/a", "rtsp://me:***@host/a"),
-    ],
-)
-def test_passwords_are_not_printed(url: str, shown: str) -> None:
-    text = MINIMAL.replace(PATH, 'kind = "rtsp"')
-    printed = to_toml(parsed(text, f"source.url={url}"))
-    assert f'url = "{shown}"' in printed
-    assert "secret" not in printed
+    ):
+        text = MINIMAL.replace(PATH, 'kind = "rtsp"')
+        printed = to_toml(parsed(text, f"source.url={url}"))
+        assert f'url = "{shown}"' in printed
+        assert "secret" not in printed
 
 
 def test_changes_are_read_as_toml_and_else_as_text() -> None:
@@ -130,9 +127,8 @@ def digest(*changes: str, made: Traits = STEERED) -> str:
     return config_digest(parsed(MINIMAL, *changes), made)
 
 
-@pytest.mark.parametrize(
-    ("made", "written_out"),
-    [
+def test_a_default_that_is_written_out_and_where_it_goes_change_nothing() -> None:
+    for made, written_out in (
         (STEERED, f"model.steps={STEERED.config.sampling.steps}"),
         (STEERED, f"model.guidance={list(STEERED.config.sampling.guidance)}"),
         (STEERED, f"model.move_time={STEERED.move_time}"),
@@ -148,15 +144,12 @@ def digest(*changes: str, made: Traits = STEERED) -> str:
         (STEERED, "publish.data=tcp://127.0.0.1:1"),
         (STEERED, "model.device=cpu"),
         (STEERED, "model.dtype=float32"),
-    ],
-)
-def test_a_default_that_is_written_out_and_where_it_goes_change_nothing(made: Traits, written_out: str) -> None:
-    assert digest(written_out, made=made) == digest(made=made)
+    ):
+        assert digest(written_out, made=made) == digest(made=made)
 
 
-@pytest.mark.parametrize(
-    ("made", "change"),
-    [
+def test_what_changes_the_pixels_changes_the_name() -> None:
+    for made, change in (
         (STEERED, "model.steps=3"),
         (STEERED, "model.solver=dpmpp_2m"),
         (STEERED, "model.cond_aug=0.0"),
@@ -170,10 +163,8 @@ def test_a_default_that_is_written_out_and_where_it_goes_change_nothing(made: Tr
         (STEERED, "source.pose={radius = 14.0}"),
         (LIVE, "source.pose={height_m = 1.6}"),
         (LIVE, "view.topdown={position_m = [-4.0, 3.0, 3.5], look_at_m = [12.0, 0.0, 0.5]}"),
-    ],
-)
-def test_what_changes_the_pixels_changes_the_name(made: Traits, change: str) -> None:
-    assert digest(change, made=made) != digest(made=made)
+    ):
+        assert digest(change, made=made) != digest(made=made)
 
 
 def test_a_quality_has_the_name_of_what_it_comes_to() -> None:

@@ -190,24 +190,20 @@ def test_every_verb_is_read_as_its_own_struct() -> None:
     assert parse_command(wire("remove_view", args={"view": "a"}, if_view_rev=2)).if_view_rev == 2
 
 
-@pytest.mark.parametrize(
-    ("changes", "code"),
-    [
+def test_f16_another_protocol_keeps_the_short_printable_id() -> None:
+    for changes, code in (
         *(({"proto": proto}, ("BAD_PROTO", "a1")) for proto in ("gcd/2.0", "", None, "gcd/1.0\n")),
         *(({"id": each}, ("BAD_ARG", "")) for each in ("", "x" * 65, "a\n", 7, "é")),
         ({"verb": "set_veiw"}, ("UNKNOWN_VERB", "a1")),
         ({"if_view_rev": 2}, ("BAD_ARG", "a1")),  # without a view
-    ],
-)
-def test_f16_another_protocol_keeps_the_short_printable_id(changes: dict[str, object], code: tuple[str, str]) -> None:
-    error = refused(json.dumps({"proto": PROTO, "id": "a1", "verb": "activate", **changes}).encode())
-    assert (error.code, error.request_id) == code
-    assert code[0] != "UNKNOWN_VERB" or "set_view" in str(error)  # the nearest
+    ):
+        error = refused(json.dumps({"proto": PROTO, "id": "a1", "verb": "activate", **changes}).encode())
+        assert (error.code, error.request_id) == code
+        assert code[0] != "UNKNOWN_VERB" or "set_view" in str(error)  # the nearest
 
 
-@pytest.mark.parametrize(
-    ("args", "says"),
-    [
+def test_f14_a_wrong_argument_is_bad_arg_and_named() -> None:
+    for args, says in (
         ({}, "view"),
         ({"view": "top\n"}, "view"),
         ({"view": "top", "azimut_deg": 1}, "azimuth_deg"),
@@ -219,26 +215,21 @@ def test_f16_another_protocol_keeps_the_short_printable_id(changes: dict[str, ob
         ({"view": "top", "kind": "orbit"}, "rate_deg_s"),
         ({"view": "top", "rate_deg_s": 3}, "rate_deg_s"),
         ([], "array"),
-    ],
-)
-def test_f14_a_wrong_argument_is_bad_arg_and_named(args: object, says: str) -> None:
-    error = refused(wire("set_view", args=args))
-    assert error.code == "BAD_ARG"
-    assert says in str(error)
+    ):
+        error = refused(wire("set_view", args=args))
+        assert error.code == "BAD_ARG"
+        assert says in str(error)
 
 
-@pytest.mark.parametrize(
-    ("args", "arg", "allowed"),
-    [
+def test_f14_out_of_range_gives_the_allowed_interval() -> None:
+    for args, arg, allowed in (
         ({"steps": 0}, "steps", [1, 1000]),
         ({"jpeg_quality": 49}, "jpeg_quality", [50, 100]),
         ({"seed": 2**53}, "seed", [0, 2**53 - 1]),
         ({"guidance": [1.0, -0.5]}, "guidance", [0, 100]),
-    ],
-)
-def test_f14_out_of_range_gives_the_allowed_interval(args: dict[str, object], arg: str, allowed: list[int]) -> None:
-    error = refused(wire("set_param", args=args))
-    assert (error.code, error.result) == ("OUT_OF_RANGE", {"allowed": {arg: allowed}})
+    ):
+        error = refused(wire("set_param", args=args))
+        assert (error.code, error.result) == ("OUT_OF_RANGE", {"allowed": {arg: allowed}})
 
 
 @pytest.fixture

@@ -211,24 +211,19 @@ def memory(coefficients: list[float], model: str = "Perspective", width: int = 4
     return dai.CalibrationHandler(stored)
 
 
-@pytest.mark.parametrize(
-    ("coefficients", "model", "wanted"),
-    [
+def test_the_lens_in_memory_is_scaled_and_cut_to_the_picture_and_has_our_names() -> None:
+    for coefficients, model, wanted in (
         ([0.0] * 14, "Perspective", ("none", ())),
         ([0.5, 0.25], "Perspective", ("rational_polynomial", (0.5, 0.25, *[0.0] * 6))),
         ([*RATIONAL, 0.5, *[0.0] * 5], "Perspective", ("rational_polynomial", (*RATIONAL, 0.5, *[0.0] * 5))),
         ([0.5, 0.25, 2.0, 4.0, *[0.0] * 10], "Fisheye", ("equidistant", (0.5, 0.25, 2.0, 4.0))),
-    ],
-)
-def test_the_lens_in_memory_is_scaled_and_cut_to_the_picture_and_has_our_names(
-    coefficients: list[float], model: str, wanted: tuple[str, tuple[float, ...]]
-) -> None:
-    lens = lens_in_memory(memory(coefficients, model), SOCKET, 1280, 720)
-    scale = 1280 / 4056  # the width is kept, rows are cut off above and below
-    assert (lens.width, lens.height) == (1280, 720)
-    assert (lens.fx, lens.fy) == pytest.approx((3100 * scale, 3101 * scale), rel=1e-5)
-    assert (lens.cx, lens.cy) == pytest.approx((2020 * scale, 1530 * scale - (3040 * scale - 720) / 2), abs=1)
-    assert (lens.distortion, lens.coefficients) == wanted
+    ):
+        lens = lens_in_memory(memory(coefficients, model), SOCKET, 1280, 720)
+        scale = 1280 / 4056  # the width is kept, rows are cut off above and below
+        assert (lens.width, lens.height) == (1280, 720)
+        assert (lens.fx, lens.fy) == pytest.approx((3100 * scale, 3101 * scale), rel=1e-5)
+        assert (lens.cx, lens.cy) == pytest.approx((2020 * scale, 1530 * scale - (3040 * scale - 720) / 2), abs=1)
+        assert (lens.distortion, lens.coefficients) == wanted
 
 
 def test_a_lens_that_makes_no_sense_is_no_lens_and_that_of_the_picture_itself_comes_before_the_memory() -> None:

@@ -122,18 +122,15 @@ def test_a_real_camera_gives_a_second_of_pictures() -> None:
 # Network streams.
 
 
-@pytest.mark.parametrize(
-    ("url", "shown"),
-    [
+def test_an_address_is_shown_without_what_may_be_secret() -> None:
+    for url, shown in (
         (f"rtsp://admin:{SECRET}@cam.local/stream1", "rtsp://cam.local"),
         (f"RTSP://admin:{SECRET}@10.0.0.7:8554/x?token={SECRET}", "rtsp://10.0.0.7:8554"),
         (f"rtsp://cam.local:554/user=admin_password={SECRET}_channel=1.sdp", "rtsp://cam.local:554"),
         (f"http://[fe80::1]:8080/video?key={SECRET}", "http://[fe80::1]:8080"),
         ("udp://@:5000", "udp://:5000"),
-    ],
-)
-def test_an_address_is_shown_without_what_may_be_secret(url: str, shown: str) -> None:
-    assert shown_address(url) == shown
+    ):
+        assert shown_address(url) == shown
 
 
 def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated_and_one_too_large_to_decode() -> None:
@@ -149,18 +146,15 @@ def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated_and_one_too_
         _ = open_stream(RtspSource(url="rtsp://host/x"), open_capture=FakeVideoCapture(RED, fixed=huge).open).info
 
 
-@pytest.mark.parametrize(
-    ("arrivals_ms", "old"),
-    [
+def test_a_burst_is_old_and_what_follows_in_time_is_not() -> None:
+    for arrivals_ms, old in (
         ([0.0, 1.0, 2.0, 3.0, 43.0, 83.0, 90.0], [0, 1, 2, 3]),  # what piled up before the start
         ([0.0, 40.0, 80.0, 900.0, 901.0, 902.0, 941.0], [0, 3, 4, 5]),  # and in a silence
         ([0.0, 40.0, 110.0, 115.0, 160.0, 239.0, 241.0], [0]),  # jitter is no burst
         ([10.0 * i for i in range(220)], [*range(201)]),  # what never waits is believed after two seconds
-    ],
-)
-def test_a_burst_is_old_and_what_follows_in_time_is_not(arrivals_ms: list[float], old: list[int]) -> None:
-    backlog = Backlog(period_ns=40_000_000)
-    assert [i for i, each in enumerate(arrivals_ms) if backlog.holds(round(each * 1e6))] == old
+    ):
+        backlog = Backlog(period_ns=40_000_000)
+        assert [i for i, each in enumerate(arrivals_ms) if backlog.holds(round(each * 1e6))] == old
 
 
 RISING = [flat(i // 3, 60, 200) for i in range(600)]
