@@ -28,9 +28,8 @@ def parsed(text: str = MINIMAL, *changes: str) -> NodeConfig:
     return parse_config(text.encode(), "test.toml", changes)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
+def test_what_is_wrong_is_one_line_that_says_where_and_what_would_be_right() -> None:
+    for old, new, said in (
         # an unknown key: the nearest known one
         ("path =", "pathh =", ["did you mean `path", "source"]),
         ("weights", "wieghts", ["did you mean `weights", "model"]),
@@ -51,14 +50,12 @@ def parsed(text: str = MINIMAL, *changes: str) -> NodeConfig:
         (PATH, 'kind = "orbital"', ["orbital", "file", "push"]),
         (PATH, 'kind = "oak"\npace = "lockstep"', ["pace"]),
         (PATH, 'kind = "folder"\npath = "p"', ["fps"]),
-    ],
-)
-def test_what_is_wrong_is_one_line_that_says_where_and_what_would_be_right(old: str, new: str, said: list[str]) -> None:
-    with pytest.raises(ConfigError) as caught:
-        parsed(MINIMAL.replace(old, new))
-    line = str(caught.value)
-    assert len(line.splitlines()) == 1
-    assert [each for each in ("test.toml", *said) if each not in line] == []
+    ):
+        with pytest.raises(ConfigError) as caught:
+            parsed(MINIMAL.replace(old, new))
+        line = str(caught.value)
+        assert len(line.splitlines()) == 1
+        assert [each for each in ("test.toml", *said) if each not in line] == []
 
 
 def test_everything_of_drawing_reaches_the_model() -> None:

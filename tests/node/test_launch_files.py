@@ -195,20 +195,17 @@ def test_a_good_launch_file_is_looked_at_from_end_to_end(launch: Path) -> None:
     assert not (launch.parent / "data").exists()  # nothing stays bound
 
 
-@pytest.mark.parametrize(
-    ("change", "topic", "code"),
-    [
+def test_what_fails_is_the_exit_code(launch: Path, capsys: Capture) -> None:
+    for change, topic, code in (
         ("source.path=/no/such.mp4", "source", 66),
         ("model.weights=/no/such.ckpt", "weights", 65),
         ("model.weights=package:unheard", "weights", 65),
         ("view.main.azimuth_deg=5", "views", 64),
         ("publish.data=tcp://0.0.0.0:5580", "endpoints", 78),
-    ],
-)
-def test_what_fails_is_the_exit_code(change: str, topic: str, code: int, launch: Path, capsys: Capture) -> None:
-    assert found(launch, change)[topic][0] == "failed"
-    assert run_app(["check", str(launch), "--set", change]) == code
-    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
+    ):
+        assert found(launch, change)[topic][0] == "failed"
+        assert run_app(["check", str(launch), "--set", change]) == code
+        assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
 
 
 def test_one_failure_does_not_hide_the_next_and_weights_must_fit_into_memory(launch: Path, tmp_path: Path) -> None:
