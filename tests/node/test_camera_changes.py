@@ -103,6 +103,9 @@ def test_a_camera_that_returns_at_another_rate_gets_windows_of_the_nearest_train
         slowest = bench.plug(Even(fps=4.0))
         flagged = view_of(rig, slowest, 2).header
         until(lambda: "fps" in reasons(rig))
+        lose(rig, slowest, 3)
+        view_of(rig, bench.plug(Even()), 3)
+        until(lambda: "fps" not in reasons(rig))
         states = [status["state"] for status in rig.statuses()]
         assert not rig.ended  # nobody was told of an end
     assert (before.src.fps_in, before.src.fps_cond) == (24.0, 24.0)

@@ -13,14 +13,16 @@ import pytest
 import zmq
 from cameras import until
 from fakes import FakeNode
+from wire_messages import origin
 
 from gcd_client.control import ControlClient, Reply, decode_reply
 from gcd_client.endpoints import fingerprint, read_key_pair
 from gcd_client.protocol import PROTO
 from gcd_node.auth import Socket, load_server_security
 from gcd_node.cli.main import run_app
-from gcd_node.config import SecurityConfig
+from gcd_node.config import PublishConfig, SecurityConfig
 from gcd_node.control import ControlServer, FloodGuard, ReplyCache
+from gcd_node.publisher import Publisher
 from gcd_node.verbs import VERBS, RequestError, parse_command
 
 Capture = pytest.CaptureFixture[str]
@@ -272,9 +274,14 @@ def test_keys_made_on_the_command_line_open_the_door(tmp_path: Path, capsys: Cap
     stanza = shown[shown.rindex("[client.NAME]") :].replace("NAME", "desk")
     (tmp_path / "allow.toml").write_text(stanza)
     security = load_server_security(SecurityConfig(keys=str(tmp_path / "node"), allow=str(tmp_path / "allow.toml")))
+    keys = ["--timeout", "20", "--keys", str(tmp_path / "desk"), "--node-key", str(tmp_path / "node" / "public.key")]
+    endpoints = PublishConfig(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0")
+    with Publisher(endpoints, security=security) as publisher:
+        publisher.note("status", origin(), {"state": "active", "level": 0})
+        assert run_app(["status", publisher.status_endpoint, "--once", *keys]) == 0
+        capsys.readouterr()
     with node.serve("tcp://127.0.0.1:0", security=security) as server:
-        line = ["ctl", "hello", "--json", "--endpoint", server.endpoint, "--timeout", "20"]
-        line += ["--keys", str(tmp_path / "desk"), "--node-key", str(tmp_path / "node" / "public.key")]
+        line = ["ctl", "hello", "--json", "--endpoint", server.endpoint, *keys]
         assert run_app(line) == 0
         assert json.loads(capsys.readouterr().out)["result"] == {"role": "viewer"}
         assert run_app([*line[:1], "activate", *line[3:]]) == 70

@@ -198,6 +198,7 @@ def test_a_good_launch_file_is_looked_at_from_end_to_end(launch: Path) -> None:
 def test_what_fails_is_the_exit_code(launch: Path, capsys: Capture) -> None:
     for change, topic, code in (
         ("source.path=/no/such.mp4", "source", 66),
+        ('source={kind = "v4l2", device = "/dev/video-none"}', "source", 69),
         ("model.weights=/no/such.ckpt", "weights", 65),
         ("model.weights=package:unheard", "weights", 65),
         ("view.main.azimuth_deg=5", "views", 64),

@@ -1,6 +1,7 @@
 """The page's server without a browser and without a node: what it serves and to whom, what a feed gives, and what
 hostile clients can do with both."""
 
+import asyncio
 import contextlib
 import logging
 import os
@@ -11,9 +12,10 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -48,7 +50,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
 from gcd_node.viewer import feed as feed_module
 from gcd_node.viewer import server as server_module
-from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, picture
+from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, NodeLink, picture
 from gcd_node.viewer.server import HEADERS, MOST_BROWSERS, ViewerServer, load_page
 
 
@@ -200,6 +202,27 @@ def test_who_sends_what_no_page_sends_or_too_much_is_sent_away_and_others_do_not
                     say(feed, "got")
             assert farewell(feed) == 1008
         assert role(other, token=TOKEN) == ("operator", False)
+
+
+def test_a_page_that_takes_seconds_for_a_message_may_say_as_much_as_any_other() -> None:
+    class Slow:
+        code: int | None = None
+
+        async def send(self, _: str) -> None:
+            await asyncio.sleep(60)
+
+        async def close(self, code: int, _: str) -> None:
+            self.code = code
+
+        async def __aiter__(self) -> AsyncIterator[str]:
+            for _ in range(2):
+                for _ in range(80):
+                    yield '{"type":"got"}'
+                await asyncio.sleep(0.6)
+
+    slow = Slow()
+    asyncio.run(Browser(cast("Any", slow), create_autospec(NodeLink), TOKEN).serve())
+    assert slow.code is None
 
 
 def test_the_end_waits_for_nobody(tmp_path: Path) -> None:
