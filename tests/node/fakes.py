@@ -32,7 +32,7 @@ from gcd_model.networks import random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import save_weights
-from gcd_node.auth import Role
+from gcd_node.auth import Client, Role, ServerSecurity, new_key_pair
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.control import ControlServer
 from gcd_node.errors import NodeError
@@ -249,6 +249,11 @@ def run(config: NodeConfig, model: ViewSynthesizer | None = None, source: FrameS
     box = Box()
     made_node(config, model or FakeSynthesizer(traits()), source or FakeSource(28), box).run()
     return box
+
+
+NODE, VIEWER, OPERATOR = (new_key_pair() for _ in range(3))
+CLIENTS = {VIEWER.public: Client(name="eye", role="viewer"), OPERATOR.public: Client(name="hand", role="operator")}
+SECURITY = ServerSecurity(keys=NODE, find_client=CLIENTS.get)
 
 
 class FakeNode:

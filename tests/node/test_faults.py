@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,7 +25,6 @@ from gcd_client.subscriber import ViewSubscriber
 from gcd_model import (
     DeviceMemoryError,
     NonFiniteError,
-    RenderOptions,
     ViewSynthesizer,
 )
 from gcd_node.config import ModelSection
@@ -179,7 +179,7 @@ def test_f11_a_full_device_is_asked_for_less_and_goes_on(tmp_path: Path) -> None
 
 
 def test_f11_a_model_that_never_finds_memory_fails_and_the_node_stays(tmp_path: Path) -> None:
-    model = FakeSynthesizer(traits(), lambda _: full())
+    model = FakeSynthesizer(traits(), Mock(side_effect=DeviceMemoryError("out of memory")))
     with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP) as rig:
         rig.await_event("MODEL_FAILED")
         rig.await_state("inactive")
@@ -232,16 +232,12 @@ def test_f11_a_full_gpu_gets_the_same_model_in_bfloat16(tmp_path: Path) -> None:
 
 
 def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) -> None:
-    seeds: list[int] = []
-
-    def broken(options: RenderOptions) -> None:
-        seeds.append(options.seed)
-        raise NonFiniteError("NaN")
-
-    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), broken), config=LOCKSTEP) as rig:
+    model = FakeSynthesizer(traits(), Mock(side_effect=NonFiniteError("NaN")))
+    with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP) as rig:
         rig.await_event("MODEL_FAILED")
         rig.await_state("inactive")
         told = rig.events("MODEL_NAN")
+    seeds = [options.seed for _, options in model.asked][-6:]
     assert [event["window_id"] for event in told] == [0, 1, 2]
     assert [seed for event in told for seed in event["seeds"]] == seeds
     assert len(set(seeds)) == 6  # one retry each, with another seed

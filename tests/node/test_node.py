@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace as changed
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -117,32 +118,23 @@ def test_nobody_claims_to_know_where_an_unsteered_camera_stands_and_the_driving_
     assert ahead == pytest.approx([0.0, 1.55 - 8.0, -8.0 - 1.6])  # above and behind, in the source camera's axes
 
 
-@pytest.mark.parametrize(
-    ("act", "fails", "code", "source", "model"),
-    [
+def test_the_last_status_is_the_end() -> None:
+    for act, fails, code, source, model in (
         (None, None, "SRC_ENDED", "ended", "ready"),
         (None, SourceError("unplugged"), "SRC_LOST", "lost", "ready"),
         (DeviceMemoryError("full"), None, "MODEL_FAILED", "closed", "failed"),
         (RuntimeError("shapes differ"), None, "MODEL_FAILED", "closed", "failed"),
         (None, cv2.error("assertion failed"), "SRC_FAILED", "closed", "ready"),
         (None, ShapeError("no such picture"), "SRC_FAILED", "closed", "ready"),
-    ],
-)
-def test_the_last_status_is_the_end(
-    act: Exception | None, fails: Exception | None, code: str, source: str, model: str
-) -> None:
-    def do(_: RenderOptions) -> None:
-        if act is not None:
-            raise act
-
-    box = Box()
-    node = made_node(fake_config(), FakeSynthesizer(traits(), do), FakeSource(60, fails=fails), box)
-    with nullcontext() if fails is act is None else pytest.raises((SourceError, ModelFailedError)):
-        node.run()
-    assert box.told("event")[-1]["code"] == code
-    last = box.told("status")[-1]
-    assert (last["source"]["state"], last["model"]["state"]) == (source, model)
-    assert last["level"] == (0 if code == "SRC_ENDED" else 2)
+    ):
+        drawing, box = FakeSynthesizer(traits(), Mock(side_effect=act)), Box()
+        node = made_node(fake_config(), drawing, FakeSource(60, fails=fails), box)
+        with nullcontext() if fails is act is None else pytest.raises((SourceError, ModelFailedError)):
+            node.run()
+        assert box.told("event")[-1]["code"] == code
+        last = box.told("status")[-1]
+        assert (last["source"]["state"], last["model"]["state"]) == (source, model)
+        assert last["level"] == (0 if code == "SRC_ENDED" else 2)
 
 
 def test_a_failure_keeps_its_own_code() -> None:

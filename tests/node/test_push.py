@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import zmq
 from cameras import environment, flat, pushing, until, write_video
+from fakes import NODE, OPERATOR, SECURITY, VIEWER
 from msgspec.structs import replace
 from wire_messages import class_map, depth, received, visibility
 
@@ -22,7 +23,7 @@ from gcd_client import AuthError, ClientKeys, FramePusher
 from gcd_client.frames import encode_frame
 from gcd_client.protocol import ClassRecord
 from gcd_client.subscriber import ReceivedView
-from gcd_node.auth import Client, ServerSecurity, new_key_pair
+from gcd_node.auth import ServerSecurity
 from gcd_node.errors import ConfigError, EndpointError, SourceLostError
 from gcd_node.frame import Frame
 from gcd_node.sources import PushSource
@@ -33,9 +34,6 @@ RED = flat(250, 10, 20)
 SHAPE = RED.shape[:2]
 FPS = 50.0
 GUARD_S = 30.0
-NODE, VIEWER, OPERATOR = (new_key_pair() for _ in range(3))
-CLIENTS = {VIEWER.public: Client(name="eye", role="viewer"), OPERATOR.public: Client(name="hand", role="operator")}
-SECURITY = ServerSecurity(keys=NODE, find_client=CLIENTS.get)
 
 
 def red(pusher: FramePusher, _: int) -> None:
