@@ -139,7 +139,7 @@ class FakeSynthesizer:
 
 
 class FakeSource:
-    """`count` frames, the number of a frame in its pixels; `fails` is raised after the last."""
+    """`count` frames, the number of a frame in its pixels, as `edit` makes them; `fails` is raised after the last."""
 
     def __init__(
         self,
@@ -149,12 +149,13 @@ class FakeSource:
         size: tuple[int, int] = (WIDTH, HEIGHT),
         period_s: float = 0.0,
         fails: Exception | None = None,
+        edit: Callable[[Frame], Frame] = lambda frame: frame,
     ) -> None:
         self.info = SourceInfo(
             kind="synthetic", id="fake", width=size[0], height=size[1], fps_nominal=fps, clock="replay"
         )
         self.closed, self.corrupt = False, 0
-        self._count, self._period_s, self._fails = count, period_s, fails
+        self._count, self._period_s, self._fails, self._edit = count, period_s, fails, edit
 
     def frames(self) -> Iterator[Frame]:
         for seq in range(self._count):
@@ -162,7 +163,7 @@ class FakeSource:
                 return
             time.sleep(self._period_s)
             image = np.full((self.info.height, self.info.width, 3), 20 + seq % 200, np.uint8)
-            yield Frame(image=image, stamp_ns=round(seq * 1e9 / self.info.fps_nominal), seq=seq)
+            yield self._edit(Frame(image=image, stamp_ns=round(seq * 1e9 / self.info.fps_nominal), seq=seq))
         if self._fails is not None:
             raise self._fails
 

@@ -29,7 +29,6 @@ from gcd_model import (
 )
 from gcd_node.config import ModelSection
 from gcd_node.errors import ConfigError, ModelFailedError, SourceLostError
-from gcd_node.frame import Frame
 from gcd_node.health import Health
 from gcd_node.model import FailureCounter, oom_levels
 from gcd_node.service import ServiceManager
@@ -246,11 +245,6 @@ def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) ->
 
 
 def test_f13_an_input_without_a_picture_is_published_and_flagged() -> None:
-    class Covered(FakeSource):
-        def frames(self) -> Iterator[Frame]:
-            for frame in super().frames():
-                yield replace(frame, image=np.full_like(frame.image, self.levels[frame.seq % 2]))
-
     for levels, flags in (
         ((0, 0), {"exposure", "static"}),  # black
         ((255, 255), {"exposure", "static"}),  # saturated
@@ -258,9 +252,9 @@ def test_f13_an_input_without_a_picture_is_published_and_flagged() -> None:
         ((0, 4), {"exposure"}),  # dark
         ((120, 124), set()),
     ):
-        source = Covered(14)
-        source.levels = levels
-        box = run(fake_config(), source=source)
+        drawn = [np.full((64, 96, 3), level, np.uint8) for level in levels]
+        covered = FakeSource(14, edit=lambda frame, drawn=drawn: replace(frame, image=drawn[frame.seq % 2]))
+        box = run(fake_config(), source=covered)
         assert set(box.of("win")[0].header.quality.ood) == flags
 
 

@@ -4,7 +4,7 @@ import functools
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace as changed
 from pathlib import Path
@@ -268,18 +268,15 @@ def test_views_are_the_same_to_the_last_bit_whatever_the_timing(stride: int, pac
 
 
 def test_when_a_window_is_complete_only_its_last_frame_is_left_to_encode() -> None:
-    class Waiting(FakeSource):
-        """Gives its last frame when all those before it are encoded."""
-
-        def frames(self) -> Iterator[Frame]:
-            for frame in super().frames():
-                if frame.seq == T - 1:
-                    until(lambda: len(model.encoded) == T - 1)
-                    assert model.asked == []
-                yield frame
+    def waiting(frame: Frame) -> Frame:
+        """The last one is given when all those before it are encoded."""
+        if frame.seq == T - 1:
+            until(lambda: len(model.encoded) == T - 1)
+            assert model.asked == []
+        return frame
 
     model = Encoder()
-    assert run(config(), model, Waiting(T)).ids() == [0]
+    assert run(config(), model, FakeSource(T, edit=waiting)).ids() == [0]
     assert model.encoded == list(range(T))
 
 

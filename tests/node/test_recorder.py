@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -55,13 +56,9 @@ class Calibrated(FakeSource):
     """A source that knows its lens, with noise that no coder keeps whole."""
 
     def __init__(self, count: int = 30, fps: float = 24.0) -> None:
-        super().__init__(count, fps=fps, size=(192, 128))
+        draw = partial(np.random.default_rng(0).integers, 0, 256, (128, 192, 3), np.uint8)
+        super().__init__(count, fps=fps, size=(192, 128), edit=lambda frame: replace(frame, image=draw()))
         self.info = replace(self.info, lens=LENS)
-
-    def frames(self) -> Iterator[Frame]:
-        draw = np.random.default_rng(0)
-        for frame in super().frames():
-            yield replace(frame, image=draw.integers(0, 256, frame.image.shape, np.uint8))
 
 
 @dataclass(frozen=True)

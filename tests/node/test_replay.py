@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -165,17 +165,12 @@ def test_a_recording_is_named_by_the_digest_of_its_bytes_a_folder_by_names_and_c
         digest_of(tmp_path / "nowhere")
 
 
-class Gap(FakeSource):
-    """Half a second is missing after 20 frames."""
-
-    def frames(self) -> Iterator[Frame]:
-        for frame in super().frames():
-            late_ns = 500_000_000 if frame.seq >= 20 else 0
-            yield Frame(image=frame.image.copy(), stamp_ns=frame.stamp_ns + late_ns, seq=frame.seq)
-
-
 def test_windows_that_were_rejected_are_counted_and_those_with_nan_named(tmp_path: Path) -> None:
-    gap = made_run(tmp_path / "gap", source=Gap(42)).manifest
+    def late(frame: Frame) -> Frame:
+        """Half a second is missing after 20 frames."""
+        return replace(frame, stamp_ns=frame.stamp_ns + 500_000_000 * (frame.seq >= 20))
+
+    gap = made_run(tmp_path / "gap", source=FakeSource(42, edit=late)).manifest
     assert gap.rejected == {"WIN_GAP": 1}
     assert [window.seqs[0] for window in gap.windows] == [0, 20]
     nan = made_run(tmp_path / "nan", nan_model({1})).manifest
@@ -405,18 +400,14 @@ def test_what_the_runs_were_made_from_is_named_first(golden: RunFolder, tmp_path
     ]
 
 
-class Brighter(FakeSource):
-    def frames(self) -> Iterator[Frame]:
-        for frame in super().frames():
-            yield Frame(image=frame.image + 1, stamp_ns=frame.stamp_ns, seq=frame.seq)
-
-
 def test_the_first_divergence_says_whether_input_and_seed_were_the_same(golden: RunFolder, tmp_path: Path) -> None:
+    brighter = FakeSource(42, edit=lambda frame: replace(frame, image=frame.image + 1))
+
     def told(whole: RunFolder) -> str:
         return report_text(compare(golden, whole), LOOSE).splitlines()[-1]
 
     assert told(lowered(tmp_path / "same", {(2, 0): 1})).endswith("the model was given the same pictures")
-    assert "other pictures already" in told(made_run(tmp_path / "input", source=Brighter(42)))
+    assert "other pictures already" in told(made_run(tmp_path / "input", source=brighter))
     seed = made_run(tmp_path / "seed", LevelModel(lower={(0, 0): 1}), changes=["model.cond_aug=0.01"])
     assert "same pictures and another seed" in told(seed)
 
