@@ -3,17 +3,14 @@
 import os
 import subprocess
 import sys
-from contextlib import closing
-from functools import partial
 from pathlib import Path
 
 import pytest
+from fakes import FakeNode
 from wire_messages import end, window
 
 from gcd_node.config import PublishConfig
-from gcd_node.control import ControlServer, Outcome
 from gcd_node.publisher import Publisher
-from gcd_node.verbs import Command
 
 CLIENT = Path(__file__).parents[2] / "client"
 LIGHTEST_IMPORT_S = 0.15
@@ -29,34 +26,20 @@ with ControlClient(control) as node:
 """
 
 
-class Views:
-    """A node that knows one answer."""
-
-    def handle(self, command: Command, role: str) -> Outcome:
-        return Outcome(result={"verb": command.verb})
-
-
 @pytest.mark.slow
 def test_the_client_alone_reads_views_and_commands(tmp_path: Path) -> None:
     python, clean = tmp_path / "venv" / "bin" / "python", {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, timeout=100)
     subprocess.run([python, "-m", "pip", "install", "-q", CLIENT], check=True, timeout=300, env=clean)
-    opened = partial(
-        Publisher,
-        PublishConfig(data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/status", min_subscribers=1),
-        lockstep=True,
-    )
-    with (
-        closing(ControlServer(f"ipc://{tmp_path}/c", Views().handle, lambda: "active", print)) as server,
-        opened() as publisher,
-    ):
+    endpoints = PublishConfig(data=f"ipc://{tmp_path}/d", status=f"ipc://{tmp_path}/status", min_subscribers=1)
+    with FakeNode().serve(f"ipc://{tmp_path}/c") as server, Publisher(endpoints, lockstep=True) as publisher:
         command = [python, "-c", PROGRAM, publisher.endpoint, server.endpoint]
         reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=clean, cwd=tmp_path)
         message = window(4)
         publisher.send(message)
         publisher.end(end(window_id=4))
         out, _ = reader.communicate(timeout=60)
-    assert out.splitlines() == [f"[(4, (2, 4, 6, 3), {sum(bytes(message.payload))})]", "{'verb': 'views'}"]
+    assert out.splitlines() == [f"[(4, (2, 4, 6, 3), {sum(bytes(message.payload))})]", "{'role': 'operator'}"]
     assert min(import_s(python, clean) for _ in range(7)) <= LIGHTEST_IMPORT_S
 
 

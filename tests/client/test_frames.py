@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gcd_client.frames import PUSH_KEY, decode_frame, encode_frame
-from gcd_client.protocol import MessageError, decode, pack
+from gcd_client.protocol import MessageError, pack
 
 WHO = "0123456789abcdef" * 2
 STAMP_NS = 1_764_000_000_123_456_789
@@ -40,9 +40,8 @@ def test_a_jpeg_is_passed_on_and_decoded_there() -> None:
     assert found.depth is not None
 
 
-@pytest.mark.parametrize(
-    ("image", "depth", "odometry"),
-    [
+def test_what_no_frame_is_made_of_is_refused_where_it_is_pushed() -> None:
+    for image, depth, odometry in (
         (IMAGE.astype(np.float32), None, None),
         (IMAGE[..., 0], None, None),
         (np.zeros((0, 8, 3), np.uint8), None, None),
@@ -51,36 +50,17 @@ def test_a_jpeg_is_passed_on_and_decoded_there() -> None:
         (IMAGE, DEPTH[None], None),
         (IMAGE, None, np.eye(3)),
         (IMAGE, None, np.eye(4, dtype=int)),
-    ],
-)
-def test_what_no_frame_is_made_of_is_refused_where_it_is_pushed(
-    image: np.ndarray | bytes, depth: np.ndarray | None, odometry: np.ndarray | None
-) -> None:
-    with pytest.raises(MessageError, match="must be"):
-        encode_frame(WHO, 0, image, STAMP_NS, depth, odometry)
-
-
-def test_whatever_arrives_is_a_frame_or_a_message_error() -> None:
-    rng, good = np.random.default_rng(3), encode_frame(WHO, 0, IMAGE, STAMP_NS, DEPTH, POSE, checksum=False)
-    for i in range(2000):
-        part = bytearray(good[: rng.integers(len(good))] if i % 3 == 0 else good)
-        for at in rng.integers(0, min(len(part), 64 + 256), 1 + i % 4) if part else ():
-            part[at] = rng.integers(256)
-        try:
-            decode_frame(bytes(part))
-        except MessageError:
-            continue
-    with pytest.raises(MessageError):
-        decode(good)
+    ):
+        with pytest.raises(MessageError, match="must be"):
+            encode_frame(WHO, 0, image, STAMP_NS, depth, odometry)
 
 
 def header(text: bytes, payload: bytes = b"x" * 64) -> bytes:
     return pack(PUSH_KEY, 1, 0, text, payload)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_headers_that_promise_what_is_not_there_are_refused() -> None:
+    for text in (
         b"{}",
         b"[" * 5000,
         b"\xff",
@@ -90,8 +70,6 @@ def header(text: bytes, payload: bytes = b"x" * 64) -> bytes:
         b'{"proto":"gcd/1.2","pusher":"%s","stamp":[1,0],"shape":[65535,65535,3],"encoding":"jpeg"}' % WHO.encode(),
         b'{"proto":"gcd/1.2","pusher":"%s","stamp":[1,0],"shape":[1,1,3],"encoding":"jpeg","depth":[9,9]}'
         % WHO.encode(),
-    ],
-)
-def test_headers_that_promise_what_is_not_there_are_refused(text: bytes) -> None:
-    with pytest.raises(MessageError):
-        decode_frame(header(text))
+    ):
+        with pytest.raises(MessageError):
+            decode_frame(header(text))

@@ -1,7 +1,6 @@
 """Messages as bytes: round trips, the layout, and what a hostile sender can do (nothing but MessageError)."""
 
 import json
-import random
 import struct
 import zlib
 from collections.abc import Mapping
@@ -108,19 +107,6 @@ def test_pixels_of_one_kind_are_never_taken_for_another(message: ViewMessage, ki
     fits = any({message.topic.rpartition("/")[2], kind} <= kinds for kinds in alike)
     part = encode(message)
     assert fits != is_refused(f"view/top/{kind}".encode().ljust(32, b"\0") + part[32:])
-
-
-@pytest.mark.parametrize("checked", [True, False])
-def test_damage_anywhere_raises_nothing_but_message_errors(checked: bool) -> None:
-    chance, whole, refused = random.Random(20), encode(window()), 0
-    for _ in range(1500):
-        part = bytearray(whole)
-        for _ in range(chance.choice((1, 1, 2, 8))):
-            part[chance.randrange(len(part))] ^= 1 << chance.randrange(8)
-        if not checked:
-            part[56:60] = bytes(4)  # no checksum: the header's own checks must hold
-        refused += is_refused(bytes(part))
-    assert refused > (1200 if checked else 300)
 
 
 def test_truncation_anywhere_is_refused() -> None:

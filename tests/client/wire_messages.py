@@ -27,6 +27,7 @@ from gcd_client.protocol import (
     ViewMessage,
     view_topic,
 )
+from gcd_client.subscriber import ReceivedView
 
 BOOT = "0123456789abcdef" * 2
 OTHER_BOOT = "f" * 32
@@ -160,6 +161,12 @@ def end(*, view_id: str = "top", window_id: int = 0, boot_id: str = BOOT, kind: 
         clock="replay",
     )
     return EndMessage(topic=view_topic(view_id, kind), header=header)
+
+
+def received(message: ViewMessage, **how: Any) -> ReceivedView:
+    """As a subscriber gives it."""
+    said = {"age_ms": message.header.age_ms, "expired": False, "skipped": 0, "restarted": False}
+    return ReceivedView(message=message, **said | how)
 
 
 def origin(boot_id: str = BOOT) -> OriginHeader:

@@ -1,12 +1,14 @@
 """Live cameras that do what a test tells them, and the bench they are plugged into."""
 
+import base64
 import os
 import queue
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 from pathlib import Path
 
@@ -198,6 +200,40 @@ class FakeVideoCapture:
 
     def release(self) -> None:
         self.released.set()
+
+
+@contextmanager
+def serving(images: Iterable[Image], password: str = "") -> Iterator[tuple[str, threading.Event]]:
+    """A network camera on loopback, which FFmpeg reads: pictures as JPEG over HTTP, 25 a second after the first 40.
+
+    Gives its address and an event; while that is clear pictures pile up. The password is that of `admin`.
+    """
+    pictures, awake = [cv2.imencode(".jpg", image[..., ::-1])[1].tobytes() for image in images], threading.Event()
+    awake.set()
+    secret = "Basic " + base64.b64encode(f"admin:{password}".encode()).decode()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            is_known = not password or self.headers["Authorization"] == secret
+            self.send_response(200 if is_known else 401)
+            self.send_header("WWW-Authenticate", 'Basic realm="camera"')
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=next")
+            self.end_headers()
+            begun_s = time.monotonic()
+            with suppress(OSError):
+                for i, data in enumerate(pictures if is_known else ()):
+                    while time.monotonic() < begun_s + (i - 40) / 25 or not awake.is_set():
+                        time.sleep(0.002)
+                    head = b"--next\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data)
+                    self.wfile.write(head + data + b"\r\n")
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/live", awake
+        server.shutdown()
 
 
 # Small recordings for tests, written with OpenCV; pictures are RGB. And what processes of tests need.

@@ -32,7 +32,7 @@ from gcd_model.networks import random_networks
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import save_weights
-from gcd_node.auth import Role
+from gcd_node.auth import Client, Role, ServerSecurity, new_key_pair
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.control import ControlServer
 from gcd_node.errors import NodeError
@@ -139,7 +139,7 @@ class FakeSynthesizer:
 
 
 class FakeSource:
-    """`count` frames, the number of a frame in its pixels; `fails` is raised after the last."""
+    """`count` frames, the number of a frame in its pixels, as `edit` makes them; `fails` is raised after the last."""
 
     def __init__(
         self,
@@ -149,12 +149,13 @@ class FakeSource:
         size: tuple[int, int] = (WIDTH, HEIGHT),
         period_s: float = 0.0,
         fails: Exception | None = None,
+        edit: Callable[[Frame], Frame] = lambda frame: frame,
     ) -> None:
         self.info = SourceInfo(
             kind="synthetic", id="fake", width=size[0], height=size[1], fps_nominal=fps, clock="replay"
         )
         self.closed, self.corrupt = False, 0
-        self._count, self._period_s, self._fails = count, period_s, fails
+        self._count, self._period_s, self._fails, self._edit = count, period_s, fails, edit
 
     def frames(self) -> Iterator[Frame]:
         for seq in range(self._count):
@@ -162,7 +163,7 @@ class FakeSource:
                 return
             time.sleep(self._period_s)
             image = np.full((self.info.height, self.info.width, 3), 20 + seq % 200, np.uint8)
-            yield Frame(image=image, stamp_ns=round(seq * 1e9 / self.info.fps_nominal), seq=seq)
+            yield self._edit(Frame(image=image, stamp_ns=round(seq * 1e9 / self.info.fps_nominal), seq=seq))
         if self._fails is not None:
             raise self._fails
 
@@ -196,7 +197,6 @@ class Box:
     views: list[ViewMessage] = field(default_factory=list)
     ends: list[EndMessage] = field(default_factory=list)
     notes: list[tuple[str, Mapping[str, Any]]] = field(default_factory=list)
-    hurried: bool = False
 
     def send(self, message: ViewMessage) -> bool:
         self.views.append(message)
@@ -212,7 +212,7 @@ class Box:
         self.views.append(made())
 
     def stop_waiting(self) -> None:
-        self.hurried = True
+        """It never waits."""
 
     @property
     def stats(self) -> PublisherStats:
@@ -250,6 +250,11 @@ def run(config: NodeConfig, model: ViewSynthesizer | None = None, source: FrameS
     box = Box()
     made_node(config, model or FakeSynthesizer(traits()), source or FakeSource(28), box).run()
     return box
+
+
+NODE, VIEWER, OPERATOR = (new_key_pair() for _ in range(3))
+CLIENTS = {VIEWER.public: Client(name="eye", role="viewer"), OPERATOR.public: Client(name="hand", role="operator")}
+SECURITY = ServerSecurity(keys=NODE, find_client=CLIENTS.get)
 
 
 class FakeNode:

@@ -1,6 +1,7 @@
 """The command line as a user meets it: real arguments in, exit code and one line out."""
 
 import json
+import math
 import subprocess
 import sys
 from importlib.metadata import version
@@ -43,12 +44,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clip(tmp_path: Path) -> Path:
-    return noise(tmp_path / "clip", *SIZE)
-
-
-@pytest.fixture
-def small_clip(tmp_path: Path) -> Path:
-    return noise(tmp_path / "small", HEIGHT, WIDTH)
+    return noise(tmp_path / "clip", HEIGHT, WIDTH)
 
 
 def synthesize(source: Path, weights: Path | str, out: Path, *options: str | Path) -> int:
@@ -67,34 +63,29 @@ def last_error(capsys: Capture) -> str:
 # One clip.
 
 
-def test_synthesize_writes_all_it_drew_and_says_what_nobody_stated(clip: Path, tmp_path: Path, capsys: Capture) -> None:
-    out = tmp_path / "out"
-    options = ["--azimuth-deg", "20", "--elevation-deg", "-5", "--radius", "1"]
-    assert synthesize(clip, KUBRIC, out, *options) == 0
-    assert "an elevation of 5 degrees and a radius of 15" in capsys.readouterr().out
-    assert len(list((out / "frames").glob("*.png"))) == 14
-    assert (out / "view.mp4").stat().st_size > 1000
-    assert (out / "strip.png").stat().st_size > 1000
-    arrays = np.load(out / "view.npz")
-    assert set(arrays) == {"latents"}
-    assert (arrays["latents"].shape, arrays["latents"].dtype) == ((1, 14, 4, 16, 24), np.float32)
-
-
-def test_poses_near_the_sphere_are_taken(clip: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_synthesize_writes_all_it_drew_says_what_nobody_stated_and_takes_poses_near_the_sphere(
+    clip: Path, tmp_path: Path, capsys: Capture
+) -> None:
     path = spherical_trajectory(ASSUMED_SOURCE, SphericalDelta(azimuth_deg=20.0), frames=14, move_time=13)
     np.save(tmp_path / "poses.npy", path.source_from_target.numpy())
-    outs = [tmp_path / "angles", tmp_path / "poses"]
+    size, latents = ["--height", str(HEIGHT), "--width", str(WIDTH)], []
     stated = ["--azimuth-deg", "20", "--source-elevation-deg", "5", "--source-radius", "15"]
-    for out, options in zip(outs, (stated, ["--poses", str(tmp_path / "poses.npy")]), strict=True):
-        assert synthesize(clip, KUBRIC, out, *options) == 0
-        assert ("is taken to stand" in capsys.readouterr().out) == (options is not stated)
-    angles, poses = (np.load(out / "view.npz")["latents"] for out in outs)
-    assert np.abs(angles - poses).max() < 1e-4
+    for name, options in (("angles", stated), ("poses", ["--poses", str(tmp_path / "poses.npy")])):
+        out = tmp_path / name
+        assert synthesize(clip, KUBRIC, out, *options, *size) == 0
+        assert ("an elevation of 5 degrees and a radius of 15" in capsys.readouterr().out) == (options is not stated)
+        assert len(list((out / "frames").glob("*.png"))) == 14
+        assert min((out / file).stat().st_size for file in ("view.mp4", "strip.png")) > 1000
+        arrays = np.load(out / "view.npz")
+        assert set(arrays) == {"latents"}
+        latents.append(arrays["latents"])
+    assert (latents[0].shape, latents[0].dtype) == ((1, 14, 4, HEIGHT // 8, WIDTH // 8), np.float32)
+    assert np.abs(latents[0] - latents[1]).max() < 1e-4
 
 
-def test_synthesize_writes_class_maps_and_where_samples_differ(small_clip: Path, tiny: Path, tmp_path: Path) -> None:
+def test_synthesize_writes_class_maps_and_where_samples_differ(clip: Path, tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert synthesize(small_clip, tiny, out, "--samples", "2") == 0
+    assert synthesize(clip, tiny, out, "--samples", "2") == 0
     assert len(list((out / "frames_s1").glob("*.png"))) == 14
     arrays = np.load(out / "view.npz")
     assert arrays["std"].shape == (14, HEIGHT, WIDTH)
@@ -110,36 +101,24 @@ def test_synthesize_writes_class_maps_and_where_samples_differ(small_clip: Path,
     assert len(strip) > 3 * HEIGHT + 8  # the legend below
 
 
-@pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> FakeSynthesizer:
-    """A live model in place of the one that is loaded."""
+def test_the_mount_reaches_clip_and_path_with_the_field_of_view_that_is_left_of_a_cropped_video(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = FakeSynthesizer(live_traits())
     monkeypatch.setattr(cli_offline, "load_synthesizer", lambda *_, **__: model)
-    return model
-
-
-@pytest.mark.parametrize(
-    ("options", "mount"),
-    [
-        ([], None),
-        (["--mount-height", "2.5", "--mount-tilt", "10"], CameraMount(height_m=2.5, tilt_deg=10.0)),
-        (["--hfov-deg", "100", "--mount-height", "2"], CameraMount(hfov_deg=100.0, height_m=2.0)),
-    ],
-)
-def test_the_mount_reaches_clip_and_path(
-    options: list[str], mount: CameraMount | None, small_clip: Path, tmp_path: Path, fake: FakeSynthesizer
-) -> None:
-    assert synthesize(small_clip, "fake", tmp_path / "out", *options) == 0
-    assert fake.clips[0].mount == mount
-    wanted = fake.traits.plan_view(mount=mount).source_from_target
-    assert torch.equal(fake.asked[0][0][0].source_from_target, wanted)
-
-
-def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, fake: FakeSynthesizer) -> None:
     write_video(tmp_path / "wide.mkv", [np.zeros((2 * WIDTH, 4 * WIDTH, 3), np.uint8)] * 14, 10.0)
-    assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / "out", "--hfov-deg", "90", "--mount-height", "2") == 0
-    mount = fake.clips[0].mount
-    assert mount.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(0.75)))  # 2:1 became 3:2
+    assumed, stated = (
+        2 * math.degrees(math.atan(0.75 * math.tan(math.radians(each)))) for each in (42.5, 45)
+    )  # 2:1 became 3:2
+    for options, mount in (
+        ([], None),
+        (["--mount-height", "2.5", "--mount-tilt", "10"], CameraMount(hfov_deg=assumed, height_m=2.5, tilt_deg=10.0)),
+        (["--hfov-deg", "90", "--mount-height", "2"], CameraMount(hfov_deg=stated, height_m=2.0)),
+    ):
+        assert synthesize(tmp_path / "wide.mkv", "fake", tmp_path / f"{len(model.clips)}", *options) == 0
+        assert model.clips[-1].mount == mount
+        wanted = model.traits.plan_view(mount=mount).source_from_target
+        assert torch.equal(model.asked[-1][0][0].source_from_target, wanted)
 
 
 @pytest.mark.parametrize(
@@ -147,20 +126,15 @@ def test_a_video_is_cropped_and_its_field_of_view_with_it(tmp_path: Path, fake: 
     [
         (KUBRIC, ["--azimuth-deg", "91"], 64, "[-90, 90]"),
         (DRIVING, ["--azimuth-deg", "5"], 64, ""),
-        (KUBRIC, ["--samples", "0"], 64, "samples"),
         (KUBRIC, ["--poses", "p.npy", "--move-time", "3"], 64, ""),
-        (KUBRIC, ["--guidance", "nan", "1.5"], 64, ""),
         (KUBRIC, ["--poses", "none.npy"], 66, "none.npy"),
         (KUBRIC, ["--device", "abacus"], 64, "abacus"),
-        ("package:none", [], 65, "none"),
         ("empty.ckpt", [], 65, "empty.ckpt"),
         ("html.ckpt", [], 65, "html.ckpt"),
         ("zeros.safetensors", [], 65, "zeros.safetensors"),
-        (KUBRIC, ["--family", "driving"], 64, "family"),
         (KUBRIC, ["--mount-height", "1.5"], 64, ""),
         (DRIVING, ["--mount-tilt", "3"], 64, ""),
         (TINY, ["--source-radius", "15", "--mount-left", "0"], 64, ""),
-        (LIVE, ["--mount-height", "nan"], 64, ""),
         (LIVE, ["--hfov-deg", "180"], 64, ""),
     ],
 )
@@ -194,9 +168,7 @@ def test_every_command_has_the_help_of_the_list_which_needs_no_torch(capsys: Cap
         assert run_app([name, "--help"]) == 0
     for arguments in (["synthesize"], ["view", "ipc", "--kind", "cls", "--hatch"], ["no-such-command"]):
         assert run_app(arguments) == 64
-    assert "no-such-command" in capsys.readouterr().err
-    assert run_app(["export", "--help"]) == 0
-    assert "[model] weights" in " ".join(capsys.readouterr().out.split())
+    capsys.readouterr()
     assert run_app(["--version"]) == 0
     assert capsys.readouterr().out == f"gcd-node {version('gcd-node')}\n"
     listed = "import sys; from gcd_node.cli.main import run_app; run_app(['--help']); assert 'torch' not in sys.modules"
@@ -212,14 +184,11 @@ raise SystemExit(run_app(["demo"]))
 """
 
 
+@pytest.mark.slow
 def test_the_demo_ends_with_pictures_of_what_arrived_in_the_other_process(tmp_path: Path) -> None:
     command = [sys.executable, "-c", RANDOM_DEMO]
-    threads = environment() | {"OMP_NUM_THREADS": "2"}
-    done = subprocess.run(command, cwd=tmp_path, env=threads, capture_output=True, text=True, timeout=110)
+    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=110)
     assert done.returncode == 0, done.stderr
-    assert "noise" in done.stdout
-    assert "Shown, from left to right: input" in " ".join(done.stdout.split())
-    assert "pictures in the other process" in done.stdout
     for name in ("side_by_side.mp4", "side_by_side.png"):
         assert (tmp_path / "gcd-demo" / name).stat().st_size > 10_000
 
@@ -249,6 +218,7 @@ def test_a_frame_is_answered_once_every_view_has_it_and_a_lost_window_misses_as_
         view_figures({"top": top, "side": side[:2]})
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_real_node_is_measured_under_the_published_names(tmp_path: Path) -> None:
     launch = tmp_path / "launch.toml"

@@ -13,14 +13,16 @@ import pytest
 import zmq
 from cameras import until
 from fakes import FakeNode
+from wire_messages import origin
 
 from gcd_client.control import ControlClient, Reply, decode_reply
 from gcd_client.endpoints import fingerprint, read_key_pair
 from gcd_client.protocol import PROTO
 from gcd_node.auth import Socket, load_server_security
 from gcd_node.cli.main import run_app
-from gcd_node.config import SecurityConfig
+from gcd_node.config import PublishConfig, SecurityConfig
 from gcd_node.control import ControlServer, FloodGuard, ReplyCache
+from gcd_node.publisher import Publisher
 from gcd_node.verbs import VERBS, RequestError, parse_command
 
 Capture = pytest.CaptureFixture[str]
@@ -183,37 +185,31 @@ def refused(part: bytes) -> RequestError:
     return caught.value
 
 
-@pytest.mark.parametrize("verb", sorted(VERBS))
-def test_every_verb_is_read_as_its_own_struct(verb: str) -> None:
-    command = parse_command(wire(verb, args=EXAMPLES.get(verb, {})))
-    assert command.verb == verb
-    assert type(command.args) is VERBS[verb].arguments
+def test_every_verb_is_read_as_its_own_struct() -> None:
+    for name, verb in VERBS.items():
+        command = parse_command(wire(name, args=EXAMPLES.get(name, {})))
+        assert (command.verb, type(command.args)) == (name, verb.arguments)
     assert parse_command(wire("remove_view", args={"view": "a"}, if_view_rev=2)).if_view_rev == 2
 
 
-@pytest.mark.parametrize(
-    ("changes", "code"),
-    [
+def test_f16_another_protocol_keeps_the_short_printable_id() -> None:
+    for changes, code in (
         *(({"proto": proto}, ("BAD_PROTO", "a1")) for proto in ("gcd/2.0", "", None, "gcd/1.0\n")),
         *(({"id": each}, ("BAD_ARG", "")) for each in ("", "x" * 65, "a\n", 7, "é")),
         ({"verb": "set_veiw"}, ("UNKNOWN_VERB", "a1")),
         ({"if_view_rev": 2}, ("BAD_ARG", "a1")),  # without a view
-    ],
-)
-def test_f16_another_protocol_keeps_the_short_printable_id(changes: dict[str, object], code: tuple[str, str]) -> None:
-    error = refused(json.dumps({"proto": PROTO, "id": "a1", "verb": "activate", **changes}).encode())
-    assert (error.code, error.request_id) == code
-    assert code[0] != "UNKNOWN_VERB" or "set_view" in str(error)  # the nearest
+    ):
+        error = refused(json.dumps({"proto": PROTO, "id": "a1", "verb": "activate", **changes}).encode())
+        assert (error.code, error.request_id) == code
+        assert code[0] != "UNKNOWN_VERB" or "set_view" in str(error)  # the nearest
 
 
-@pytest.mark.parametrize(
-    ("args", "says"),
-    [
+def test_f14_a_wrong_argument_is_bad_arg_and_named() -> None:
+    for args, says in (
         ({}, "view"),
         ({"view": "top\n"}, "view"),
         ({"view": "top", "azimut_deg": 1}, "azimuth_deg"),
         ({"view": "top", "azimuth_deg": "30"}, "azimuth_deg"),
-        ({"view": "top", "azimuth_deg": None}, "azimuth_deg"),
         ({"view": "top", "kind": "spiral"}, "kind"),
         ({"view": "top", "T_src_dst": IDENTITY[:15]}, "T_src_dst"),
         ({"view": "top", "T_src_dst": IDENTITY, "radius": 1}, "radius, or"),
@@ -221,28 +217,21 @@ def test_f16_another_protocol_keeps_the_short_printable_id(changes: dict[str, ob
         ({"view": "top", "kind": "orbit"}, "rate_deg_s"),
         ({"view": "top", "rate_deg_s": 3}, "rate_deg_s"),
         ([], "array"),
-    ],
-)
-def test_f14_a_wrong_argument_is_bad_arg_and_named(args: object, says: str) -> None:
-    error = refused(wire("set_view", args=args))
-    assert error.code == "BAD_ARG"
-    assert says in str(error)
+    ):
+        error = refused(wire("set_view", args=args))
+        assert error.code == "BAD_ARG"
+        assert says in str(error)
 
 
-@pytest.mark.parametrize(
-    ("args", "arg", "allowed"),
-    [
+def test_f14_out_of_range_gives_the_allowed_interval() -> None:
+    for args, arg, allowed in (
         ({"steps": 0}, "steps", [1, 1000]),
-        ({"steps": 1001}, "steps", [1, 1000]),
         ({"jpeg_quality": 49}, "jpeg_quality", [50, 100]),
-        ({"seed": -1}, "seed", [0, 2**53 - 1]),
         ({"seed": 2**53}, "seed", [0, 2**53 - 1]),
         ({"guidance": [1.0, -0.5]}, "guidance", [0, 100]),
-    ],
-)
-def test_f14_out_of_range_gives_the_allowed_interval(args: dict[str, object], arg: str, allowed: list[int]) -> None:
-    error = refused(wire("set_param", args=args))
-    assert (error.code, error.result) == ("OUT_OF_RANGE", {"allowed": {arg: allowed}})
+    ):
+        error = refused(wire("set_param", args=args))
+        assert (error.code, error.result) == ("OUT_OF_RANGE", {"allowed": {arg: allowed}})
 
 
 @pytest.fixture
@@ -256,16 +245,12 @@ def test_ctl_shows_the_result_as_json_or_what_is_allowed(
     ctl: Callable[..., int], node: FakeNode, capsys: Capture
 ) -> None:
     assert ctl("set_view", "view=top", "azimuth_deg=30") == 0
-    assert capsys.readouterr().out.startswith("OK (the node is active)\n")
-    assert ctl("hello") == 0
     headline, _, result = capsys.readouterr().out.partition("\n")
-    assert (headline, json.loads(result)) == ("OK (the node is active)", {"role": "operator"})
+    assert (headline, json.loads(result)) == ("OK (the node is active)", {"view_rev": 2})
     assert ctl("remove_view", "view=1") == 0
     assert msgspec.to_builtins(node.heard[-1].args) == {"view": "1"}  # a name is text
-    capsys.readouterr()
     assert ctl("set_view", "view=top", "azimuth_deg=120") == 70
-    said = capsys.readouterr().err
-    assert said.startswith("error: set_view: OUT_OF_RANGE")
+    assert "OUT_OF_RANGE" in (said := capsys.readouterr().err)
     assert "[-90,90]" in said
 
 
@@ -281,25 +266,29 @@ def test_ctl_wants_key_value_once_and_both_keys_or_none(words: list[str]) -> Non
 
 
 def test_keys_made_on_the_command_line_open_the_door(tmp_path: Path, capsys: Capture, node: FakeNode) -> None:
-    for name in ("node", "desk"):
-        assert run_app(["keys", "new", str(tmp_path / name)]) == 0
+    assert [run_app(["keys", "new", str(tmp_path / name)]) for name in ("node", "desk")] == [0, 0]
     shown, pair = capsys.readouterr().out, read_key_pair(tmp_path / "desk")
-    assert pair.secret not in shown
+    assert (pair.secret in shown, fingerprint(pair.public) in shown) == (False, True)
     assert run_app(["keys", "show", str(tmp_path / "desk")]) == 0
     assert capsys.readouterr().out in shown
-    assert fingerprint(pair.public) in shown
     stanza = shown[shown.rindex("[client.NAME]") :].replace("NAME", "desk")
     (tmp_path / "allow.toml").write_text(stanza)
     security = load_server_security(SecurityConfig(keys=str(tmp_path / "node"), allow=str(tmp_path / "allow.toml")))
+    keys = ["--timeout", "20", "--keys", str(tmp_path / "desk"), "--node-key", str(tmp_path / "node" / "public.key")]
+    endpoints = PublishConfig(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0")
+    with Publisher(endpoints, security=security) as publisher:
+        publisher.note("status", origin(), {"state": "active", "level": 0})
+        assert run_app(["status", publisher.status_endpoint, "--once", *keys]) == 0
+        capsys.readouterr()
     with node.serve("tcp://127.0.0.1:0", security=security) as server:
-        line = ["ctl", "hello", "--json", "--endpoint", server.endpoint, "--timeout", "20"]
-        line += ["--keys", str(tmp_path / "desk"), "--node-key", str(tmp_path / "node" / "public.key")]
+        line = ["ctl", "hello", "--json", "--endpoint", server.endpoint, *keys]
         assert run_app(line) == 0
         assert json.loads(capsys.readouterr().out)["result"] == {"role": "viewer"}
         assert run_app([*line[:1], "activate", *line[3:]]) == 70
         assert "FORBIDDEN" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_who_talks_to_a_running_node_does_not_wait_for_torch(tmp_path: Path) -> None:
     code = (
         "import sys; from gcd_node.cli.main import run_app; "

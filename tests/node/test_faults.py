@@ -1,17 +1,18 @@
 """Each row of the failure table as a test named after it, through real sockets: `pytest tests/node -k f9_`.
 
-F5, F6, F9, F20, F23 and F25 are in test_fault_processes.py, F7 in test_camera_changes.py, F16 to F19 with control and
-security, F22 in test_recorder.py.
+F5, F9, F23 and F25 are in test_fault_processes.py, F6 in test_source_conformance.py, F7 in test_camera_changes.py, F15
+in test_node_life.py, F16 to F19 with control and security, F20 in test_publisher.py, F22 in test_recorder.py.
 """
 
 import gc
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,15 +25,10 @@ from gcd_client.subscriber import ViewSubscriber
 from gcd_model import (
     DeviceMemoryError,
     NonFiniteError,
-    RenderOptions,
-    SourceFeatures,
-    Trajectory,
-    View,
     ViewSynthesizer,
 )
 from gcd_node.config import ModelSection
 from gcd_node.errors import ConfigError, ModelFailedError, SourceLostError
-from gcd_node.frame import Frame
 from gcd_node.health import Health
 from gcd_node.model import FailureCounter, oom_levels
 from gcd_node.service import ServiceManager
@@ -165,19 +161,13 @@ def test_f10_without_a_reader_nothing_is_rendered_until_one_comes(tmp_path: Path
         until(lambda: "IDLE" not in rig.statuses()[-1]["reasons"])
 
 
-class Narrow(FakeSynthesizer):
-    """A model whose device holds one view at a time."""
-
-    def render(
-        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        if len(trajectories) > 1:
-            raise DeviceMemoryError("no room for two")
-        return super().render(features, trajectories, options)
+def full() -> None:
+    raise DeviceMemoryError("out of memory")
 
 
 def test_f11_a_full_device_is_asked_for_less_and_goes_on(tmp_path: Path) -> None:
-    with Rig(tmp_path, lambda _: Steady(), Narrow(traits()), config=LOCKSTEP, views=TWO_VIEWS) as rig:
+    model = FakeSynthesizer(traits(), lambda _: full() if len(model.asked[-1][0]) > 1 else None)
+    with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=TWO_VIEWS) as rig:
         rig.await_views(2, "other")
         told = rig.await_event("GPU_OOM")
         status = rig.await_status(lambda status: status["model"]["state"] == "degraded")
@@ -188,10 +178,8 @@ def test_f11_a_full_device_is_asked_for_less_and_goes_on(tmp_path: Path) -> None
 
 
 def test_f11_a_model_that_never_finds_memory_fails_and_the_node_stays(tmp_path: Path) -> None:
-    def full(_: RenderOptions) -> None:
-        raise DeviceMemoryError("out of memory")
-
-    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), full), config=LOCKSTEP) as rig:
+    model = FakeSynthesizer(traits(), Mock(side_effect=DeviceMemoryError("out of memory")))
+    with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP) as rig:
         rig.await_event("MODEL_FAILED")
         rig.await_state("inactive")
         status = rig.await_status(lambda status: "MODEL_FAILED" in status["reasons"] and status["state"] == "inactive")
@@ -216,27 +204,13 @@ def test_f11_only_three_failures_within_a_minute_at_the_bottom_are_the_end() -> 
         failures.out_of_memory(1, DeviceMemoryError("full"), levels)
 
 
-class OnGpu(FakeSynthesizer):
-    """Says that it is on a GPU, and fits there in bfloat16 alone; holds itself in a cycle, as modules may."""
-
-    def __init__(self, section: ModelSection) -> None:
-        precision = section.dtype or "float32"
-        super().__init__(replace(traits(), device="cuda:0", precision=precision))
-
-    def render(
-        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        if self.traits.precision == "float32":
-            raise DeviceMemoryError("out of memory")
-        return super().render(features, trajectories, options)
-
-
 def test_f11_a_full_gpu_gets_the_same_model_in_bfloat16(tmp_path: Path) -> None:
-    loaded, still_there = list["weakref.ref[OnGpu]"](), list[int]()  # when the next one is loaded
+    loaded, still_there = list["weakref.ref[ViewSynthesizer]"](), list[int]()  # when the next one is loaded
 
     def load(section: ModelSection) -> ViewSynthesizer:
         still_there.append(sum(model() is not None for model in loaded))
-        made = OnGpu(section)
+        told = replace(traits(), device="cuda:0", precision=section.dtype or "float32")
+        made = FakeSynthesizer(told, lambda _: full() if section.dtype is None else None)
         loaded.append(weakref.ref(made))
         return made
 
@@ -257,16 +231,12 @@ def test_f11_a_full_gpu_gets_the_same_model_in_bfloat16(tmp_path: Path) -> None:
 
 
 def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) -> None:
-    seeds: list[int] = []
-
-    def broken(options: RenderOptions) -> None:
-        seeds.append(options.seed)
-        raise NonFiniteError("NaN")
-
-    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), broken), config=LOCKSTEP) as rig:
+    model = FakeSynthesizer(traits(), Mock(side_effect=NonFiniteError("NaN")))
+    with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP) as rig:
         rig.await_event("MODEL_FAILED")
         rig.await_state("inactive")
         told = rig.events("MODEL_NAN")
+    seeds = [options.seed for _, options in model.asked][-6:]
     assert [event["window_id"] for event in told] == [0, 1, 2]
     assert [seed for event in told for seed in event["seeds"]] == seeds
     assert len(set(seeds)) == 6  # one retry each, with another seed
@@ -275,11 +245,6 @@ def test_f12_pictures_that_are_no_numbers_are_never_published(tmp_path: Path) ->
 
 
 def test_f13_an_input_without_a_picture_is_published_and_flagged() -> None:
-    class Covered(FakeSource):
-        def frames(self) -> Iterator[Frame]:
-            for frame in super().frames():
-                yield replace(frame, image=np.full_like(frame.image, self.levels[frame.seq % 2]))
-
     for levels, flags in (
         ((0, 0), {"exposure", "static"}),  # black
         ((255, 255), {"exposure", "static"}),  # saturated
@@ -287,9 +252,9 @@ def test_f13_an_input_without_a_picture_is_published_and_flagged() -> None:
         ((0, 4), {"exposure"}),  # dark
         ((120, 124), set()),
     ):
-        source = Covered(14)
-        source.levels = levels
-        box = run(fake_config(), source=source)
+        drawn = [np.full((64, 96, 3), level, np.uint8) for level in levels]
+        covered = FakeSource(14, edit=lambda frame, drawn=drawn: replace(frame, image=drawn[frame.seq % 2]))
+        box = run(fake_config(), source=covered)
         assert set(box.of("win")[0].header.quality.ood) == flags
 
 
@@ -307,23 +272,6 @@ def test_f14_an_impossible_view_is_refused_with_what_is_allowed_and_nothing_chan
         assert rig.ask("set_view", view="mian", azimuth_deg=5.0).code is Code.UNKNOWN_VIEW
         assert rig.ask("set_view", view="main", azimut_deg=5.0).code is Code.BAD_ARG
         assert rig.ask("views").result == before
-
-
-def test_f15_a_window_in_work_keeps_the_view_it_was_begun_with(tmp_path: Path) -> None:
-    begun, go_on = threading.Semaphore(0), threading.Semaphore(0)
-
-    def step(options: RenderOptions) -> None:
-        begun.release()
-        assert go_on.acquire(timeout=30)
-
-    with Rig(tmp_path, lambda _: Steady(), FakeSynthesizer(traits(), step), config=LOCKSTEP) as rig:
-        assert begun.acquire(timeout=30)
-        assert rig.ask("set_view", view="main", azimuth_deg=-30.0).code is Code.OK
-        go_on.release(1000)
-        first, second = rig.await_views(2)[:2]
-    assert [view.header.view_rev for view in (first, second)] == [1, 2]
-    poses = [view.header.pose[-1].az_deg for view in (first, second) if view.header.pose]
-    assert poses == [10.0, -30.0]
 
 
 @pytest.fixture

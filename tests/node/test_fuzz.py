@@ -18,6 +18,7 @@ from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator, outcomes
 from wire_messages import BOOT, class_map, depth, end, jpeg_window, origin, pixels, view_header, visibility, window
 
 from gcd_client.control import Code, Reply, Request, encode_request
+from gcd_client.frames import decode_frame, encode_frame
 from gcd_client.images import colours, decode_jpegs, images
 from gcd_client.protocol import (
     PREFIX,
@@ -38,6 +39,7 @@ from gcd_node.errors import ConfigError, SourceError
 from gcd_node.frame import load_lens
 from gcd_node.sources.files import read_picture
 from gcd_node.verbs import VERBS, RequestError, parse_command
+from gcd_node.viewer.feed import parse_request
 
 pytestmark = pytest.mark.timeout(max(120, ROUNDS // 10))
 
@@ -69,6 +71,14 @@ def read_message(part: bytes, _: Path) -> str:
 def read_message_without_checksum(part: bytes, _: Path) -> str:
     """So that the checks behind the checksum are reached."""
     return use(decode(part if len(part) < PREFIX.size else part[:56] + bytes(4) + part[60:]))
+
+
+def read_frame(part: bytes, _: Path) -> str:
+    return str(decode_frame(part).image.dtype)
+
+
+def read_page(part: bytes, _: Path) -> str:
+    return parse_request(part.decode(errors="replace")).type
 
 
 def request(verb: str, args: object, **more: object) -> bytes:
@@ -153,7 +163,17 @@ def picture(suffix: str, width: int = 24, height: int = 16, *options: int) -> by
 JPEGS = [picture(".jpg"), picture(".jpg", 40, 8), picture(".jpg", 24, 16, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)]
 PICTURES = [*JPEGS, *map(picture, (".png", ".bmp", ".webp", ".tiff"))]
 MESSAGES = [encode(each) for each in (window(), jpeg_window(), class_map(), end(), status())]
+FRAMES = [
+    encode_frame(BOOT, 0, pixels(5, frames=1)[0], 5, np.ones((4, 6), np.float32), np.eye(4), checksum=False),
+    encode_frame(BOOT, 0, JPEGS[0], 5),
+]
+PAGE = [
+    b'{"type": "ask", "id": 5, "verb": "set_view", "args": {"view": "top"}}',
+    b'{"type": "watch", "view": "top"}',
+    b'{"type": "hello", "token": "abc"}',
+]
 ANY = TEXT_PIECES + BYTE_PIECES
+READ = ["message", "unchecked", "frame", "page", "request", "launch", "changes", "clients", "lens", "picture", "jpeg"]
 
 
 @pytest.mark.parametrize(
@@ -161,6 +181,8 @@ ANY = TEXT_PIECES + BYTE_PIECES
     [
         (read_message, MESSAGES, ANY, MessageError, 0.25, 0),
         (read_message_without_checksum, MESSAGES, ANY, MessageError, 0.25, 0.05),
+        (read_frame, FRAMES, ANY, MessageError, 0.25, 0.05),
+        (read_page, PAGE, TEXT_PIECES, MessageError, 0.25, 0.05),
         (lambda part, _: parse_command(part).verb, REQUESTS, TEXT_PIECES, RequestError, 0.25, 0.05),
         (read_launch_file, [CONFIG, *LAUNCH], TEXT_PIECES, ConfigError, 0.25, 0.05),
         (read_changes, CHANGES, TEXT_PIECES, ConfigError, 0.25, 0.05),
@@ -169,7 +191,7 @@ ANY = TEXT_PIECES + BYTE_PIECES
         (lambda part, path: read_file(path, part, read_picture), PICTURES, BYTE_PIECES, SourceError, 0.02, 0.02),
         (read_jpeg, JPEGS, BYTE_PIECES, MessageError, 0.02, 0.02),
     ],
-    ids=["messages", "no checksum", "requests", "launch files", "changes", "clients", "lens", "picture", "jpeg view"],
+    ids=READ,
 )
 def test_what_was_tampered_with_ends_as_what_it_is_or_a_documented_error(
     tmp_path: Path,

@@ -8,7 +8,6 @@ import socket
 import stat
 import subprocess
 import sys
-from fnmatch import fnmatch
 from pathlib import Path
 
 import msgspec
@@ -17,10 +16,9 @@ import pytest
 from cameras import write_video
 from fakes import write_tiny
 from msgspec.structs import replace
-from typer.main import get_command
 
 from gcd_node.check import check_launch
-from gcd_node.cli.main import COMMANDS, new_app, run_app
+from gcd_node.cli.main import COMMANDS, run_app
 from gcd_node.config import NodeConfig, PublishConfig, load_config, parse_config
 from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
 from gcd_node.publisher import Publisher
@@ -84,6 +82,7 @@ def verified(folder: Path, text: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
     text = UNIT.read_text()
     assert INSTALLED in text
@@ -101,19 +100,14 @@ def test_the_unit_is_confined_and_a_restart_is_for_what_a_restart_can_mend() -> 
     said = unit()
     assert said["DeviceAllow"] == ["char-usb_device rw", "char-video4linux rw"]
     assert "PrivateDevices" not in said  # it would hide the cameras
-    wanted = {
-        "Type": "notify",
-        "Restart": "on-failure",
-        "StartLimitBurst": "5",
-        "User": "gcd",
-        "DevicePolicy": "closed",
-    }
-    assert {key: said[key] for key in wanted} == {key: [value] for key, value in wanted.items()}
+    wanted = ["Type=notify", "Restart=on-failure", "StartLimitBurst=5", "User=gcd", "DevicePolicy=closed"]
+    assert [line for line in wanted if line not in UNIT.read_text().splitlines()] == []
     (codes,) = said["RestartPreventExitStatus"]
     hopeless = {each.exit_code for each in (UsageError, TooShortError, SourceError, ConfigError)}
     assert set(map(int, codes.split())) == hopeless == {64, 65, 66, 78}
 
 
+@pytest.mark.slow
 def test_the_node_does_under_the_units_settings_what_the_unit_says(tmp_path: Path) -> None:
     runtime, said = tmp_path / "run", unit()
     runtime.mkdir()
@@ -145,29 +139,21 @@ def test_the_node_does_under_the_units_settings_what_the_unit_says(tmp_path: Pat
     assert (runtime.exists(), list(runtime.iterdir())) == (True, [])
 
 
-def instructions() -> list[tuple[str, str]]:
-    text = re.sub(r"^#.*\n", "", (LAUNCH / "docker" / "Dockerfile").read_text(), flags=re.MULTILINE)
-    lines = text.replace("\\\n", " ").splitlines()
-    return [(name, rest) for name, _, rest in (line.partition(" ") for line in lines) if name]
-
-
-def all_of(name: str) -> list[str]:
-    return [rest for each, rest in instructions() if each == name]
-
-
 def test_the_container_copies_what_is_there_runs_as_nobody_special_and_calls_commands_that_exist() -> None:
+    text = re.sub(r"^#.*\n", "", (LAUNCH / "docker" / "Dockerfile").read_text(), flags=re.MULTILINE)
     ignore = (LAUNCH / "docker" / "Dockerfile.dockerignore").read_text().splitlines()
+
+    def all_of(name: str) -> list[str]:
+        return re.findall(rf"^{name} (.*)", text.replace("\\\n", " "), re.MULTILINE)
+
     copied = {source for rest in all_of("COPY") for source in rest.split()[:-1]}
     assert ignore[1] == "*"
     assert copied == {line[1:] for line in ignore if line.startswith("!")}  # not left out of the build
     assert [source for source in copied if not (ROOT / source).exists()] == []
-    assert not any(fnmatch(source, pattern) for source in copied for pattern in ignore[2:] if pattern[0] not in "!#")
-    commands = get_command(new_app(COMMANDS)).commands  # type: ignore[attr-defined]
     (health,), (start,) = all_of("HEALTHCHECK"), all_of("CMD")
-    assert msgspec.json.decode(health.partition("CMD ")[2]) == ["gcd-node", "status", "--once"]
-    assert "--once" in {option for each in commands["status"].params for option in each.opts}
-    first, config = msgspec.json.decode(start, type=list[str])
-    assert first in commands
+    assert health.endswith('["gcd-node", "status", "--once"]')
+    command, config = msgspec.json.decode(start, type=list[str])
+    assert command in COMMANDS
     assert f"launch/{Path(config).name}" in " ".join(all_of("COPY"))
     assert (all_of("USER"), all_of("STOPSIGNAL")) == (["10001:10001"], ["SIGTERM"])
 
@@ -209,20 +195,18 @@ def test_a_good_launch_file_is_looked_at_from_end_to_end(launch: Path) -> None:
     assert not (launch.parent / "data").exists()  # nothing stays bound
 
 
-@pytest.mark.parametrize(
-    ("change", "topic", "code"),
-    [
+def test_what_fails_is_the_exit_code(launch: Path, capsys: Capture) -> None:
+    for change, topic, code in (
         ("source.path=/no/such.mp4", "source", 66),
+        ('source={kind = "v4l2", device = "/dev/video-none"}', "source", 69),
         ("model.weights=/no/such.ckpt", "weights", 65),
         ("model.weights=package:unheard", "weights", 65),
         ("view.main.azimuth_deg=5", "views", 64),
         ("publish.data=tcp://0.0.0.0:5580", "endpoints", 78),
-    ],
-)
-def test_what_fails_is_the_exit_code(change: str, topic: str, code: int, launch: Path, capsys: Capture) -> None:
-    assert found(launch, change)[topic][0] == "failed"
-    assert run_app(["check", str(launch), "--set", change]) == code
-    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
+    ):
+        assert found(launch, change)[topic][0] == "failed"
+        assert run_app(["check", str(launch), "--set", change]) == code
+        assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
 
 
 def test_one_failure_does_not_hide_the_next_and_weights_must_fit_into_memory(launch: Path, tmp_path: Path) -> None:
@@ -237,15 +221,15 @@ def test_one_failure_does_not_hide_the_next_and_weights_must_fit_into_memory(lau
 
 def test_where_recordings_would_go_is_looked_at(launch: Path, tmp_path: Path) -> None:
     folder = tmp_path / "new" / "recordings"
-    verdict, detail = found(launch, f"record.folder={folder}", "record.keep_free_mb=0")["record"]
-    assert verdict == "ok"
-    assert "inputs, views" in detail
-    assert list(folder.iterdir()) == []
-    assert found(launch, f"record.folder={folder}", "record.keep_free_mb=1e12")["record"][0] == "warning"
     (tmp_path / "file").write_text("")
-    verdict, detail = found(launch, f"record.folder={tmp_path}/file/x")["record"]
-    assert verdict == "failed"
-    assert "check folder in [record]" in detail
+    for where, keep_free_mb, verdict in (
+        (folder, 0, "ok"),
+        (folder, 1e12, "warning"),
+        (tmp_path / "file/x", 0, "failed"),
+    ):
+        changes = (f"record.folder={where}", f"record.keep_free_mb={keep_free_mb}")
+        assert found(launch, *changes)["record"][0] == verdict
+    assert list(folder.iterdir()) == []
 
 
 # The configuration as text.

@@ -88,13 +88,11 @@ def test_a_node_goes_through_its_life_as_it_is_asked(tmp_path: Path) -> None:
     assert [view.message.sequence for view in rig.of()] == [0, 2]  # 1 was the end of the first stream
 
 
-def asked(rig: Rig, verb: str) -> dict[str, Any]:
-    result = rig.ask(verb).result
-    assert result is not None
-    return result
+def asked(rig: Rig, verb: str) -> Any:
+    return rig.ask(verb).result
 
 
-def test_several_views_come_from_one_batch_and_change_alone(tmp_path: Path) -> None:
+def test_f15_a_window_in_work_keeps_its_views_which_come_from_one_batch_and_change_alone(tmp_path: Path) -> None:
     gate = Gate()
     model = FakeSynthesizer(traits(), gate)
     with Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=TWO_VIEWS, more="") as rig:
@@ -150,11 +148,10 @@ def test_a_node_tells_who_it_is_and_parameters_change_from_the_next_window_on(tm
         rig.await_views(1)
         hello, described = asked(rig, "hello"), asked(rig, "describe")
         assert (hello["boot_id"], hello["node_id"], hello["role"]) == (rig.views[0].header.boot_id, "gcd", "operator")
-        limits = {"azimuth_deg": [-90.0, 90.0], "elevation_deg": [-30.0, 30.0], "radius": [-3.0, 3.0]}
-        assert (described["limits"], described["fps"]) == (limits, [6.0, 8.0, 12.0, 24.0])
+        assert described["limits"] == {"azimuth_deg": [-90, 90], "elevation_deg": [-30, 30], "radius": [-3, 3]}
+        assert described["fps"] == [6.0, 8.0, 12.0, 24.0]
         assert asked(rig, "get_calib")["K"] == pytest.approx(list(rig.views[0].header.intrinsics or ()))
-        state = asked(rig, "state")
-        assert (state["state"], state["source"]) == ("active", "streaming")
+        assert (asked(rig, "state")["state"], asked(rig, "state")["source"]) == ("active", "streaming")
         assert "heartbeat_seq" not in asked(rig, "stats")
         assert rig.ask("record_start").code is Code.NOT_READY
         reply = rig.ask("set_param", steps=3, guidance=[1.0, 2.0], publish="jpeg", jpeg_quality=60)
@@ -200,8 +197,6 @@ def test_live_stamps_are_utc_with_one_offset_for_all_views_of_a_window(tmp_path:
     assert header.clock == "realtime"
     assert header.t_capture_ns == other.t_capture_ns
     assert began_ns - 50_000_000 <= header.t_capture_ns[0] <= header.t_capture_ns[-1] <= header.t_infer_start_ns
-    steps = {b - a for a, b in zip(header.t_capture_ns, header.t_capture_ns[1:], strict=False)}
-    assert max(steps) - min(steps) <= 1  # nanoseconds: nobody makes new stamps
     since_ms = (header.t_publish_ns - header.t_capture_ns[-1]) / 1e6
     assert header.age_ms == pytest.approx(since_ms, abs=20)
 

@@ -1,4 +1,4 @@
-"""Cameras through OpenCV: a scripted Video4Linux device, and a real RTSP server on loopback, whose password is never
+"""Cameras through OpenCV: a scripted Video4Linux device, and a network camera on loopback, whose password is never
 repeated."""
 
 import logging
@@ -16,8 +16,7 @@ from unittest.mock import create_autospec
 import cv2
 import msgspec
 import pytest
-from cameras import FPS, HEIGHT, WIDTH, Bench, Camera, FakeVideoCapture, environment, flat, until
-from rtsp_server import RtspServer, serving, write_transport_stream
+from cameras import FPS, HEIGHT, WIDTH, Bench, Camera, FakeVideoCapture, environment, flat, serving, until
 
 from gcd_node.errors import ConfigError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
@@ -48,12 +47,9 @@ def test_the_pixel_format_is_set_before_the_size_and_what_differs_is_logged(capl
     with caplog.at_level(logging.WARNING):
         source = camera(fake, width=1280, height=720, fps=30.0)
     source.close()
-    order = [prop for prop, _ in fake.calls]
     size_and_rate = [cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS]
-    assert order == [cv2.CAP_PROP_FOURCC, *size_and_rate]
-    assert [record.getMessage() for record in caplog.records] == [
-        "the camera /dev/null: asked for width 1280, it gives 640"
-    ]
+    assert [prop for prop, _ in fake.calls] == [cv2.CAP_PROP_FOURCC, *size_and_rate]
+    assert ["640" in record.getMessage() for record in caplog.records] == [True]
     assert (source.info.codec, source.info.fps_nominal) == ("MJPG", 30.0)
 
 
@@ -126,18 +122,15 @@ def test_a_real_camera_gives_a_second_of_pictures() -> None:
 # Network streams.
 
 
-@pytest.mark.parametrize(
-    ("url", "shown"),
-    [
+def test_an_address_is_shown_without_what_may_be_secret() -> None:
+    for url, shown in (
         (f"rtsp://admin:{SECRET}@cam.local/stream1", "rtsp://cam.local"),
         (f"RTSP://admin:{SECRET}@10.0.0.7:8554/x?token={SECRET}", "rtsp://10.0.0.7:8554"),
         (f"rtsp://cam.local:554/user=admin_password={SECRET}_channel=1.sdp", "rtsp://cam.local:554"),
         (f"http://[fe80::1]:8080/video?key={SECRET}", "http://[fe80::1]:8080"),
         ("udp://@:5000", "udp://:5000"),
-    ],
-)
-def test_an_address_is_shown_without_what_may_be_secret(url: str, shown: str) -> None:
-    assert shown_address(url) == shown
+    ):
+        assert shown_address(url) == shown
 
 
 def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated_and_one_too_large_to_decode() -> None:
@@ -153,56 +146,45 @@ def test_what_is_no_address_of_a_stream_is_refused_and_not_repeated_and_one_too_
         _ = open_stream(RtspSource(url="rtsp://host/x"), open_capture=FakeVideoCapture(RED, fixed=huge).open).info
 
 
-@pytest.mark.parametrize(
-    ("arrivals_ms", "old"),
-    [
+def test_a_burst_is_old_and_what_follows_in_time_is_not() -> None:
+    for arrivals_ms, old in (
         ([0.0, 1.0, 2.0, 3.0, 43.0, 83.0, 90.0], [0, 1, 2, 3]),  # what piled up before the start
         ([0.0, 40.0, 80.0, 900.0, 901.0, 902.0, 941.0], [0, 3, 4, 5]),  # and in a silence
         ([0.0, 40.0, 110.0, 115.0, 160.0, 239.0, 241.0], [0]),  # jitter is no burst
         ([10.0 * i for i in range(220)], [*range(201)]),  # what never waits is believed after two seconds
-    ],
-)
-def test_a_burst_is_old_and_what_follows_in_time_is_not(arrivals_ms: list[float], old: list[int]) -> None:
-    backlog = Backlog(period_ns=40_000_000)
-    assert [i for i, each in enumerate(arrivals_ms) if backlog.holds(round(each * 1e6))] == old
+    ):
+        backlog = Backlog(period_ns=40_000_000)
+        assert [i for i, each in enumerate(arrivals_ms) if backlog.holds(round(each * 1e6))] == old
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """24 s whose red channel rises by 1 every 3 pictures."""
-    images = [flat(i // 3, 60, 200) for i in range(600)]
-    return write_transport_stream(tmp_path_factory.mktemp("stream") / "live.ts", images)
+RISING = [flat(i // 3, 60, 200) for i in range(600)]
+"""24 s whose red channel rises by 1 every 3 pictures."""
 
 
-@pytest.fixture
-def server(recording: Path) -> Iterator[RtspServer]:
-    with serving(recording) as running:
-        yield running
-
-
-def test_what_piled_up_in_a_silence_is_not_new_and_after_a_long_one_it_is_lost(server: RtspServer) -> None:
-    source = open_stream(RtspSource(url=server.url, open_timeout_s=GUARD_S), read_timeout_s=4.0)
-    frames = source.frames()
-    before = next(frames)
-    server.stall()
-    time.sleep(1.5)
-    server.resume()
-    after = next(frame for frame in frames if frame.stamp_ns - before.stamp_ns > 1_400_000_000)
-    shown_s = (int(after.image[20, 20, 0]) - int(before.image[20, 20, 0])) * 3 / 25
-    assert shown_s >= (after.stamp_ns - before.stamp_ns) / 1e9 - 1.0  # what piled up is 1.5 s older than its arrival
-    server.stall()
-    begin = time.monotonic()
-    with pytest.raises(SourceLostError):
-        list(frames)
-    assert 2.0 < time.monotonic() - begin < GUARD_S
+def test_what_piled_up_in_a_silence_is_not_new_and_after_a_long_one_it_is_lost() -> None:
+    with serving(RISING) as (url, awake):
+        source = open_stream(RtspSource(url=url, open_timeout_s=GUARD_S), read_timeout_s=2.5)
+        frames = source.frames()
+        before = next(frames)
+        awake.clear()
+        time.sleep(1.5)
+        awake.set()
+        after = next(frame for frame in frames if frame.stamp_ns - before.stamp_ns > 1_400_000_000)
+        shown_s = (int(after.image[20, 20, 0]) - int(before.image[20, 20, 0])) * 3 / 25
+        assert shown_s >= (after.stamp_ns - before.stamp_ns) / 1e9 - 1.0  # what piled up is older than its arrival
+        awake.clear()
+        begin = time.monotonic()
+        with pytest.raises(SourceLostError):
+            list(frames)
+        assert 1.0 < time.monotonic() - begin < GUARD_S
 
 
 def test_a_password_opens_a_stream_and_is_never_repeated(
-    recording: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
-    with serving(recording, password=SECRET) as server:
-        right = server.url.replace("//", f"//admin:{SECRET}@")
+    with serving(RISING, SECRET) as (url, _):
+        right = url.replace("//", f"//admin:{SECRET}@")
         source = open_stream(RtspSource(url=right, open_timeout_s=GUARD_S))
         assert next(source.frames()).size == (WIDTH, HEIGHT)
         assert SECRET not in f"{source.info}{threading.enumerate()}"
@@ -214,24 +196,25 @@ def test_a_password_opens_a_stream_and_is_never_repeated(
     assert "wr0ng" not in told
 
 
-def test_a_process_ends_although_a_read_never_returns(server: RtspServer) -> None:
+@pytest.mark.slow
+def test_a_process_ends_although_a_read_never_returns() -> None:
     code = (
         "import sys; from gcd_node.sources.opencv import RtspSource, open_stream\n"
         "source = open_stream(RtspSource(url=sys.argv[1], open_timeout_s=20), read_timeout_s=600)\n"
         "next(source.frames()); print('open', flush=True); sys.stdin.readline()\n"
         "source.close(); print('closed')\n"
     )
-    command = [sys.executable, "-c", code, server.url]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
-    ) as process:
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with (
+        serving(RISING) as (url, awake),
+        subprocess.Popen([sys.executable, "-c", code, url], env=environment(), **pipes) as process,
+    ):
         assert process.stdout.readline() == "open\n"
-        server.stall()
+        awake.clear()
         time.sleep(0.3)
         out, errors = process.communicate("go\n", timeout=60)
     assert (process.returncode, out) == (0, "closed\n")
-    assert errors.endswith("does not let go; its thread is left behind\n")
-    assert errors.count("\n") == 1
+    assert errors.count("\n") == 1  # that its thread is left behind
 
 
 # A live source over all its openings: stalled, lost, opened again, given up, closed.
@@ -393,16 +376,12 @@ def test_closing_does_not_wait_for_a_camera_that_is_being_opened() -> None:
     until(late.closed.is_set)  # nobody wants it any more
 
 
-def test_patience_follows_the_rate_and_waiting_doubles_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert patience_s(V4l2Source(), FPS) == (0.2, 1.8)
-    assert patience_s(V4l2Source(), 5.0) == pytest.approx((0.6, 1.8))
-    assert patience_s(V4l2Source(), 1.0) == pytest.approx((3.0, 6.0))
+def test_patience_follows_the_rate_and_waiting_doubles_up_to_its_limit() -> None:
+    for fps, patience in ((FPS, (0.2, 1.8)), (5.0, (0.6, 1.8)), (1.0, (3.0, 6.0))):
+        assert patience_s(V4l2Source(), fps) == pytest.approx(patience)
     assert patience_s(V4l2Source(stall_ms=500.0), FPS) == (0.5, 1.8)
-    for part in (0.8, 1.0, 1.2):
-        monkeypatch.setattr("random.uniform", lambda *_, part=part: part)
-        even = [part * wait for wait in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)]
-        assert [backoff_s("v4l2", i) for i in range(7)] == pytest.approx([min(10.0, wait) for wait in even])
-        assert [backoff_s("push", i) for i in range(3)] == pytest.approx([min(0.5, wait) for wait in even[:3]])
+    for kind, waits in (("v4l2", [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0]), ("push", [0.5] * 7)):
+        assert [backoff_s(kind, i) for i in range(7)] == pytest.approx(waits, rel=0.21)
 
 
 def test_an_opening_that_waits_for_the_one_before_has_its_own_time_afterwards() -> None:

@@ -136,11 +136,9 @@ def test_a_polynomial_that_turns_back_is_not_followed_and_a_calibration_that_see
 
 def detailed_texture(width: int, height: int) -> Image:
     """Noise at every scale down to single pixels, as grass and gravel have it."""
-    rng = np.random.default_rng(3)
-    out = np.full((height, width, 3), 127.0)
+    rng, out = np.random.default_rng(3), np.full((height, width, 3), 127.0)
     for octave in range(8):
-        size = (max(2, width >> octave), max(2, height >> octave))
-        layer = rng.normal(0, 14, (size[1], size[0], 3))
+        layer = rng.normal(0, 14, (max(2, height >> octave), max(2, width >> octave), 3))
         out += cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC)
     return np.rint(out).clip(0, 255).astype(np.uint8)
 
@@ -203,6 +201,9 @@ def test_a_calibration_cuts_to_the_trained_field_of_view_and_a_narrow_one_is_fla
 
 
 def test_a_stated_field_of_view_that_is_too_wide_is_cut_to_the_trained_one_where_pixels_are_left() -> None:
+    for fps, flags in ((23.976, ()), (20.0, ("fps",))):  # a trained one but for rounding, and none
+        run = prepared(f"window.fps={fps}")
+        assert (run.fps, run.ood) == (fps, flags)
     run = prepared("source.hfov_deg=90.0")
     assert hfov_deg(run) == pytest.approx(53.13, abs=0.05)
     assert run.ood == ()
@@ -224,12 +225,6 @@ def test_a_calibration_for_another_shape_is_refused_at_the_start_and_left_out_in
     kept = prepared(stated, width=640, height=360, before=before)
     assert (kept.fit.resize, kept.ood) == ("remap2x_area", ())
     assert prepared(lens=BARREL, before=prepared(lens=BARREL), **square).ood == ("hfov",)
-
-
-def test_a_stated_rate_that_is_a_trained_one_but_for_rounding_is_not_flagged() -> None:
-    for fps, flags in ((23.976, ()), (20.0, ("fps",))):
-        run = prepared(f"window.fps={fps}")
-        assert (run.fps, run.ood) == (fps, flags)
 
 
 @ALL_LENSES
@@ -383,31 +378,23 @@ def test_rectified_pictures_are_described_by_the_projection_matrix_and_who_was_n
     assert (lens.distortion, lens.coefficients) == ("none", ())  # DepthAI has undistorted it
 
 
-@pytest.mark.parametrize(
-    ("model", "d", "wanted"),
-    [
+def test_names_of_distortion_become_ours() -> None:
+    for model, d, wanted in (
         ("plumb_bob", (), ("none", 0)),
-        ("plumb_bob", (0.0,) * 5, ("none", 0)),
-        ("", (), ("none", 0)),
         ("plumb_bob", (0.1,) * 4, ("plumb_bob", 4)),
         ("plumb_bob", (0.1,) * 8, ("rational_polynomial", 8)),
         ("rational_polynomial", (0.1,) * 8, ("rational_polynomial", 8)),
-        ("rational_polynomial", (0.1,) * 14, ("rational_polynomial", 14)),
         ("equidistant", (0.1,) * 4, ("equidistant", 4)),
         ("fisheye", (0.1,) * 4, ("equidistant", 4)),
         ("fisheye", (0.0,) * 4, ("none", 0)),  # undistorted already
-        ("equidistant", (), ("none", 0)),
         # a wrong number of coefficients
         ("plumb_bob", (0.1,) * 3, None),
         ("rational_polynomial", (0.1,) * 5, None),
         ("equidistant", (0.1,) * 5, None),
-        ("equidistant", (0.1,) * 3, None),
-    ],
-)
-def test_names_of_distortion_become_ours(model: str, d: tuple[float, ...], wanted: tuple[str, int] | None) -> None:
-    with nullcontext() if wanted else pytest.raises(ConfigError):
-        lens = stated_lens(**INFO | {"model": model, "d": d})
-        assert (lens.distortion, len(lens.coefficients)) == wanted
+    ):
+        with nullcontext() if wanted else pytest.raises(ConfigError):
+            lens = stated_lens(**INFO | {"model": model, "d": d})
+            assert (lens.distortion, len(lens.coefficients)) == wanted
 
 
 def test_resizing_parts_and_joined_pixels_move_every_point_with_the_picture() -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from cameras import Bench, Camera, until
+from cameras import until
 from fakes import Box, FakeSource, fake_config, traits
-from rig import Rig
 from wire_messages import end, lines_of, origin, pixels, start_reader, window
 
 from gcd_client.images import images
@@ -56,10 +55,8 @@ def test_only_what_leaves_the_machine_s_memory_carries_a_checksum(tmp_path, cont
         views = plain_reader(context, publisher.endpoint, topic_key("view/top/win"))
         notes = plain_reader(context, publisher.status_endpoint, topic_key("status"))
         welcomed = plain_reader(context, publisher.endpoint, bytes(32))
-        assert (welcomed.poll(5000), welcomed.recv()) == (
-            zmq.POLLIN,
-            bytes(64),
-        )  # who wants no views
+        assert welcomed.poll(5000)
+        assert welcomed.recv() == bytes(64)  # who wants no views
         until(lambda: publisher.stats.subscribers == 1)
         publisher.send(window())
         publisher.note("status", origin(), {"state": "active"})
@@ -78,20 +75,6 @@ def test_lockstep_never_skips_for_a_slow_process(tmp_path, transport) -> None:
             publisher.send(window(i, images=big))
         publisher.end(end(window_id=29))
     assert lines_of(reader) == [*(f"{i} {i} 0 False {zlib.crc32(big)}" for i in range(30)), "end"]  # bit for bit
-
-
-def test_a_conflated_slow_reader_gets_the_newest_window_and_then_the_end(tmp_path) -> None:
-    with opened(tmp_path) as publisher:
-        reader = start_reader(publisher.endpoint, "top", "--slow", "0.15")
-        until(lambda: publisher.stats.subscribers == 1)
-        for i in range(40):
-            publisher.send(window(i))
-            time.sleep(0.01)
-        publisher.end(end(window_id=39), delay_ms=400)
-    seen = [int(line.split()[0]) for line in lines_of(reader)[:-1]]
-    assert seen[-1] == 39
-    assert seen == sorted(set(seen))
-    assert len(seen) < 30
 
 
 def test_sequences_count_each_topic_on_its_own_and_the_end_follows_by_its_delay(tmp_path, context) -> None:
@@ -190,15 +173,18 @@ def test_what_stops_the_thread_reaches_the_caller(tmp_path, monkeypatch) -> None
             call()
 
 
-def test_a_live_ipc_endpoint_is_refused_and_stays_alive_and_the_file_of_a_dead_process_is_replaced(tmp_path) -> None:
+def test_f20_a_live_ipc_endpoint_is_refused_and_stays_alive_and_the_file_of_a_dead_process_is_replaced(
+    tmp_path,
+) -> None:
     for endpoint in ("tcp://0.0.0.0:5580", "tcp://*:5580", "tcp://192.168.1.4:1", "tcp://robot:1"):
         with pytest.raises(ConfigError):  # beyond this machine, without keys
             opened(tmp_path, data=endpoint)
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(f"{tmp_path}/data")
     with opened(tmp_path, lockstep=True, readers=1) as first:
-        with pytest.raises(EndpointError):
+        with pytest.raises(EndpointError) as caught:
             opened(tmp_path)
+        assert (caught.value.exit_code, f"{tmp_path}/data" in str(caught.value)) == (73, True)
         with ViewSubscriber(first.endpoint, "top", conflate=False) as views:
             first.send(window())
             assert views.receive(5000) is not None
@@ -286,26 +272,21 @@ def preview(width: int, height: int, *changes: str) -> ViewMessage:
     return preview_message(shown, frame_of(width, height), time.monotonic_ns(), 3)
 
 
-@pytest.mark.parametrize(("width", "height"), [(96, 64), (640, 480), (641, 480), (1920, 1080), (3000, 100)])
-def test_a_preview_is_the_whole_picture_and_never_wider_than_said(width: int, height: int) -> None:
-    message = preview(width, height)
-    _, shown_height, shown_width, _ = message.header.shape
-    assert shown_width == min(width, PREVIEW_WIDTH)
-    assert shown_height == pytest.approx(shown_width * height / width, abs=0.51)
-    assert message.header.src.resize == ("none" if width <= PREVIEW_WIDTH else "area")
-    assert np.abs(images(message)[0].astype(int) - (200, 100, 50)).max() <= 4  # JPEG
-
-
-def test_a_preview_says_that_it_is_no_generated_view_and_what_frame_it_is() -> None:
+def test_a_preview_is_the_whole_picture_and_no_generated_view_and_says_what_frame_it_is() -> None:
+    for width, height in ((96, 64), (641, 480), (1920, 1080), (3000, 100)):
+        message = preview(width, height)
+        _, shown_height, shown_width, _ = message.header.shape
+        assert shown_width == min(width, PREVIEW_WIDTH)
+        assert shown_height == pytest.approx(shown_width * height / width, abs=0.51)
+        assert np.abs(images(message)[0].astype(int) - (200, 100, 50)).max() <= 4  # JPEG
+        assert message.header.intrinsics is None
     header = preview(1280, 720, "source.hfov_deg=90.0").header
     assert (header.view_id, header.synthetic, header.encoding, header.window_id) == ("src", False, "jpeg", -1)
     assert header.t_capture_ns == (5_000_000_000,)  # of a recording, its own clock
     assert (header.src.seq, header.src.epoch, header.model.name) == ((7,), 3, "none")
     assert 0 <= header.age_ms < 30_000
-    assert header.pose[0].az_deg == 0.0
     assert header.intrinsics[0] == pytest.approx(320.0)  # half of 640 over tan 45 degrees
     assert (header.intrinsics[2], header.intrinsics[5]) == (319.5, 179.5)
-    assert preview(1280, 720).header.intrinsics is None
 
 
 def test_nothing_is_made_while_nobody_looks_and_at_most_five_a_second_then() -> None:
@@ -329,23 +310,6 @@ def test_nothing_is_made_while_nobody_looks_and_at_most_five_a_second_then() -> 
     assert 0 < len(seqs) <= 50
     assert seqs == sorted(set(seqs))
     assert [message.topic for message in box.ends] == [PREVIEW_TOPIC]
-
-
-def test_a_subscriber_sees_the_input_and_is_told_of_its_end(tmp_path: Path) -> None:
-    camera = Camera()
-    with Rig(tmp_path, Bench(camera), config='kind = "v4l2"\nhfov_deg = 60.0', watched=False) as rig:
-        with ViewSubscriber(f"ipc://{tmp_path}/data", "src", "frm") as views:
-            rig.await_state("active")
-            until(lambda: rig.publisher.stats.previews == 1)
-            camera.run(30)
-            first = views.receive(60_000)
-            assert (first.images.shape, first.header.synthetic) == ((1, 64, 96, 3), False)
-            assert first.header.intrinsics is not None
-            assert np.abs(first.images.astype(int) - 20 - first.header.src.seq[0]).max() <= 3
-            assert 0 <= first.age_ms < 60_000
-            rig.ask("deactivate")
-            until(lambda: views.receive(100) is None and views.ended)
-        rig.await_state("inactive")
 
 
 def test_a_reader_of_previews_that_hangs_does_not_hold_up_a_lockstep_run(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Frames that somebody else pushes: who may, what is refused, what travels with a picture, and how it comes back."""
 
-import itertools
 import logging
 import subprocess
 import sys
@@ -15,17 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from cameras import Bench, Camera, environment, flat, pushing, until, write_video
-from fakes import FakeSynthesizer, painting_traits
+from cameras import environment, flat, pushing, until, write_video
+from fakes import NODE, OPERATOR, SECURITY, VIEWER
 from msgspec.structs import replace
-from rig import Rig
-from wire_messages import class_map, depth, visibility
+from wire_messages import class_map, depth, received, visibility
 
 from gcd_client import AuthError, ClientKeys, FramePusher
 from gcd_client.frames import encode_frame
 from gcd_client.protocol import ClassRecord
 from gcd_client.subscriber import ReceivedView
-from gcd_node.auth import Client, ServerSecurity, new_key_pair
+from gcd_node.auth import ServerSecurity
 from gcd_node.errors import ConfigError, EndpointError, SourceLostError
 from gcd_node.frame import Frame
 from gcd_node.sources import PushSource
@@ -36,9 +34,6 @@ RED = flat(250, 10, 20)
 SHAPE = RED.shape[:2]
 FPS = 50.0
 GUARD_S = 30.0
-NODE, VIEWER, OPERATOR = (new_key_pair() for _ in range(3))
-CLIENTS = {VIEWER.public: Client(name="eye", role="viewer"), OPERATOR.public: Client(name="hand", role="operator")}
-SECURITY = ServerSecurity(keys=NODE, find_client=CLIENTS.get)
 
 
 def red(pusher: FramePusher, _: int) -> None:
@@ -144,6 +139,7 @@ def test_over_tcp_an_operator_s_key_pushes_and_a_viewer_s_does_not() -> None:
         assert source.corrupt == 0
 
 
+@pytest.mark.slow
 def test_the_example_for_opencv_pushes_a_file(endpoint: str, tmp_path: Path) -> None:
     video = write_video(tmp_path / "clip.mkv", [RED] * 200, fps=25.0)
     script = Path(__file__).parents[2] / "launch" / "clients" / "push_opencv.py"
@@ -166,54 +162,8 @@ def planner(name: str = "planner") -> dict[str, Any]:
     return defined
 
 
-def held(awareness: Any, camera: Camera) -> Any:
-    """The next view that the planner holds, while the camera goes on. Its stamps lie on an even grid in the past: a
-    window of them takes as long as this machine needs, and none is spoilt by a slow one."""
-    found: list[Any] = []
-    stamps = itertools.count(time.monotonic_ns() - 1_000_000_000_000, round(1e9 / camera.info.fps_nominal))
-
-    def look() -> bool:
-        camera.shoot(stamp_ns=next(stamps))
-        found.append(awareness.poll(wait_ms=10.0))
-        return found[-1] is not None
-
-    until(look)
-    return found[-1]
-
-
-def live(folder: Path, camera: Camera) -> Rig:
-    """A node whose model draws class maps; it has just begun."""
-    return Rig(folder, Bench(camera), FakeSynthesizer(painting_traits()), views="[view.main]", watched=False)
-
-
-def test_the_planner_follows_a_node_to_its_end_and_into_its_next_life(tmp_path: Path) -> None:
-    defined = planner()
-    awareness = defined["Awareness"](f"ipc://{tmp_path}/data", "main", max_age_ms=1e9)
-    assert awareness.poll() is None
-    assert awareness.why_not == "nothing has come yet"
-    with live(tmp_path, camera := Camera(fps=10.0)):
-        first = held(awareness, camera)
-        assert 0.0 < defined["caution"](first) <= 1.0
-    until(lambda: awareness.poll(wait_ms=10) is None and awareness.ended)
-    assert awareness.why_not == "the stream has ended"
-    with live(tmp_path, camera := Camera(fps=10.0)):
-        second = held(awareness, camera)
-        assert second.header.boot_id != first.header.boot_id
-        assert awareness.why_not == "the node was started anew"
-        assert not awareness.ended
-        defined["time"] = types.SimpleNamespace(monotonic=lambda: awareness._until_s + 0.001)
-        until(lambda: awareness.poll() is None)
-        assert awareness.why_not == "the last one has expired"
-    awareness.close()
-
-
-def arrived(message: Any, **how: object) -> ReceivedView:
-    said = {"age_ms": message.header.age_ms, "expired": False, "skipped": 0, "restarted": False, **how}
-    return ReceivedView(message=message, **said)
-
-
 class Scripted:
-    """A subscriber that gives what a test lists, or leaves out a stale view."""
+    """A subscriber that gives what a test lists, leaves out a stale view, or ends."""
 
     ended, stale = False, 0
 
@@ -223,27 +173,42 @@ class Scripted:
     def receive(self, timeout_ms: float) -> ReceivedView | None:
         item = self._given.pop(0)
         self.stale += item == "stale"
+        self.ended = item == "end"
         return item if isinstance(item, ReceivedView) else None
 
 
-def test_the_planner_drops_what_is_stale_late_or_of_another_epoch(tmp_path: Path) -> None:
+def test_the_planner_drops_what_is_stale_late_of_another_epoch_or_another_life(tmp_path: Path) -> None:
     classes = (ClassRecord(id=0, name="road", colour=(0, 0, 0)), ClassRecord(id=1, name="car", colour=(0, 0, 255)))
     message = class_map(drawn=np.ones((14, 4, 6), np.uint8))
-    message = replace(message, header=replace(message.header, classes=classes))
+    quality = replace(message.header.quality, ood=())
+    message = replace(message, header=replace(message.header, classes=classes, quality=quality))
     src = replace(message.header.src, epoch=message.header.src.epoch + 1)
-    good, jumped = arrived(message), arrived(replace(message, header=replace(message.header, src=src)))
-    awareness = planner()["Awareness"](f"ipc://{tmp_path}/data", "main")
+    good, jumped = received(message), received(replace(message, header=replace(message.header, src=src)))
+    late, anew = received(message, expired=True), received(message, restarted=True)
+    defined = planner()
+    awareness = defined["Awareness"](f"ipc://{tmp_path}/data", "main")
+    assert awareness.poll() is None
+    assert awareness.why_not == "nothing has come yet"
     awareness.close()
-    awareness._views = Scripted(good, None, "stale", good, jumped, arrived(message, expired=True))
-    assert awareness.poll() is good
-    assert awareness.poll() is good  # nothing new, and not run out yet
+    for given, held, why_not in (
+        (good, good, ""),
+        (None, good, ""),  # nothing new, and not run out yet
+        ("stale", None, "what comes is older than max_age_ms"),
+        (good, good, ""),
+        (jumped, jumped, "the camera's clock or format jumped"),
+        (late, None, "it came too late"),
+        (good, good, ""),
+        ("end", None, "the stream has ended"),
+        (anew, anew, "the node was started anew"),
+    ):
+        awareness._views = Scripted(given)
+        assert awareness.poll() is held
+        assert why_not in awareness.why_not
+    assert defined["caution"](good) == 1.0
+    defined["time"] = types.SimpleNamespace(monotonic=lambda: awareness._until_s + 0.001)
+    awareness._views = Scripted(None)
     assert awareness.poll() is None
-    assert awareness.why_not == "what comes is older than max_age_ms"
-    assert awareness.poll() is good
-    assert awareness.poll() is jumped
-    assert awareness.why_not == "the camera's clock or format jumped"
-    assert awareness.poll() is None
-    assert awareness.why_not == "it came too late"
+    assert awareness.why_not == "the last one has expired"
 
 
 def seen_by(vis: np.ndarray, inverse: np.ndarray, **header: object) -> list[ReceivedView]:
@@ -253,7 +218,7 @@ def seen_by(vis: np.ndarray, inverse: np.ndarray, **header: object) -> list[Rece
     messages = visibility(seen=vis), depth(inverse=inverse.astype("<f2"))
     changes = {"source_from_view": (tuple(pose.ravel().tolist()),) * 2, "pose_units": "m"}
     changes["quality"] = replace(messages[0].header.quality, ood=())
-    return [arrived(replace(each, header=replace(each.header, **changes | header))) for each in messages]
+    return [received(replace(each, header=replace(each.header, **changes | header))) for each in messages]
 
 
 def test_obstacles_are_what_was_seen_now_where_it_was_and_never_of_two_windows(tmp_path: Path) -> None:

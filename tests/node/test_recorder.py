@@ -5,12 +5,14 @@ import hashlib
 import json
 import multiprocessing
 import os
+import re
 import subprocess
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -54,13 +56,9 @@ class Calibrated(FakeSource):
     """A source that knows its lens, with noise that no coder keeps whole."""
 
     def __init__(self, count: int = 30, fps: float = 24.0) -> None:
-        super().__init__(count, fps=fps, size=(192, 128))
+        draw = partial(np.random.default_rng(0).integers, 0, 256, (128, 192, 3), np.uint8)
+        super().__init__(count, fps=fps, size=(192, 128), edit=lambda frame: replace(frame, image=draw()))
         self.info = replace(self.info, lens=LENS)
-
-    def frames(self) -> Iterator[Frame]:
-        draw = np.random.default_rng(0)
-        for frame in super().frames():
-            yield replace(frame, image=draw.integers(0, 256, frame.image.shape, np.uint8))
 
 
 @dataclass(frozen=True)
@@ -128,17 +126,12 @@ def of(messages: Sequence[Said], topic: str) -> list[Said]:
     return [each for each in messages if each.topic == topic]
 
 
-def summary(path: Path) -> Any:
-    with path.open("rb") as file:
-        return make_reader(file).get_summary()
-
-
-def extras(path: Path) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
-    """Its metadata and attachments, by name."""
+def extras(path: Path) -> tuple[Any, dict[str, dict[str, str]], dict[str, bytes]]:
+    """Its summary, and its metadata and attachments by name."""
     with path.open("rb") as file:
         reader = make_reader(file)
         metadata = {each.name: each.metadata for each in reader.iter_metadata()}
-        return metadata, {each.name: each.data for each in reader.iter_attachments()}
+        return reader.get_summary(), metadata, {each.name: each.data for each in reader.iter_attachments()}
 
 
 def salvaged(path: Path, topic: str) -> list[int]:
@@ -178,14 +171,13 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
         assert rig.ask("record_stop").code is Code.WRONG_STATE
         assert rig.client.request("record_start", dry_run=True).code is Code.OK
         assert not folder.exists()
-        assert rig.ask("record_start").code is Code.ACCEPTED
+        assert [rig.ask("record_start").code for _ in range(2)] == [Code.ACCEPTED, Code.WRONG_STATE]
         begun = rig.await_event("REC_STARTED")
-        assert rig.ask("record_start").code is Code.WRONG_STATE
         camera.run(28)
         rig.await_views(2)
         status = rig.await_status(lambda status: status["rec"].get("written", 0) >= 2 * 28)
-        rig.ask("set_view", {"view": "main", "azimuth_deg": 20.0})
-        rig.ask("set_view", {"view": "main", "azimuth_deg": 900.0})
+        for azimuth_deg in (20.0, 900.0):
+            rig.ask("set_view", {"view": "main", "azimuth_deg": azimuth_deg})
         rig.ask("state")
         assert rig.ask("record_stop").code is Code.ACCEPTED
         stopped = rig.await_event("REC_STOPPED")
@@ -193,20 +185,20 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
         assert rig.ask("record_start").code is Code.ACCEPTED
         rig.await_event("REC_STARTED", 2)
     first, second = files(folder)
-    assert begun["file"] == f"{first.parent.name}/{first.name}"
-    assert (status["rec"]["state"], status["rec"]["file"]) == ("recording", begun["file"])
+    name = f"{first.parent.name}/{first.name}"
+    assert (begun["file"], status["rec"]["file"], status["rec"]["state"]) == (name, name, "recording")
     assert status["rec"]["dropped"] == {}
-    assert (stopped["reason"], stopped["finished"], stopped["level"]) == ("ASKED", True, 0)
     heard = said(first)
-    assert (stopped["bytes"], stopped["written"]) == (first.stat().st_size, len(heard))
-    told = [(each.told["verb"], each.told["role"], each.told["code"]) for each in of(heard, "/gcd/command")]
-    assert told == [  # no questions
+    ending = [stopped[key] for key in ("reason", "finished", "level", "bytes", "written")]
+    assert ending == ["ASKED", True, 0, first.stat().st_size, len(heard)]
+    commands = [each.told for each in of(heard, "/gcd/command")]
+    assert [(each["verb"], each["role"], each["code"]) for each in commands] == [  # no questions
         ("record_start", "operator", "ACCEPTED"),
         ("record_start", "operator", "WRONG_STATE"),
         ("set_view", "operator", "OK"),
         ("set_view", "operator", "OUT_OF_RANGE"),
     ]
-    assert of(heard, "/gcd/command")[-1].told["args"] == {"view": "main", "azimuth_deg": 900.0}
+    assert commands[-1]["args"] == {"view": "main", "azimuth_deg": 900.0}
     assert "VIEW_SET" in [each.told["code"] for each in of(heard, "/gcd/event")]
     assert rig.events("REC_STOPPED")[1]["reason"] == "SHUTDOWN"
     assert said(second)
@@ -215,7 +207,6 @@ def test_a_live_node_records_from_start_to_stop_and_says_so(tmp_path: Path) -> N
     assert [each.sequence for each in inputs] == list(range(3, 31))
     assert all(before_ns <= each.stamp_ns == each.log_ns <= time.time_ns() for each in inputs)
     assert all(abs(b.stamp_ns - a.stamp_ns - SECOND_NS / FPS) <= 1_000_000 for a, b in pairwise(inputs))
-    assert views
     assert {each.stamp_ns for each in views} <= set(captured_ns)
     by_number = {each.sequence: each.stamp_ns for each in of(heard, "/src/image")}
     near = [abs(each.stamp_ns - by_number[each.sequence]) for each in views if each.sequence in by_number]
@@ -230,7 +221,7 @@ def test_a_recording_that_rotated_is_read_part_by_part_and_plays_as_the_source_g
     numbers: list[int] = []
     for part, path in enumerate(found):
         heard = said(path)
-        metadata, attachments = extras(path)
+        _, metadata, attachments = extras(path)
         assert {"gcd-node", "gcd-node/source"} <= metadata.keys()
         assert "config.toml" in attachments
         assert path.stat().st_size < 1_500_000
@@ -265,6 +256,7 @@ def record_for_ever(folder: Path) -> None:
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_after_kill_9_everything_written_is_readable_and_plays(tmp_path: Path) -> None:
     recorder = multiprocessing.get_context("spawn").Process(target=record_for_ever, args=(tmp_path,))
     recorder.start()
@@ -388,6 +380,7 @@ def test_what_cannot_be_written_is_counted_and_the_rest_goes_on(
 
 
 Run: TypeAlias = tuple[list[Said], Box, Path]
+PICTURES = ("image", "camera_info", "classes", "std", "visibility", "depth")
 
 
 @pytest.fixture(scope="module")
@@ -403,10 +396,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(whole: Run) -> None:
     heard, _, path = whole
-    counts, found = Counter(each.topic for each in heard), summary(path)
+    counts, (found, *_) = Counter(each.topic for each in heard), extras(path)
     assert {each.topic: found.statistics.channel_message_counts[key] for key, each in found.channels.items()} == counts
-    pictures = ("image", "camera_info", "classes", "std", "visibility", "depth")
-    wanted = {"/src/image": 30, "/src/camera_info": 30, "/tf": 2} | {f"/view/main/{name}": 28 for name in pictures}
+    wanted = {"/src/image": 30, "/src/camera_info": 30, "/tf": 2} | {f"/view/main/{name}": 28 for name in PICTURES}
     wanted |= {f"/view/main/{name}": 2 for name in ("header", "std_header", "age_ms")}
     assert {name: counts[name] for name in counts if not name.startswith(("/gcd", "/diag"))} == wanted
     assert counts["/gcd/status"] == counts["/diagnostics"] > 0
@@ -421,29 +413,23 @@ def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(whole: Run) 
 
 def test_stamps_are_those_of_the_capture_and_numbers_those_of_the_source(whole: Run) -> None:
     heard, box, _ = whole
-    inputs, views = of(heard, "/src/image"), of(heard, "/view/main/image")
-    assert [each.stamp_ns for each in inputs] == [round(i * 1e8) for i in range(30)]
-    assert [each.sequence for each in inputs] == list(range(30))
-    headers = [message.header for message in box.of("win")]
-    assert [each.stamp_ns for each in views] == [stamp for header in headers for stamp in header.t_capture_ns]
-    assert [each.sequence for each in views] == [number for header in headers for number in header.src.seq]
-    for topic in ("classes", "std", "camera_info"):
-        assert [each.stamp_ns for each in of(heard, f"/view/main/{topic}")] == [each.stamp_ns for each in views]
-    assert [each.stamp_ns for each in of(heard, "/src/camera_info")] == [each.stamp_ns for each in inputs]
-    assert {each.publish_ns for each in views} == {header.t_publish_ns for header in headers}
-    assert all(abs(each.log_ns - time.time_ns()) < 600 * SECOND_NS for each in heard)
+    topics = dict.fromkeys(("/src/image", "/src/camera_info"), 30) | {f"/view/main/{name}": 28 for name in PICTURES}
+    for topic, number in topics.items():
+        found = of(heard, topic)
+        assert [(each.stamp_ns, each.sequence) for each in found] == [(round(i * 1e8), i) for i in range(number)]
+        assert all(abs(each.log_ns - time.time_ns()) < 600 * SECOND_NS for each in found)
+    sent_ns = {message.header.t_publish_ns for message in box.of("win")}
+    assert {each.publish_ns for each in of(heard, "/view/main/image")} == sent_ns
 
 
 def test_pictures_and_maps_are_what_was_seen_and_published(whole: Run) -> None:
     heard, box, _ = whole
-    for topic, wanted, most in (
-        ("/src/image", [np.full((64, 96, 3), 20 + number) for number in range(30)], 2),
-        ("/view/main/image", np.concatenate([images(message) for message in box.of("win")]), 3),
-    ):
+    view = np.concatenate([images(message) for message in box.of("win")])
+    for topic, wanted in (("/src/image", [20 + number for number in range(30)]), ("/view/main/image", view)):
         for each, pixels in zip(of(heard, topic), wanted, strict=True):
             assert each.value.format == "jpeg"
             picture = cv2.imdecode(np.frombuffer(each.value.data, np.uint8), cv2.IMREAD_COLOR)
-            assert np.abs(picture[..., ::-1].astype(int) - pixels).max() <= most
+            assert np.abs(picture[..., ::-1].astype(int) - pixels).max() <= 3
     for topic, kind in (("classes", "cls"), ("std", "std"), ("visibility", "vis"), ("depth", "depth")):
         encoding, pixels_of = ("32FC1", depth_m) if kind == "depth" else ("mono8", images)
         wanted = np.concatenate([pixels_of(message) for message in box.of(kind)]).reshape(-1, 64, 96)
@@ -474,7 +460,7 @@ def test_a_recording_says_who_made_it_with_what(tmp_path: Path) -> None:
     source = 'kind = "rtsp"\nurl = "rtsp://robot:hunter2@camera/stream"'
     _, box = recorded(recorder_config(tmp_path, source=source), Calibrated(14))
     (path,) = files(tmp_path)
-    told, attachments = extras(path)
+    _, told, attachments = extras(path)
     assert told["gcd-node"]["boot_id"] == box.of("win")[0].header.boot_id
     assert told["gcd-node"]["version/torch"]
     assert "hfov_deg" not in told["gcd-node/source"]  # it is calibrated
@@ -494,8 +480,8 @@ def test_only_what_is_wanted_is_recorded_jpeg_as_it_is_and_no_transforms_without
         _, box = recorded(config, FakeSource(14))
         heard = said(files(tmp_path / what)[0])
         assert of(heard, wanted)
-        assert not of(heard, unwanted) + of(heard, "/tf")
         assert of(heard, "/gcd/event")
+        assert not of(heard, unwanted) + of(heard, "/tf")
         assert replayed(files(tmp_path / what)[0])[0].info.width == 96  # the only pictures there are
     (message,) = box.of("win")
     assert b"".join(each.value.data for each in of(heard, "/view/main/image")) == message.payload  # not coded again
@@ -503,20 +489,21 @@ def test_only_what_is_wanted_is_recorded_jpeg_as_it_is_and_no_transforms_without
 
 def test_frames_of_a_view_follow_each_other_as_they_were_taken_and_a_status_is_a_diagnosis_of_every_part() -> None:
     message = window()
-    live, lockstep = fake_config("view.top={}", source='kind = "v4l2"'), fake_config("view.top={}")
     at_ns, frames = message.header.t_publish_ns, message.header.shape[0]
-    for config, step_ns in ((live, SECOND_NS // 10), (lockstep, 0)):
-        made = [each for each in view_messages(message, config) if each.topic.endswith("/image")]
-        assert [each.log_ns for each in made] == [at_ns + i * step_ns for i in range(frames)]
-    parts = {"source": {"state": "lost", "fps": 0.0}, "model": {"state": "degraded"}}
-    fields = {"state": "active", "level": 2, "reasons": ["SRC_LOST"], **parts, "stages": {"age": {"p50_ms": 7.5}}}
+    for source, step_ns in (('kind = "v4l2"', SECOND_NS // 10), (LOCKSTEP, 0)):
+        told = view_messages(message, fake_config("view.top={}", source=source))
+        made = [each.log_ns for each in told if each.topic.endswith("/image")]
+        assert made == [at_ns + i * step_ns for i in range(frames)]
+    parts = {
+        "source": {"state": "lost", "fps": 0.0},
+        "model": {"state": "degraded"},
+        "stages": {"age": {"p50_ms": 7.5}},
+    }
+    fields = {"state": "active", "level": 2, "reasons": ["SRC_LOST"], **parts}
     _, array = note_messages("status", origin(), fields, 1)
     parts = array.fields.status
-    assert [(each.name, each.level, each.message) for each in parts] == [
-        ("gcd: node", 2, "active"),
-        ("gcd: source", 2, "lost"),
-        ("gcd: model", 1, "degraded"),
-        ("gcd: stages", 0, ""),
+    assert [(each.name.removeprefix("gcd: "), each.level, each.message) for each in parts] == [
+        *(("node", 2, "active"), ("source", 2, "lost"), ("model", 1, "degraded"), ("stages", 0, "")),
     ]
     assert [(each.key, each.value) for each in parts[3].values] == [("age", '{"p50_ms": 7.5}')]
     assert ("reasons", '["SRC_LOST"]') in [(each.key, each.value) for each in parts[0].values]
@@ -539,21 +526,12 @@ def test_camera_info_says_what_is_known_of_the_camera_and_a_replay_knows_as_much
 
 
 def test_the_layout_that_ships_shows_topics_that_are_recorded(whole: Run) -> None:
-    layout = json.loads((Path(__file__).parents[2] / "launch" / "foxglove-layout.json").read_text())
-    panels = layout["configById"]
-
-    def shown(node: Any) -> list[str]:
-        return [node] if isinstance(node, str) else [*shown(node["first"]), *shown(node["second"])]
-
-    assert sorted(shown(layout["layout"])) == sorted(panels)
-    modes = [panel["imageMode"] for panel in panels.values() if "imageMode" in panel]
-    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
-    named = {mode[key] for mode in modes for key in ("imageTopic", "calibrationTopic") if key in mode}
-    named |= {path.split(".")[0] for path in paths}
-    named |= {panel[key] for panel in panels.values() for key in ("topicToRender", "topicPath") if key in panel}
+    layout = (Path(__file__).parents[2] / "launch" / "foxglove-layout.json").read_text().replace("/topdown/", "/main/")
+    topics = {each.topic for each in whole[0]}
+    named = set(re.findall(r'"(/\w[\w/]+)', layout))
     assert len(named) >= 8
-    assert {name.replace("/topdown/", "/main/") for name in named} <= {each.topic for each in whole[0]}
+    assert named <= topics
     parts = {status.name for each in of(whole[0], "/diagnostics") for status in each.value.status}
-    drawn = {path.split('"')[1] for path in paths if "name==" in path}
-    assert drawn == {"gcd: node", "gcd: source", "gcd: model", "gcd: rec"}
-    assert drawn <= parts
+    assert (
+        set(re.findall(r'name==\\"([^\\]+)', layout)) == {"gcd: node", "gcd: source", "gcd: model", "gcd: rec"} <= parts
+    )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from cameras import until
-from fakes import FakeNode
+from fakes import CLIENTS, NODE, OPERATOR, SECURITY, VIEWER, FakeNode
 from wire_messages import window
 
 from gcd_client.control import ControlClient
@@ -19,9 +19,7 @@ from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError, NodeError, OutputError
 from gcd_node.publisher import Publisher
 
-NODE, VIEWER, OPERATOR, STRANGER = (new_key_pair() for _ in range(4))
-CLIENTS = {VIEWER.public: Client(name="eye", role="viewer"), OPERATOR.public: Client(name="hand", role="operator")}
-SECURITY = ServerSecurity(keys=NODE, find_client=CLIENTS.get)
+STRANGER = new_key_pair()
 LOOPBACK = "tcp://127.0.0.1:0"
 
 

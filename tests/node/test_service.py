@@ -104,6 +104,7 @@ def in_a_process(code: str, **options: Any) -> "subprocess.Popen[str]":
     return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, **options)
 
 
+@pytest.mark.slow
 def test_a_process_that_logs_json_breaks_no_line() -> None:
     code = """
 import logging, sys, threading, warnings
@@ -126,6 +127,7 @@ raise RuntimeError("the end")
     assert "RuntimeError: the end" in told[3]["message"]
 
 
+@pytest.mark.slow
 def test_a_stderr_that_nobody_reads_holds_up_no_thread() -> None:
     code = """
 import logging, sys, time
@@ -178,6 +180,7 @@ def test_a_node_is_as_nice_as_it_is_told_and_its_threads_take_turns_quickly(monk
         gc.unfreeze()
 
 
+@pytest.mark.slow
 def test_a_thread_that_hangs_changes_neither_the_exit_code_nor_what_was_said() -> None:
     code = """
 import sys, threading, time
@@ -191,6 +194,7 @@ main()
     assert done.stderr.startswith("error: ipc:///nowhere/at/all did not answer state")
 
 
+@pytest.mark.slow
 def test_f23_a_node_that_has_not_even_begun_ends_with_0() -> None:
     code = """
 import sys, time
@@ -208,40 +212,36 @@ main.main()
 # Adapters beside their weights, exports and engines: what is taken, and what is refused before anything runs.
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Weights, an adapter of them, and one of others."""
-    folder = tmp_path_factory.mktemp("adapters")
-    loaded = load_weights(write_tiny(folder))
-    state = loaded.networks.state_dict()
-    names = (name for name in sorted(state) if name.endswith("query.weight") and state[name].ndim == 2)
-    layer = next(names).removesuffix(".weight")
+def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(tmp_path: Path) -> None:
+    loaded = load_weights(write_tiny(tmp_path))
+    state, card = loaded.networks.state_dict(), replace(loaded.card, name="adapted")
+    layer = min(name for name in state if name.endswith("query.weight") and state[name].ndim == 2).removesuffix(
+        ".weight"
+    )
     width = state[f"{layer}.weight"].shape[0]
     factors = {f"{layer}.down": torch.ones(2, width), f"{layer}.up": torch.ones(width, 2)}
-    card = replace(loaded.card, name="adapted")
-    for name, base in (("own", base_digest(state)), ("other", "0" * 12)):
-        adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)
-        write_adapter(folder / f"{name}.safetensors", adapter, overwrite=False)
-    return {name: folder / f"{name}.safetensors" for name in ("tiny", "own", "other")}
 
+    def config(name: str = "", base: str = "") -> NodeConfig:
+        """With an adapter of this name, if any."""
+        changes = [f"model.weights={tmp_path}/tiny.safetensors", "model.device=cpu"]
+        if name:
+            changes.append(f"model.adapter={tmp_path}/{name}.safetensors")
+            adapter = Adapter(rank=2, alpha=1.0, base=base, card=card, tensors=factors)
+            write_adapter(tmp_path / f"{name}.safetensors", adapter, overwrite=False)
+        return fake_config(*changes)
 
-def launch(weights: object, *changes: str) -> NodeConfig:
-    return fake_config(f"model.weights={weights}", "model.device=cpu", *changes)
-
-
-def test_the_node_runs_weights_with_their_own_adapter_under_a_name_of_their_own(files: dict[str, Path]) -> None:
-    plain, adapted = launch(files["tiny"]), launch(files["tiny"], f"model.adapter={files['own']}")
+    plain, adapted = config(), config("own", base_digest(state))
     before, traits = load_model(plain.model).traits, load_model(adapted.model).traits
     assert traits.name == "adapted"
     assert traits.sha256_12 != before.sha256_12
     assert config_digest(plain, before) != config_digest(adapted, before)
     with pytest.raises(CheckpointError):
-        load_model(launch(files["tiny"], f"model.adapter={files['other']}").model)
+        load_model(config("other", "0" * 12).model)
 
 
 def test_onnxruntime_is_refused_for_what_is_no_export_and_an_export_over_a_folder_of_mine(tmp_path: Path) -> None:
     for change in ("model.engine=onnxruntime", 'model.providers=["CUDAExecutionProvider"]'):
         with pytest.raises(ConfigError, match="onnxruntime runs exports, and random:driving is none"):
-            load_model(launch("random:driving", change).model)
+            load_model(fake_config("model.weights=random:driving", change).model)
     pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
     assert run_app(["export", "--weights", "random:driving", "--onnx", str(tmp_path), "--overwrite"]) == 64

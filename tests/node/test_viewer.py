@@ -5,14 +5,12 @@ import asyncio
 import contextlib
 import logging
 import os
-import re
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-import urllib.request
 import zlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -23,11 +21,10 @@ import numpy as np
 import pytest
 from cameras import Bench, Camera, environment, until
 from fakes import fake_config
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from msgspec.structs import replace
 from rig import Rig
 from viewer_clients import (
+    DEAF,
     TOKEN,
     WAIT_S,
     answer,
@@ -37,19 +34,15 @@ from viewer_clients import (
     hear,
     host_of,
     open_feed,
-    raw_feed,
     role,
     say,
-    send_raw,
     taken_apart,
     viewer_of,
 )
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from wire_messages import class_map, depth, jpeg_window, pixels, visibility, window
+from wire_messages import class_map, depth, jpeg_window, pixels, received, visibility, window
 
 from gcd_client.images import colours, decode_jpegs, images
-from gcd_client.protocol import MessageError, ViewMessage
-from gcd_client.subscriber import ReceivedView
 from gcd_node.auth import Role, new_key_pair, write_key_pair
 from gcd_node.config import PublishConfig
 from gcd_node.errors import ConfigError, EndpointError
@@ -57,7 +50,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
 from gcd_node.viewer import feed as feed_module
 from gcd_node.viewer import server as server_module
-from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, NodeLink, parse_request, picture
+from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, NodeLink, picture
 from gcd_node.viewer.server import HEADERS, MOST_BROWSERS, ViewerServer, load_page
 
 
@@ -65,17 +58,6 @@ from gcd_node.viewer.server import HEADERS, MOST_BROWSERS, ViewerServer, load_pa
 def viewer(tmp_path: Path) -> Iterator[ViewerServer]:
     with viewer_of(tmp_path) as opened:
         yield opened
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.text(max_size=80) | st.binary(max_size=80))
-def test_what_is_no_request_of_the_page_is_refused(text: str | bytes) -> None:
-    with pytest.raises(MessageError):
-        parse_request(text)
-
-
-def received(message: ViewMessage, age_ms: float = 50.0) -> ReceivedView:
-    return ReceivedView(message=message, age_ms=age_ms, expired=False, skipped=0, restarted=False)
 
 
 def silent_browser() -> Browser:
@@ -251,10 +233,8 @@ def test_the_end_waits_for_nobody(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         with viewer_of(tmp_path) as viewer:
             host, port = host_of(viewer).split(":")
-            for _ in range(3):
-                stack.enter_context(raw_feed(viewer))
             stack.enter_context(socket.create_connection((host, int(port)), WAIT_S))
-            feed = stack.enter_context(open_feed(viewer.url))
+            *_, feed = (stack.enter_context(open_feed(viewer.url, **each)) for each in (DEAF, DEAF, DEAF, {}))
             hear(feed, "beat")
             began_s = time.monotonic()
         assert time.monotonic() - began_s < 20
@@ -301,13 +281,12 @@ def test_a_page_that_never_reads_slows_nobody_and_is_given_up(tmp_path: Path, mo
     monkeypatch.setattr(feed_module, "_STUCK_S", 1.0)
     noise = np.random.default_rng(0).integers(0, 256, (14, 256, 384, 3), np.uint8)
     endpoints = PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")
-    with Publisher(endpoints) as publisher, viewer_of(tmp_path) as viewer, open_feed(viewer.url) as healthy:
-        stuck = [raw_feed(viewer) for _ in range(3)]
-        for each in stuck:
-            send_raw(each, {"type": "watch", "view": "top"})
-            for _ in range(40):  # it even says that it has seen everything
-                send_raw(each, {"type": "got"})
-        say(healthy, "watch", view="top")
+    with Publisher(endpoints) as publisher, viewer_of(tmp_path) as viewer, contextlib.ExitStack() as stack:
+        healthy, *stuck = (stack.enter_context(open_feed(viewer.url, **each)) for each in ({}, DEAF, DEAF, DEAF))
+        for each in (healthy, *stuck):
+            say(each, "watch", view="top")
+            for _ in range(40 * (each is not healthy)):  # it even says that it has seen everything
+                say(each, "got")
         until(lambda: publisher.stats.subscribers == 6 and viewer.browsers == 4)
         for number in range(12):
             started_s = time.monotonic()
@@ -315,8 +294,6 @@ def test_a_page_that_never_reads_slows_nobody_and_is_given_up(tmp_path: Path, mo
             assert time.monotonic() - started_s < 10
             assert hear(healthy, "picture", lambda head, number=number: head["header"]["window_id"] >= number)
         until(lambda: viewer.browsers == 1)
-        for each in stuck:
-            each.close()
 
 
 @pytest.mark.parametrize("page_role", ["viewer", "operator"])
@@ -334,16 +311,11 @@ def test_a_node_with_keys_asks_its_page_too(page_role: Role, tmp_path: Path, cap
         pass
     settings = replace(settings, viewer=replace(settings.viewer, keys=str(tmp_path / "page")))
     told: list[str] = []
-
-    def address() -> "re.Match[str] | None":
-        told.append(capfd.readouterr().err)
-        return re.search(r"page (http://127\.0\.0\.1:\d+/)#token=(\S{32})\n", "".join(told))
-
     with open_session(settings, viewer=True):
-        until(lambda: address() is not None)
-        found = address()
-        with open_feed(found[1]) as feed:
-            assert role(feed, token=found[2]) == ("operator", False)
+        until(lambda: told.append(capfd.readouterr().err) or "#token" in "".join(told))
+        url, _, token = "".join(told).partition("page ")[2].strip().partition("#token=")
+        with open_feed(url) as feed:
+            assert role(feed, token=token) == ("operator", False)
             assert answer(feed, "views")["result"]["main"]["view_rev"] == 1
             assert answer(feed, "set_param", steps=3)["code"] == ("OK" if page_role == "operator" else "FORBIDDEN")
 
@@ -353,14 +325,7 @@ def printed_page(process: "subprocess.Popen[str]") -> str:
     return process.stderr.readline().removeprefix("page ").strip()
 
 
-def is_served(url: str) -> bool:
-    try:
-        urllib.request.urlopen(url.partition("#")[0], timeout=WAIT_S).close()
-    except OSError:
-        return False
-    return True
-
-
+@pytest.mark.slow
 def test_the_viewer_serves_without_torch_until_it_is_told_to_end(tmp_path: Path) -> None:
     code = "import sys; sys.modules['torch'] = None; from gcd_node.cli.main import main; main()"
     endpoints = [f"--{name}=ipc://{tmp_path}/{name}" for name in ("data", "status", "control")]
@@ -374,6 +339,7 @@ def test_the_viewer_serves_without_torch_until_it_is_told_to_end(tmp_path: Path)
         assert process.wait(WAIT_S) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["in order", "killed"])
 def test_a_launch_file_with_a_page_starts_a_viewer_that_ends_with_the_node(end: str, tmp_path: Path) -> None:
     code = f"""
@@ -388,17 +354,17 @@ with open_session(settings, viewer=True):
     sys.stdin.read()
 """
     pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, "-c", code], env=environment(), text=True, **pipes) as process:
-        url = printed_page(process)
-        assert is_served(url)
+    started = subprocess.Popen([sys.executable, "-c", code], env=environment(), text=True, **pipes)
+    with started as process, open_feed(printed_page(process)) as feed:
         if end == "killed":
             process.kill()
         else:
             process.communicate("", timeout=WAIT_S)
             assert process.returncode == 0
-        until(lambda: not is_served(url))
+        assert farewell(feed)
 
 
+@pytest.mark.slow
 def test_the_demo_opens_its_page_and_ends_with_ctrl_c(tmp_path: Path) -> None:
     opened, browser = tmp_path / "opened", tmp_path / "browser"
     browser.write_text(f"#!/bin/sh\necho $1 > {opened}\n")

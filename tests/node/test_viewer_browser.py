@@ -13,20 +13,16 @@ from cameras import Bench, Camera, until
 from fakes import FakeSynthesizer, painting_traits
 from rig import Rig
 from viewer_clients import viewer_of
-from wire_messages import origin
-
-from gcd_node.config import PublishConfig
-from gcd_node.publisher import Publisher
 
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs the Python package selenium, of the extra `dev`")
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.timeout(120),
     pytest.mark.skipif(not CHROMIUM.exists(), reason="needs the Debian package chromium"),
     pytest.mark.skipif(not DRIVER.exists(), reason="needs the Debian package chromium-driver"),
 ]
 PROCESS = Path(__file__).with_name("node_process.py")
-LOOK_MS = 100  # of the page: TICK_MS in main.js
 
 
 class Page:
@@ -64,19 +60,6 @@ class Page:
         """Move a slider as a hand does."""
         self.get(f"$('{name}').value = {value}")
         self.get(f"['input', 'change'].map((kind) => $('{name}').dispatchEvent(new Event(kind, {{bubbles: true}})))")
-
-    def require_prompt_death(self) -> None:
-        """It was shown at the first look after it was so by the page's rule and clock, and looks follow each other as
-        fast as the machine lets them; the silence that means it leaves one look of 2 s."""
-        script = """
-            const done = arguments[0];
-            import("/link.js").then(({Link, BEAT_LOST_MS, NODE_SILENT_MS}) => {
-                const dead = (silence) => Link.prototype.life.call({heard: 0, reason: ""}, silence)[0] === "dead";
-                done([...JSON.parse(document.body.dataset.silence).map(dead), Math.max(BEAT_LOST_MS, NODE_SILENT_MS)]);
-            });"""
-        before, then, longest_ms = self._driver.execute_async_script(script)
-        assert (before, then) == (False, True)
-        assert longest_ms + LOOK_MS <= 2000
 
     def complaints(self) -> list[str]:
         """What the browser holds for an error and is no broken connection: scripts that failed, what was refused."""
@@ -185,13 +168,11 @@ def test_a_hung_node_is_shown_as_dead_until_it_goes_on(page: Page, url: str, nod
     node.send_signal(signal.SIGSTOP)
     try:
         page.wait(lambda: page.state == "dead")
-        page.require_prompt_death()
     finally:
         node.send_signal(signal.SIGCONT)
     page.wait(lambda: page.state == "live")
     node.kill()
     page.wait(lambda: page.state == "dead")
-    page.require_prompt_death()
     page.wait(lambda: page.text("view-veil") == "DEAD")
     assert page.text("state") == "dead"
     assert "silent" in page.text("why")
@@ -221,21 +202,3 @@ def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Pa
         page.wait(lambda: page.state == "stale" and page.text("view-veil") == "too old")  # the camera gives nothing
         assert page.complaints() == []
         page.forget(viewer.url)
-
-
-def test_who_comes_to_a_node_that_is_not_there_is_told_so(page: Page, tmp_path: Path) -> None:
-    with viewer_of(tmp_path) as viewer:
-        page.open(viewer.url)
-        page.wait(lambda: "has not spoken" in page.text("why"))
-        assert page.state == "connecting"
-        assert page.text("view-badge") == "no view yet"
-        assert page.text("input-badge") == "no input yet"
-        with Publisher(PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")) as publisher:
-
-            def speak() -> bool:
-                publisher.note("status", origin(), {"state": "active", "level": 0})
-                return page.state == "stale"
-
-            page.wait(speak)  # it lives, and no view comes
-            page.wait(lambda: page.state == "dead")  # it lives no more, though its socket is there
-        assert "silent" in page.text("why")

@@ -15,12 +15,10 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console, RenderableType
-from wire_messages import BOOT, CLASSES, class_map, depth, end, numbers, origin, pixels, visibility, window
+from wire_messages import BOOT, CLASSES, class_map, depth, end, numbers, origin, pixels, received, visibility, window
 
 from gcd_client.protocol import EndMessage, OriginHeader, StatusMessage, StatusTopic, ViewMessage
-from gcd_client.subscriber import ReceivedView
 from gcd_model import hatched
-from gcd_node.auth import Client, ServerSecurity, new_key_pair, write_key_pair
 from gcd_node.cli.main import run_app
 from gcd_node.cli.watch import StatusBoard, ViewTable
 from gcd_node.config import PublishConfig
@@ -43,10 +41,6 @@ def text_of(renderable: RenderableType, width: int = 140) -> str:
 
 
 # Views.
-
-
-def received(message: ViewMessage, *, skipped: int = 0) -> ReceivedView:
-    return ReceivedView(message=message, age_ms=40.0, expired=False, skipped=skipped, restarted=False)
 
 
 def read_video(path: Path) -> np.ndarray:
@@ -75,13 +69,11 @@ def test_a_table_has_the_figures_of_each_topic() -> None:
     table = ViewTable()
     for i in range(5):
         table.add(received(window(i), skipped=2 if i == 3 else 0), now_s=10.0 + 0.5 * i)
-    table.add(received(window(123_456, view_id="a_view_name_of16")), now_s=12.0)
-    long, top = table.rows(now_s=12.25, ended=False)
-    assert long[:2] == ("view/a_view_name_of16/win", "123456")
-    assert top == ("view/top/win", "4", "2x4x6x3", "290", "2.00", "2", "live, fps")
-    assert [row[-1] for row in table.rows(now_s=72.2, ended=False)] == ["expired, fps", "expired, fps"]
-    assert [row[-1] for row in table.rows(now_s=12.25, ended=True)] == ["ended, fps", "ended, fps"]
-    assert max(map(len, text_of(table.render("", ended=False), 80).splitlines())) <= 80
+    for now_s, ended, state in ((12.25, False, "live"), (72.2, False, "expired"), (12.25, True, "ended")):
+        ((*figures, last),) = table.rows(now_s=now_s, ended=ended)
+        assert last == f"{state}, fps"
+        if state == "live":
+            assert figures == ["view/top/win", "4", "2x4x6x3", "290", "2.00", "2"]
 
 
 def test_what_is_saved_are_the_published_pixels_and_hatched_ones(tmp_path: Path, capsys: Capture) -> None:
@@ -171,20 +163,15 @@ def working() -> dict[str, object]:
     health = Health()
     health.state, health.model = "active", "busy"
     health.source("streaming")
-    health.expect(("topdown", "a_long_view_name"), 3600.0)
+    health.expect(("topdown",), 3600.0)
     for i in range(11):
         health.frame(i * 100_000_000, time.monotonic_ns())
-    for view_id in ("topdown", "a_long_view_name"):
-        health.published(view_id, 0.25)
-    health.faults = {"WIN_GAP": 2}
-    health.counts.update(slot=3, sent=5, subs=1, bytes=4130)
+    health.published("topdown", 0.25)
     return health.report()
 
 
 def test_a_status_holds_until_the_node_is_silent_for_three_seconds_and_a_kept_one_is_as_old_as_it_says() -> None:
-    board = StatusBoard()
-    assert (board.level(0.0), board.record(0.0)) == (Level.STALE, {"level": 3, "stale": True})
-    assert "no status yet" in text_of(board.render(0.0))
+    assert StatusBoard().record(0.0) == {"level": 3, "stale": True}
     board = board_of(note("status", {"level": 1, "reasons": ["fps"]}))
     assert [board.level(10.0 + ago) for ago in (0.0, 2.9, 3.1)] == [Level.WARN, Level.WARN, Level.STALE]
     assert (board.record(12.0)["age_ms"], board.record(20.0)["level"]) == (2000, 3)
@@ -193,16 +180,6 @@ def test_a_status_holds_until_the_node_is_silent_for_three_seconds_and_a_kept_on
     board.add(note("status", {"level": 0}, late_s=60.0), 11.0, WALL_NS)  # another machine's clock
     assert board.level(11.0) is Level.OK
     assert board_of(note("status", {"level": 0}, late_s=-60.0)).record(10.5)["age_ms"] == 500
-
-
-def test_a_working_node_is_shown_with_its_figures_in_80_columns() -> None:
-    events = [note("event", {"code": f"E{i}", "level": 2, "epoch": i}) for i in range(20)]
-    text = text_of(board_of(note("status", working()), *events).render(10.0), width=80)
-    assert max(map(len, text.splitlines())) <= 80
-    shown = " ".join(text.replace("│", " ").split())
-    for expected in ("OK robot_7 node state active", "state streaming, fps 10.0", "WIN_GAP 2", "slot 3", "code E19"):
-        assert expected in shown, expected
-    assert "E11" not in shown  # only the latest
 
 
 HOSTILE: tuple[dict[str, Any], ...] = (
@@ -227,7 +204,6 @@ def test_whatever_a_node_says_is_drawn_without_harm(fields: dict[str, Any]) -> N
 def test_status_prints_a_table_or_notes_as_json(tmp_path: Path, capsys: Capture) -> None:
     endpoint = f"ipc://{tmp_path}/status"
     assert run_app(["status", endpoint, "--once", "--timeout", "0.2"]) == 69
-    assert capsys.readouterr().err.startswith(f"error: no status from {endpoint} within 0.2 s: is the node running")
     with Publisher(PublishConfig(data=endpoint + ".data", status=endpoint)) as publisher:
         publisher.note("status", origin(), working())  # each is kept for who comes later
         publisher.note("meta", origin(), {"fps": 10.0})
@@ -245,16 +221,3 @@ def test_status_prints_a_table_or_notes_as_json(tmp_path: Path, capsys: Capture)
     lines = {line["topic"]: line for line in told}
     assert set(lines) == {"status", "meta", "event"}
     assert (lines["event"]["code"], lines["meta"]["node_id"]) == ("SRC_LOST", "gcd")
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_a_node_that_asks_for_keys_is_reached_with_them_alone(tmp_path: Path, known: bool) -> None:
-    node, ours = new_key_pair(), new_key_pair()
-    clients = {ours.public if known else node.public: Client(name="planner", role="viewer")}
-    write_key_pair(tmp_path / "keys", ours)
-    endpoints = PublishConfig(data=f"ipc://{tmp_path}/data", status="tcp://127.0.0.1:0")
-    with Publisher(endpoints, security=ServerSecurity(keys=node, find_client=clients.get)) as publisher:
-        publisher.note("status", origin(), working())
-        command = ["status", str(publisher.status_endpoint), "--once", "--timeout", "20"]
-        ended = run_app([*command, "--keys", str(tmp_path / "keys"), "--node-key", node.public])
-        assert ended == (0 if known else 77)

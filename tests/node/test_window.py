@@ -171,9 +171,8 @@ def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None
     assert slot.take() is not None  # the reader flushes
 
 
-@pytest.mark.parametrize(
-    ("source_fps", "trained", "wanted"),
-    [
+def test_the_highest_rate_it_can_give_is_chosen() -> None:
+    for source_fps, trained, wanted in (
         (30.0, (6, 8, 12, 24), (24, False)),
         (24.0, (6, 8, 12, 24), (24, False)),
         (24000 / 1001, (6, 8, 12, 24), (24, False)),
@@ -182,12 +181,8 @@ def test_the_end_completes_a_window_that_only_waits_for_a_nearer_frame() -> None
         (60.0, (5, 10), (10, False)),
         (4.0, (5, 10), (4.0, True)),
         (17.0, (), (17.0, False)),
-    ],
-)
-def test_the_highest_rate_it_can_give_is_chosen(
-    source_fps: float, trained: tuple[float, ...], wanted: tuple[float, bool]
-) -> None:
-    assert choose_fps(source_fps, trained) == wanted
+    ):
+        assert choose_fps(source_fps, trained) == wanted
 
 
 # The slot between reader and model thread, with real threads; numbers stand for windows where any will do.

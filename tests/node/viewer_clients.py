@@ -1,12 +1,9 @@
 """Clients of a page's server that are no browser, good ones and bad ones, and a server for them."""
 
 import asyncio
-import base64
 import contextlib
 import http.client
 import json
-import os
-import socket
 import struct
 import threading
 import time
@@ -75,11 +72,16 @@ def get(viewer: ViewerServer, path: str, *, hosts: list[str] | None = None, meth
     return answer.status, answer.headers, body
 
 
-def open_feed(url: str, origin: str | None = None) -> ClientConnection:
+DEAF: Any = {"max_queue": 1, "close_timeout": 0.2}
+"""Of a feed that nobody reads: it takes one message off its socket."""
+
+
+def open_feed(url: str, origin: str | None = None, **limits: Any) -> ClientConnection:
     """url: of the page, as it is printed. origin: what the browser says the page came from."""
     page = url.partition("/#")[0].rstrip("/")
     feed = page.replace("http:", "ws:") + "/feed"
-    return connect(feed, origin=page if origin is None else origin or None, open_timeout=WAIT_S, max_size=2**26)  # type: ignore[arg-type]
+    limits = {"open_timeout": WAIT_S, "max_size": 2**26, **limits}
+    return connect(feed, origin=page if origin is None else origin or None, **limits)  # type: ignore[arg-type]
 
 
 def say(feed: ClientConnection, kind: str, **what: object) -> None:
@@ -125,28 +127,3 @@ def taken_apart(part: bytes) -> tuple[Any, bytes]:
     """Header, with how long it waited, and payload."""
     waited_ms, size = struct.unpack_from("<fI", part)
     return {**json.loads(part[8 : 8 + size]), "waited_ms": waited_ms}, part[8 + size :]
-
-
-def raw_feed(viewer: ViewerServer) -> socket.socket:
-    """A feed that was asked for by somebody who then does nothing."""
-    host, port = host_of(viewer).split(":")
-    raw = socket.socket()
-    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    raw.settimeout(WAIT_S)
-    raw.connect((host, int(port)))
-    key = base64.b64encode(os.urandom(16)).decode()
-    lines = ["GET /feed HTTP/1.1", f"Host: {host}:{port}", f"Origin: http://{host}:{port}", "Upgrade: websocket"]
-    lines += ["Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13", "", ""]
-    raw.sendall("\r\n".join(lines).encode())
-    answer = b""
-    while not answer.endswith(b"\r\n\r\n"):
-        answer += raw.recv(1)
-    assert b" 101 " in answer
-    return raw
-
-
-def send_raw(raw: socket.socket, what: dict[str, object]) -> None:
-    """A masked text frame."""
-    text = json.dumps(what).encode()
-    assert len(text) < 126
-    raw.sendall(bytes((0x81, 0x80 | len(text), 0, 0, 0, 0)) + text)

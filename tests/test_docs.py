@@ -27,7 +27,7 @@ from gcd_node.sources import SourceConfig, SourcePose
 from gcd_node.verbs import VERBS, RequestError, parse_command
 from gcd_train.cli.main import app as train_app
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "launch/README", "tools/README", "client/README")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
 LINKED = [*PAGES, *sorted((ROOT / "docs" / "log").glob("*.md")), *sorted((ROOT / "model").rglob("weights/*.md"))]

