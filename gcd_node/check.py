@@ -3,27 +3,33 @@
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import psutil
 import torch
 
 from gcd_client.protocol import ClientError
-from gcd_model import CheckpointError, ModelError, Traits, default_precision, inspect_weights, is_export, weights_path
+from gcd_model import (
+    CheckpointError,
+    ModelError,
+    OptionError,
+    Traits,
+    inspect_weights,
+    is_export,
+    placement,
+    weights_path,
+)
 from gcd_node.auth import load_server_security
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError, NodeError, SourceError
 from gcd_node.frame import SourceInfo
-from gcd_node.preprocess import in_words
+from gcd_node.preprocess import assumed_hfov_deg, in_words
 from gcd_node.recorder import RoomError, check_room
 from gcd_node.session import load_model, open_session
 from gcd_node.sources import open_source
 from gcd_node.stream_context import family_name, prepare_stream
 from gcd_node.views import LiveConfig, VirtualViews
-
-Verdict: TypeAlias = Literal["ok", "warning", "failed"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,7 +37,7 @@ class Finding:
     """One thing that was looked at. error: what a start would fail with, None otherwise."""
 
     topic: str
-    verdict: Verdict
+    verdict: Literal["ok", "warning", "failed"]
     detail: str
     error: Exception | None = None
 
@@ -41,11 +47,9 @@ class _DoubtfulError(Exception):
 
 
 def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator[Finding]:
-    """Look at endpoints, source, weights and views, in this order, and where recordings go, if anywhere; each as soon
-    as it is known.
+    """Look at endpoints, where recordings go, source, weights and views; gives each as soon as it is known.
 
-    free_memory: bytes, on the model's device; measured if left out. What follows from something that failed is left
-        out.
+    free_memory: bytes, on the model's device; measured if left out.
     """
     look = _Look(config, free_memory)
     yield _finding("endpoints", look.endpoints)
@@ -53,8 +57,7 @@ def check_launch(config: NodeConfig, free_memory: int | None = None) -> Iterator
         yield _finding("record", look.record)
     yield _finding("source", look.source)
     yield _finding("weights", look.weights)
-    if look.traits is not None and look.info is not None:
-        yield _finding("views", partial(look.views, look.traits, look.info))
+    yield _finding("views", look.views)
 
 
 def _finding(topic: str, look: Callable[[], str]) -> Finding:
@@ -80,7 +83,6 @@ class _Look:
             return f"free: {sockets}, {'no control' if control is None else f'control {control.endpoint}'}"
 
     def record(self) -> str:
-        """What fails here ends no start, but nothing would be recorded."""
         section = self._config.record
         root = Path(section.folder or "").expanduser()
         try:
@@ -102,8 +104,8 @@ class _Look:
                 raise SourceError(f"{source.info.id} has no frames; is it the right one?")
             info = self.info = source.info
             rate = f"{info.width} x {info.height} at {info.fps_nominal:g} FPS"
-            lens = "" if info.lens is None else ", calibrated"
-            return f"{info.kind} {info.id}: {rate}{lens}; its first frame is number {first.seq}"
+            rate += "" if info.lens is None else ", calibrated"
+            return f"{info.kind} {info.id}: {rate}; its first frame is number {first.seq}"
         finally:
             source.close()
 
@@ -122,32 +124,35 @@ class _Look:
 
     def _inspected(self, section: ModelSection) -> Traits:
         """What loading would say. Raises CheckpointError, also if the weights alone are more than the free memory."""
+        path = weights_path(section.weights)
         report = inspect_weights(
-            weights_path(section.weights),
-            family=section.family,
-            head_width=section.head_width,
-            image_heads=section.image_heads,
+            path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
         )
-        device = section.device
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        precision = section.dtype or default_precision(torch.device(device), live=report.family == "live")
+        try:
+            live = report.family == "live"
+            device, precision = placement(section.device, section.engine, section.dtype, live=live)
+        except OptionError as error:
+            raise ConfigError(f"[model]: {error}") from error
         needed, free = report.parameters * (4 if precision == "float32" else 2), self._free_memory
         if free is None:
-            on_gpu = device.startswith("cuda")
-            free = torch.cuda.mem_get_info(device)[0] if on_gpu else psutil.virtual_memory().available
+            free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
         if needed > free:
             sizes = f"the weights take {needed / 2**30:.2f} GiB in {precision}, {free / 2**30:.2f} are free on {device}"
             raise CheckpointError(f"{sizes}; free some, or use bfloat16 or a smaller model")
-        return Traits.of(report, sha256_12=report.sha256_12, precision=precision, device=device)
+        return Traits.of(report, sha256_12=report.sha256_12, precision=precision, device=str(device))
 
-    def views(self, traits: Traits, info: SourceInfo) -> str:
-        config = self._config
+    def views(self) -> str:
+        config, traits, info = self._config, self.traits, self.info
+        if traits is None or info is None:
+            raise _DoubtfulError("not looked at: that takes the source and the weights")
         context = prepare_stream(config, traits, info)
         VirtualViews(traits).sync(LiveConfig(config).settings(), context.mount)
         frames, names = traits.config.frames, ", ".join(config.view)
         line = f"{names}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {context.fps:g} FPS"
         line = "; ".join(filter(None, (line, in_words(context.mount, config.source.pose, traits))))
+        if traits.live and context.lens is None and info.hfov_in_use(config.source.hfov_deg) is None:
+            hfov_deg = assumed_hfov_deg(config.source.pose)
+            raise _DoubtfulError(f"{line}; the pictures are taken to be {hfov_deg:.4g} degrees wide: state hfov_deg")
         if context.ood:
             raise _DoubtfulError(f"{line}; outside what {traits.name} was trained with: {', '.join(context.ood)}")
         return line

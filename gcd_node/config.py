@@ -312,7 +312,12 @@ def parse_config(text: str | bytes, name: str, changes: Sequence[str] = ()) -> N
         prepare_source(table, name)
         return msgspec.convert(table, NodeConfig, strict=True)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{name}: {explain_settings_error(str(error), NodeConfig)}") from error
+        words = re.sub(
+            r"^Expected `str` matching regex .* - at ",
+            "a name is of a-z, 0-9 and _ (of node_id also A-Z and -), got another at ",
+            str(error),
+        )
+        raise ConfigError(f"{name}: {explain_settings_error(words, NodeConfig)}") from error
     except FileError as error:
         raise ConfigError(f"{name} {error}") from error
 

@@ -33,7 +33,6 @@ HEADINGS = ("input: the packaged drive", "view from above", "the same: what is p
 
 _MOUNT = SourcePose(height_m=1.55, forward_m=1.6, left_m=0.0, tilt_deg=0.0)
 _RECEIVER_TIMEOUT_S = 60.0
-_ROWS = 4
 Moment: TypeAlias = tuple[Image, Image, Image, Image]
 """One moment: the camera's picture, the view made of it, the same with what is painted hatched, and its class map."""
 
@@ -96,7 +95,7 @@ def run_demo(out: Path, on_window: Callable[[WindowReport], None]) -> tuple[Summ
         raise NodeError("nothing arrived in the receiving process; run `gcd-node -v demo` to see why")
     classes = ontology(models[0])
     write_video(out / "side_by_side.mp4", [comparison([moment], classes) for moment in shown], summary.fps)
-    write_png(out / "side_by_side.png", comparison([shown[i] for i in spread(len(shown), _ROWS)], classes))
+    write_png(out / "side_by_side.png", comparison([shown[i] for i in spread(len(shown), 4)], classes))
     return summary, models[0], len(shown)
 
 

@@ -14,7 +14,6 @@ from typing import Any, Literal, TypeAlias, get_args
 
 SourceState: TypeAlias = Literal["closed", "connecting", "streaming", "stalled", "lost", "ended"]
 ModelState: TypeAlias = Literal["absent", "loading", "warming", "ready", "busy", "degraded", "failed"]
-RecordState: TypeAlias = Literal["off", "recording", "stopping", "failed"]
 Stage: TypeAlias = Literal["capture_gap", "window", "encode", "render", "publish", "age"]
 """What takes time, in order; docs/deploy.md says from where to where."""
 
@@ -58,7 +57,7 @@ class RecordHealth:
     bytes: on the disk, all files together. written: messages. dropped: what found no room in the queue, by topic.
     """
 
-    state: RecordState = "off"
+    state: Literal["off", "recording", "stopping", "failed"] = "off"
     file: str | None = None
     bytes: int = 0
     written: int = 0

@@ -270,7 +270,8 @@ class Node:
         if self._once or isinstance(error, SourceLostError):
             self._give_up(error)
         elif verb == "activate" and self._on_its_own and is_live and isinstance(error, SourceError):
-            self._retry_s = time.monotonic() + backoff_s(self._config.source.kind, self._failures)
+            self._retry_s = time.monotonic() + (wait_s := backoff_s(self._config.source.kind, self._failures))
+            _LOG.log(logging.INFO if self._failures else logging.WARNING, "trying again in %.1f s", wait_s)
             self._failures += 1
 
     def _give_up(self, error: Exception) -> None:

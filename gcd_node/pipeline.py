@@ -174,7 +174,8 @@ class Stream:
             self._health.counts.update(built=self._builder.built, source=dropped, slot=self._newest.dropped)
             for reason, count in rejected.items():
                 if count > self._reported.get(reason, 0) and reason != "SRC_LOST":
-                    self._announcer.event(reason, Level.WARN, {"count": count})
+                    is_meant = reason == "CLOCK_STEP" and getattr(self._live.config.source, "loop", False)
+                    self._announcer.event(reason, Level.OK if is_meant else Level.WARN, {"count": count})
             self._reported = rejected
 
     def announce_end(self) -> str:

@@ -17,10 +17,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from gcd_client.protocol import PROTO, EndMessage, OriginHeader, StatusTopic, ViewMessage
-from gcd_node.auth import Client
+from gcd_node.auth import Client, EventSink
 from gcd_node.config import NodeConfig, RecordConfig, to_toml
 from gcd_node.errors import NodeError
 from gcd_node.frame import Frame, LensModel, SourceInfo
@@ -44,8 +44,6 @@ _PATIENCE_S, _FLUSH_S = 10.0, 2.0
 _DRIFT_NS = 1_000_000
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PACKAGES = ("gcd-node", "torch", "numpy", "mcap")
-
-Tell: TypeAlias = Callable[[str, Level, Mapping[str, object]], None]  # publishes an event: code, level, fields
 
 
 class RoomError(Exception):
@@ -96,7 +94,7 @@ class Recorder:
     """
 
     def __init__(
-        self, config: NodeConfig, boot_id: str, live: Callable[[], NodeConfig], tell: Tell, sink: MessageSink
+        self, config: NodeConfig, boot_id: str, live: Callable[[], NodeConfig], tell: EventSink, sink: MessageSink
     ) -> None:
         """live: the configuration in force. tell: publishes an event; called from the recorder's thread."""
         self._config, self._boot_id, self._live, self._tell_node, self._sink = config, boot_id, live, tell, sink

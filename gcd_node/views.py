@@ -18,7 +18,6 @@ from gcd_node.messages import PREVIEW_PERIOD_S, MessageSink, end_message, previe
 from gcd_node.preprocess import stated_sphere
 from gcd_node.stream_context import StreamContext, published_kinds
 
-_KINDS: tuple[ViewKind, ...] = get_args(ViewKind)
 _LEAST = 0.9  # of a period between two previews, so that a camera's jitter does not make it miss every second one
 
 
@@ -228,7 +227,7 @@ class EndOfStream:
         return self._open.pop(view_id, set[str]()) | {view_topic(view_id, kind) for kind in now}
 
     def _end(self, view_id: str, rev: int, topics: Set[str], last: int, *, delay_ms: int | None) -> None:
-        for topic in [topic for kind in _KINDS if (topic := view_topic(view_id, kind)) in topics]:
+        for topic in [topic for kind in get_args(ViewKind) if (topic := view_topic(view_id, kind)) in topics]:
             self._sink.end(end_message(self._context(), topic, view_id, rev, last), delay_ms=delay_ms)
 
 

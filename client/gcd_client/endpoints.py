@@ -108,9 +108,9 @@ def resolve_endpoint(endpoint: str, channel: Channel) -> str:
     """An endpoint as ZeroMQ takes it: "ipc" becomes the channel's file in the runtime folder. Raises SetupError."""
     if endpoint == "ipc":
         return f"ipc://{runtime_folder()}/{channel}"
-    if re.fullmatch(r"ipc://.+|tcp://.*:[0-9]{1,5}", endpoint):
+    if (match := re.fullmatch(r"ipc://.+|tcp://.*:([0-9]{1,5})", endpoint)) and int(match[1] or 0) < 65536:
         return endpoint
-    raise SetupError(f'an endpoint is "ipc", "ipc:///some/path" or "tcp://127.0.0.1:5580", got {endpoint!r}')
+    raise SetupError(f'an endpoint is "ipc", "ipc:///a/path" or "tcp://127.0.0.1:5580" (to 65535), got {endpoint!r}')
 
 
 class Connection:

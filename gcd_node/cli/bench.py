@@ -34,7 +34,6 @@ from gcd_node.sources import LIVE_KINDS
 _RATES_HZ = (5.0, 10.0, 15.0)
 _FIRST_VIEW_S, _IDLE_S, _END_S, _POLL_S = 180.0, 2.0, 20.0, 0.05
 _FEWEST_VIEWS = 3  # jitter is a difference of differences
-_MEBIBYTE = 2**20
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -220,7 +219,7 @@ def _cost(process: psutil.Process, check: Callable[[], None], seconds: float, id
     return figures | {
         "GcdNodeMetrics.CPU_OVER_IDLE": float(np.mean(busy)) - idle,
         "GcdNodeMetrics.CPU_CORES": (after.user + after.system - before.user - before.system) / took_s,
-        "GcdNodeMetrics.PEAK_MEMORY": peak_bytes / _MEBIBYTE,
+        "GcdNodeMetrics.PEAK_MEMORY": peak_bytes / 2**20,
     }
 
 

@@ -108,7 +108,8 @@ def table(rows: Iterable[Sequence[object]], columns: Sequence[str] = (), title: 
 
     made = Table(title=title, show_header=bool(columns))
     for name in columns:
-        made.add_column(name.removeprefix(">"), justify="right" if name.startswith(">") else "left")
+        justify = "right" if name.startswith(">") else "left"
+        made.add_column(name.removeprefix(">"), justify=justify, no_wrap=name == columns[0])
     for row in rows:
         made.add_row(*map(str, row))
     for column in made.columns:

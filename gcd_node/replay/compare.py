@@ -13,8 +13,6 @@ from gcd_node.errors import UsageError
 from gcd_node.replay.run import KeptKind, Manifest, Pixels, RunFolder, WindowEntry
 
 _MAP_NAMES: dict[KeptKind, str] = {"cls": "class map", "vis": "visibility", "depth": "depth"}
-_ABSENT = "-"  # shown for what one of the runs does not have
-_TOP = 255.0
 _DEPTH_SLACK = 0.01  # ten times what f16 rounds away, a tenth of what depth networks err
 _SECTIONS = ("strict", "source", "model", "view", "window")  # what a replay uses of a launch file
 _LINES = 10
@@ -106,7 +104,7 @@ def compare(a: RunFolder, b: RunFolder) -> RunComparison:
     compared = (_compare_view(a, b, view_id, of_a.get((w, view_id)), of_b.get((w, view_id))) for w, view_id in views)
     differences = tuple(each for each in compared if not each.within(Tolerance()))
     facts_a, facts_b = dict(_facts(a.manifest)), dict(_facts(b.manifest))
-    pairs = {name: (facts_a.get(name, _ABSENT), facts_b.get(name, _ABSENT)) for name in facts_a | facts_b}
+    pairs = {name: (facts_a.get(name, "-"), facts_b.get(name, "-")) for name in facts_a | facts_b}
     different = {printable(name): (printable(one), printable(two)) for name, (one, two) in pairs.items() if one != two}
     return RunComparison(a=str(a.path), b=str(b.path), facts=different, views=len(views), differences=differences)
 
@@ -139,7 +137,7 @@ def _compare_view(
 def _psnr_db(a: Pixels, b: Pixels) -> float:
     """Peak signal-to-noise ratio of two pictures."""
     squares = float(cv2.norm(a, b, cv2.NORM_L2SQR))
-    return math.inf if squares == 0 else 10 * math.log10(_TOP**2 * a.size / squares)
+    return math.inf if squares == 0 else 10 * math.log10(255**2 * a.size / squares)
 
 
 def _share(kind: KeptKind, a: Pixels, b: Pixels) -> float:

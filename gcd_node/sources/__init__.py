@@ -2,7 +2,6 @@
 and its source, open. One contract, `gcd_node.frame`. What a kind needs is imported when such a source is opened.
 """
 
-import difflib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
@@ -204,17 +203,17 @@ def prepare_source(table: dict[str, Any], name: str) -> None:
     Raises:
         ConfigError: no such kind; a key that its kind has not.
     """
+    from gcd_model import explain_settings_error  # only now: it brings torch
+
     section = table.get("source")
     if not isinstance(section, dict):
         return
     kind = section.setdefault("kind", "file")
     if kind not in _KINDS:
         raise ConfigError(f"{name}: [source] kind must be one of {', '.join(_KINDS)}, got {kind!r}")
-    known = _KINDS[kind].__struct_fields__
-    for key in section.keys() - {"kind", *known}:
-        near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-        hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
-        raise ConfigError(f"{name}: unknown key `{key}` in [source] of kind {kind!r}; {hint}")
+    for key in section.keys() - {"kind", *_KINDS[kind].__struct_fields__}:
+        unknown = explain_settings_error(f"Object contains unknown field `{key}`", _KINDS[kind])
+        raise ConfigError(f"{name}: [source] of kind {kind!r}: {unknown}")
 
 
 def open_source(

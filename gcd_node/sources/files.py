@@ -183,9 +183,10 @@ def open_video(path: Path) -> Generator[cv2.VideoCapture]:
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
     try:
         if not capture.isOpened() or codec_name(capture.get(cv2.CAP_PROP_FOURCC)) in _NO_VIDEO:
+            found = "there is none" if not path.exists() else "it is a folder" if path.is_dir() else "no codec knows it"
             raise SourceError(
-                f"cannot open {path} as a video: missing, empty, damaged or another kind of file; give a video, or say "
-                'kind = "folder" for a folder of pictures, kind = "mcap" for a log'
+                f"cannot open the video {path}: {found}; give one that is whole (a folder of pictures, and a log, are "
+                "sources of another kind)"
             )
         width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if width * height > MAX_PIXELS:

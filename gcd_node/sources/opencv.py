@@ -111,10 +111,9 @@ def open_v4l2(config: V4l2Source, open_capture: OpenCapture = cv2.VideoCapture) 
     device = config.device
     path = _DEVICES / f"video{device or 0}" if device is None or device.isdigit() else Path(device).expanduser()
     if not path.exists():
-        there = ", ".join(map(str, list_v4l2())) or "none"
-        raise SourceAbsentError(
-            f"there is no camera {path}; there is {there}: plug it in, or correct device in [source]"
-        )
+        there = ", ".join(map(str, list_v4l2()))
+        others = f"there is {there}" if there else "nor any other"
+        raise SourceAbsentError(f"there is no camera {path}; {others}: plug it in, or correct device in [source]")
     if not os.access(path, os.R_OK | os.W_OK):
         raise SourceError(f"{path} may not be used by this user; add the user to the group `video` and log in again")
     silence_opencv()

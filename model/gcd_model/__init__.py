@@ -37,7 +37,7 @@ from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.eyes import SeenFrame
 from gcd_model.live.memory import PlacedFrame
 from gcd_model.live.synthesizer import visibility_of
-from gcd_model.loading import default_precision, export_weights, load_synthesizer, weights_path
+from gcd_model.loading import export_weights, load_synthesizer, placement, weights_path
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
 from gcd_model.synthesizer import FrameSynthesizer, ViewSynthesizer
 from gcd_model.traits import Traits
@@ -76,7 +76,6 @@ __all__ = [
     "center_crop_box",
     "convert_weights",
     "decode_toml",
-    "default_precision",
     "explain_settings_error",
     "export_weights",
     "hatched",
@@ -84,6 +83,7 @@ __all__ = [
     "is_export",
     "load_synthesizer",
     "nearest_delta",
+    "placement",
     "printable",
     "read_json",
     "read_small",

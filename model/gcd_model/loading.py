@@ -179,6 +179,12 @@ def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
     return LoadedWeights(card=card, networks=networks)
 
 
+def placement(name: str, engine: EngineName | None, dtype: str | None, *, live: bool) -> tuple[torch.device, str]:
+    """Device and precision that `load_synthesizer` would choose. Raises OptionError."""
+    device = device_named(name, engine)
+    return device, dtype or default_precision(device, live=live)
+
+
 def default_precision(device: torch.device, *, live: bool) -> str:
     """What networks compute in where nobody says: bfloat16 on CUDA; of the live model on a CPU that has it, too."""
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # older versions of torch cannot tell

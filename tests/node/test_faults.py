@@ -29,9 +29,10 @@ from gcd_model import (
 )
 from gcd_node.config import ModelSection
 from gcd_node.errors import ConfigError, ModelFailedError, SourceLostError
-from gcd_node.health import Health
+from gcd_node.health import Health, Level
 from gcd_node.model import FailureCounter, oom_levels
 from gcd_node.service import ServiceManager
+from gcd_node.sources import open_source
 from gcd_node.status import Announcer
 
 WAITING = "life = {autostart = false}"
@@ -132,6 +133,12 @@ def test_f4_frames_that_do_not_rise_are_dropped_and_a_step_begins_a_new_epoch(tm
     assert before.header.src.seq == (*range(5), *range(7, 16))
     assert (before.header.src.dropped, before.header.src.epoch) == (2, 0)
     assert after.header.src.epoch == 1
+
+
+def test_f4_a_recording_that_begins_again_as_it_is_told_to_is_no_trouble(tmp_path: Path) -> None:
+    config = 'kind = "synthetic"\nfps = 24.0\nframes = 15\nloop = true\nallow_upscale = true'
+    with Rig(tmp_path, open_source, config=config) as rig:
+        assert rig.await_event("CLOCK_STEP")["level"] == Level.OK
 
 
 @pytest.mark.parametrize("strict", ["true", "false"])

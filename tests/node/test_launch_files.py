@@ -203,6 +203,8 @@ def test_what_fails_is_the_exit_code(launch: Path, capsys: Capture) -> None:
         ("model.weights=package:unheard", "weights", 65),
         ("view.main.azimuth_deg=5", "views", 64),
         ("publish.data=tcp://0.0.0.0:5580", "endpoints", 78),
+        ("publish.data=tcp://127.0.0.1:99999", "endpoints", 78),
+        ("model.device=cuda:99", "weights", 78),
     ):
         assert found(launch, change)[topic][0] == "failed"
         assert run_app(["check", str(launch), "--set", change]) == code
@@ -217,6 +219,18 @@ def test_one_failure_does_not_hide_the_next_and_weights_must_fit_into_memory(lau
     assert "in use" in findings["endpoints"][1]
     tiny = f"model.weights={write_tiny(tmp_path)}"
     assert [found(launch, tiny, memory=memory)["weights"][0] for memory in (10_000, 2**40)] == ["failed", "ok"]
+
+
+def test_what_was_not_looked_at_and_what_is_assumed_is_said(launch: Path, tmp_path: Path) -> None:
+    assert found(launch, "source.path=/no/such.mp4")["views"] == (
+        "warning",
+        "not looked at: that takes the source and the weights",
+    )
+    checkpoint = write_tiny(tmp_path)  # it is only read, not loaded
+    assert found(launch, f"model.weights={checkpoint}", "model.engine=cuda")["weights"][0] == "failed"
+    live = "model.weights=package:live-small"
+    assert "85 degrees wide: state hfov_deg" in found(launch, live)["views"][1]
+    assert found(launch, live, "source.hfov_deg=85")["views"][0] == "ok"
 
 
 def test_where_recordings_would_go_is_looked_at(launch: Path, tmp_path: Path) -> None:
