@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -132,6 +133,13 @@ def test_every_file_is_served_with_headers_that_let_nothing_in_and_no_token(view
         assert TOKEN not in body.decode() + str(headers)
     assert HEADERS["Content-Security-Policy"].startswith("default-src 'none'")
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
+
+
+def test_a_page_shows_within_two_seconds_that_its_node_is_dead() -> None:
+    link, main = (load_page()[name][0].decode() for name in ("/link.js", "/main.js"))
+    silences = re.findall(r"(?:BEAT_LOST|NODE_SILENT)_MS = (\d+)", link)
+    (look_ms,) = re.findall(r"TICK_MS = (\d+)", main)
+    assert max(map(int, silences)) + int(look_ms) <= 2000
 
 
 def test_a_foreign_name_made_to_point_here_gets_nothing(viewer: ViewerServer) -> None:
