@@ -1,7 +1,7 @@
 # Everything from nothing but python3 (>= 3.11) and make:
 #   make demo    replay the packaged drive through the model and over ZeroMQ into a second process
 #   make test    the default tests            make check   format, lint, types
-#   make slow    full-size tests (minutes, about 10 GB of memory)
+#   make slow    full-size tests, processes, the browser, C++ (minutes, about 10 GB of memory)
 # WORKERS test processes run beside each other, on a thread each; many of the tests wait rather than compute.
 # TORCH_INDEX names another package index for torch, for example a CPU-only or CUDA one.
 

@@ -244,16 +244,13 @@ def test_sizes_are_bounded_before_anything_is_read() -> None:
         decode(encode(window()), max_payload=100)
 
 
-@pytest.mark.parametrize(
-    "topic",
-    [
+def test_a_topic_outside_the_protocol_is_refused() -> None:
+    for topic in (
         *(b"", b"view/top", b"view/Top/win", b"view/top/win/", b"view//win", b"view/abcdefghijklmnopq/win"),
         *(b"src/win", b"view/src/frm", b"view/top/win\0x", b"\xffiew/top/win", b"control"),
-    ],
-)
-def test_a_topic_outside_the_protocol_is_refused(topic: bytes) -> None:
-    header, payload = split(encode(window()))
-    assert is_refused(raw(json.dumps(header).encode(), payload, topic=topic))
+    ):
+        header, payload = split(encode(window()))
+        assert is_refused(raw(json.dumps(header).encode(), payload, topic=topic))
 
 
 @pytest.mark.parametrize("flags", [0, 1, 2, 4, 3, 6, 7])
@@ -268,20 +265,16 @@ def test_a_view_id_outside_the_alphabet_is_refused(view_id: str) -> None:
         view_topic(view_id, "win")
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
+def test_what_a_header_cannot_hold_is_refused_when_encoding() -> None:
+    for message in (
         ViewMessage(topic="view/top/win", header=replace(view_header(), age_ms=float("nan")), payload=bytes(144)),
         ViewMessage(topic="view/top/win", header=replace(view_header(), age_ms=np.float32(1)), payload=bytes(144)),
         status({"fps": float("inf")}),
         status({"fps": object()}),
         status({"text": "x" * 70_000}),
-    ],
-    ids=["NaN", "foreign number", "infinite", "object", "too long"],
-)
-def test_what_a_header_cannot_hold_is_refused_when_encoding(message: Message) -> None:
-    with pytest.raises(MessageError):
-        encode(message)
+    ):
+        with pytest.raises(MessageError):
+            encode(message)
 
 
 # The page other languages are written from

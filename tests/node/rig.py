@@ -40,6 +40,25 @@ def rig_config(folder: Path, source: str, views: str, more: str) -> NodeConfig:
     return parse_config(text.encode(), "test", [*endpoints, f"control.endpoint=ipc://{folder}/control"])
 
 
+def launch_file(folder: Path, source: str, *, weights: str = "random:driving", more: str = "") -> Path:
+    """A launch file of one view, with its endpoints in its folder. more: of [publish], and what comes after."""
+    (folder / "launch.toml").write_text(f"""
+        [source]
+        {source}
+        [model]
+        weights = "{weights}"
+        steps = 1
+        [view.main]
+        [control]
+        endpoint = "ipc://{folder}/control"
+        [publish]
+        data = "ipc://{folder}/data"
+        status = "ipc://{folder}/status"
+        {more}
+    """)
+    return folder / "launch.toml"
+
+
 @contextlib.contextmanager
 def service_manager(address: str) -> Generator[Callable[[], list[str]]]:
     """Listens as systemd does; calling it gives the lines that have arrived since."""

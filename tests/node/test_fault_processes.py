@@ -14,7 +14,7 @@ import torch
 from cameras import environment
 from fakes import LOCKSTEP, FakeSource, FakeSynthesizer, Steady, traits, write_tiny
 from mcap.reader import make_reader
-from rig import Rig
+from rig import Rig, launch_file
 from safetensors import safe_open
 from safetensors.torch import save_file
 from wire_messages import start_reader
@@ -23,6 +23,7 @@ from gcd_client.subscriber import ViewSubscriber
 from gcd_node import session
 from gcd_node.cli.main import run_app
 
+FRAMES = f"{LOCKSTEP}\nframes = 30"
 REALTIME = 'kind = "synthetic"\npace = "realtime"'
 SLACK_S = 10.0  # what a machine that does other things may add
 START_S = 300.0  # the same for starting a process; shorter than a model hangs
@@ -32,33 +33,13 @@ pytestmark = pytest.mark.timeout(2 * START_S)
 Outcome = Callable[..., tuple[int, str]]
 
 
-def launch_file(folder: Path, *, weights: str = "random:driving", more: str = "") -> Path:
-    """Thirty frames of a made-up source. more: of [publish], and what comes after."""
-    (folder / "launch.toml").write_text(f"""
-        [source]
-        {LOCKSTEP}
-        frames = 30
-        [model]
-        weights = "{weights}"
-        steps = 1
-        [view.main]
-        [control]
-        endpoint = "ipc://{folder}/control"
-        [publish]
-        data = "ipc://{folder}/data"
-        status = "ipc://{folder}/status"
-        {more}
-    """)
-    return folder / "launch.toml"
-
-
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Outcome:
     """Runs a launch file with this source as the command line does; gives its exit code and what it said."""
 
     def ran(opened: FakeSource, **launch: str) -> tuple[int, str]:
         monkeypatch.setattr(session, "open_source", lambda *_: opened)
-        return run_app(["run", str(launch_file(tmp_path, **launch))]), capsys.readouterr().err
+        return run_app(["run", str(launch_file(tmp_path, FRAMES, **launch))]), capsys.readouterr().err
 
     return ran
 
@@ -119,7 +100,7 @@ def test_f9_a_stalled_reader_disturbs_nobody(tmp_path: Path) -> None:
 def test_f23_sigterm_ends_every_view_and_the_process_with_0(tmp_path: Path) -> None:
     recordings = tmp_path / "recordings"
     more = f'min_subscribers = 1\n[record]\nfolder = "{recordings}"\nkeep_free_mb = 0\nautostart = true'
-    command = [sys.executable, "-m", "gcd_node", "run", str(launch_file(tmp_path, more=more))]
+    command = [sys.executable, "-m", "gcd_node", "run", str(launch_file(tmp_path, FRAMES, more=more))]
     with ViewSubscriber(f"ipc://{tmp_path}/data", "main", conflate=False) as views:
         node = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         try:

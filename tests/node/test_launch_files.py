@@ -16,6 +16,7 @@ import pytest
 from cameras import write_video
 from fakes import write_tiny
 from msgspec.structs import replace
+from rig import launch_file
 
 from gcd_node.check import check_launch
 from gcd_node.cli.main import COMMANDS, run_app
@@ -165,21 +166,7 @@ def test_the_container_copies_what_is_there_runs_as_nobody_special_and_calls_com
 def launch(tmp_path: Path) -> Path:
     """Of a video that is smaller than any model takes unless it may be enlarged."""
     write_video(tmp_path / "v.mkv", [np.full((128, 192, 3), 5 * i, np.uint8) for i in range(16)], 10.0)
-    path = tmp_path / "launch.toml"
-    path.write_text(f"""
-        [source]
-        path = "{tmp_path}/v.mkv"
-        allow_upscale = true
-        [model]
-        weights = "random:driving"
-        [view.main]
-        [publish]
-        data = "ipc://{tmp_path}/data"
-        status = "ipc://{tmp_path}/status"
-        [control]
-        endpoint = "ipc://{tmp_path}/control"
-    """)
-    return path
+    return launch_file(tmp_path, f'path = "{tmp_path}/v.mkv"\nallow_upscale = true')
 
 
 def found(launch: Path, *changes: str, memory: int | None = None) -> dict[str, tuple[str, str]]:

@@ -148,11 +148,9 @@ def test_a_failure_keeps_its_own_code() -> None:
 
 
 def test_an_outbox_that_fails_ends_the_run_and_every_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise NodeError("the publisher stopped")
-
     box, before = Box(), threading.active_count()
-    model = FakeSynthesizer(traits(), lambda _: monkeypatch.setattr(box, "note", broken))
+    monkeypatch.setattr(box, "note", Mock(side_effect=[None, None, None, *[NodeError("the publisher stopped")] * 999]))
+    model = FakeSynthesizer(traits(), lambda _: time.sleep(0.05))
     with pytest.raises(NodeError):
         made_node(fake_config(), model, FakeSource(100_000, period_s=0.001), box).run()
     assert threading.active_count() == before

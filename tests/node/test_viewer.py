@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -24,10 +25,10 @@ from fakes import fake_config
 from msgspec.structs import replace
 from rig import Rig
 from viewer_clients import (
-    DEAF,
     TOKEN,
     WAIT_S,
     answer,
+    deaf,
     endpoints_in,
     farewell,
     get,
@@ -49,7 +50,6 @@ from gcd_node.errors import ConfigError, EndpointError
 from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
 from gcd_node.viewer import feed as feed_module
-from gcd_node.viewer import server as server_module
 from gcd_node.viewer.feed import MOST_UNSEEN, MOST_WAITING, Browser, NodeLink, picture
 from gcd_node.viewer.server import HEADERS, MOST_BROWSERS, ViewerServer, load_page
 
@@ -133,6 +133,13 @@ def test_every_file_is_served_with_headers_that_let_nothing_in_and_no_token(view
         assert TOKEN not in body.decode() + str(headers)
     assert HEADERS["Content-Security-Policy"].startswith("default-src 'none'")
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
+
+
+def test_a_page_shows_within_two_seconds_that_its_node_is_dead() -> None:
+    link, main = (load_page()[name][0].decode() for name in ("/link.js", "/main.js"))
+    silences = re.findall(r"(?:BEAT_LOST|NODE_SILENT)_MS = (\d+)", link)
+    (look_ms,) = re.findall(r"TICK_MS = (\d+)", main)
+    assert max(map(int, silences)) + int(look_ms) <= 2000
 
 
 def test_a_foreign_name_made_to_point_here_gets_nothing(viewer: ViewerServer) -> None:
@@ -234,7 +241,9 @@ def test_the_end_waits_for_nobody(tmp_path: Path) -> None:
         with viewer_of(tmp_path) as viewer:
             host, port = host_of(viewer).split(":")
             stack.enter_context(socket.create_connection((host, int(port)), WAIT_S))
-            *_, feed = (stack.enter_context(open_feed(viewer.url, **each)) for each in (DEAF, DEAF, DEAF, {}))
+            *_, feed = (
+                stack.enter_context(open_feed(viewer.url, **each)) for each in (*(deaf(viewer) for _ in range(3)), {})
+            )
             hear(feed, "beat")
             began_s = time.monotonic()
         assert time.monotonic() - began_s < 20
@@ -277,12 +286,13 @@ def test_pictures_come_only_while_somebody_looks_and_an_operator_steers_the_node
 
 
 def test_a_page_that_never_reads_slows_nobody_and_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server_module, "_PING_S", 0.5)
     monkeypatch.setattr(feed_module, "_STUCK_S", 1.0)
     noise = np.random.default_rng(0).integers(0, 256, (14, 256, 384, 3), np.uint8)
     endpoints = PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")
     with Publisher(endpoints) as publisher, viewer_of(tmp_path) as viewer, contextlib.ExitStack() as stack:
-        healthy, *stuck = (stack.enter_context(open_feed(viewer.url, **each)) for each in ({}, DEAF, DEAF, DEAF))
+        healthy, *stuck = (
+            stack.enter_context(open_feed(viewer.url, **each)) for each in ({}, *(deaf(viewer) for _ in range(3)))
+        )
         for each in (healthy, *stuck):
             say(each, "watch", view="top")
             for _ in range(40 * (each is not healthy)):  # it even says that it has seen everything

@@ -13,6 +13,10 @@ from cameras import Bench, Camera, until
 from fakes import FakeSynthesizer, painting_traits
 from rig import Rig
 from viewer_clients import viewer_of
+from wire_messages import origin
+
+from gcd_node.config import PublishConfig
+from gcd_node.publisher import Publisher
 
 CHROMIUM, DRIVER = Path("/usr/bin/chromium"), Path("/usr/bin/chromedriver")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs the Python package selenium, of the extra `dev`")
@@ -202,3 +206,21 @@ def test_a_fixed_view_has_its_classes_and_says_why_it_cannot_be_steered(page: Pa
         page.wait(lambda: page.state == "stale" and page.text("view-veil") == "too old")  # the camera gives nothing
         assert page.complaints() == []
         page.forget(viewer.url)
+
+
+def test_who_comes_to_a_node_that_is_not_there_is_told_so(page: Page, tmp_path: Path) -> None:
+    with viewer_of(tmp_path) as viewer:
+        page.open(viewer.url)
+        page.wait(lambda: "has not spoken" in page.text("why"))
+        assert page.state == "connecting"
+        assert page.text("view-badge") == "no view yet"
+        assert page.text("input-badge") == "no input yet"
+        with Publisher(PublishConfig(data=f"ipc://{tmp_path}/data", status=f"ipc://{tmp_path}/status")) as publisher:
+
+            def speak() -> bool:
+                publisher.note("status", origin(), {"state": "active", "level": 0})
+                return page.state == "stale"
+
+            page.wait(speak)  # it lives, and no view comes
+            page.wait(lambda: page.state == "dead")  # it lives no more, though its socket is there
+        assert "silent" in page.text("why")

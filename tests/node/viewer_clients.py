@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import http.client
 import json
+import socket
 import struct
 import threading
 import time
@@ -72,8 +73,12 @@ def get(viewer: ViewerServer, path: str, *, hosts: list[str] | None = None, meth
     return answer.status, answer.headers, body
 
 
-DEAF: Any = {"max_queue": 1, "close_timeout": 0.2}
-"""Of a feed that nobody reads: it takes one message off its socket."""
+def deaf(viewer: ViewerServer) -> dict[str, Any]:
+    """Of a feed that nobody reads: it takes one message off its socket, which holds little."""
+    raw, (host, port) = socket.socket(), host_of(viewer).split(":")
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    raw.connect((host, int(port)))
+    return {"sock": raw, "max_queue": 1, "close_timeout": 0.2}
 
 
 def open_feed(url: str, origin: str | None = None, **limits: Any) -> ClientConnection:
