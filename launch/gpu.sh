@@ -40,7 +40,7 @@ if [ -n "$SMALL" ]; then
   REPEATS=1
 else
   MODEL=(--weights random:full --device cuda --dtype bfloat16 --height 256 --width 384 --steps 25 --guidance 1 1.5)
-  ENGINES=(cuda-float32-decoder compiled graphs cuda-tuned)
+  ENGINES=(cuda-float8 cuda-float32-decoder compiled graphs cuda-tuned)
   PEERS=(--peer diffusers --compiled)
   "$PYTHON" -c 'import torch; assert torch.cuda.is_available(), "no CUDA device; SMALL=1 tries the script on a CPU"'
 fi

@@ -38,6 +38,7 @@ ENGINES = {
     "torch": "ours",
     "cuda": "ours on cuda",
     "cuda-tuned": "ours on cuda, tuned",
+    "cuda-float8": "ours on cuda, float8",
     "cuda-float32-decoder": "ours on cuda, float32 decoder",
     "compiled": "ours, compiled alone",
     "graphs": "ours, graphs alone",

@@ -49,6 +49,7 @@ STAGES: tuple[StageName, ...] = get_args(StageName)
 VARIANTS = {
     "ours on cuda": {},
     "ours on cuda, tuned": {"tuned": True},
+    "ours on cuda, float8": {"float8": True},
     "ours on cuda, float32 decoder": {"decoder": "float32"},
     "ours, compiled alone": {"graphs": False},
     "ours, graphs alone": {"backend": None, "channels_last": False, "joined": False, "decoder": "float32"},

@@ -113,7 +113,7 @@ class Options:
     provider: Annotated[
         list[str] | None, _model(help="Execution provider of onnxruntime, by its own name; several, best first.")
     ] = None
-    dtype: Annotated[str | None, _model(help="float32, bfloat16 or float16.")] = None
+    dtype: Annotated[str | None, _model(help="float32, bfloat16 or float16; float8 with --engine cuda.")] = None
     head_width: HeadWidth = None
     image_heads: ImageHeads = None
     adapter: Annotated[Path | None, _model("--adapter", help="Low-rank adapter trained on these weights.")] = None

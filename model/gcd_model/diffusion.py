@@ -128,13 +128,14 @@ def guidance_scale(first: float, last: float, frames: int) -> Tensor:
     return torch.linspace(first, last, frames, dtype=torch.float64)
 
 
-def unit_noise(shape: tuple[int, ...], seed: int, stream: int = 0) -> Tensor:
-    """Standard normal float32, the same on every device.
+def unit_noise(shape: tuple[int, ...], seed: int, stream: int = 0, device: torch.device | str = "cpu") -> Tensor:
+    """Standard normal float32.
 
     seed, stream: draws with another seed or another stream (sample number) are independent.
+    device: where it is drawn, and lies; a GPU draws other numbers than a CPU.
     """
     mixed = (seed * 0x9E3779B97F4A7C15 + stream * 0xBF58476D1CE4E5B9 + 1) % 2**63
-    return torch.randn(shape, generator=torch.Generator().manual_seed(mixed))
+    return torch.randn(shape, generator=torch.Generator(device).manual_seed(mixed), device=device)
 
 
 # --- solvers as tables of coefficients, and the loop that follows them ----------------------------------------------

@@ -1,6 +1,7 @@
 """From the name of a checkpoint to a synthesizer on a device."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Unpack, get_args
 
@@ -48,7 +49,8 @@ def load_synthesizer(
         device: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:N".
         dtype: "float32", "bfloat16" or "float16"; else float32 on the CPU, bfloat16 on CUDA. The VAE decoder
             stays float32 (on CUDA torch may use TF32 in its convolutions, see torch.backends.cudnn). The live model
-            computes in bfloat16 also on a CPU that multiplies in it (Intel AMX).
+            computes in bfloat16 also on a CPU that multiplies in it (Intel AMX). "float8", for the engine "cuda": as
+            bfloat16, but attention and feed-forward of the U-Net multiply in 8 bits (e4m3).
         told: family, head_width, image_heads, frames, see `Told`.
         adapter: file of a low-rank adapter that was trained on these weights; family and path are then the adapter's.
         engine: what computes the networks: "torch" as they are, or "cuda", compiled and as CUDA graphs, for a GPU; it
@@ -77,7 +79,7 @@ def load_synthesizer(
             f"make one: gcd-node export --weights {source} --onnx FOLDER"
         )
     place = device_named(device, engine)
-    precision(dtype or "float32")  # before anything is loaded
+    _stored_in(dtype or "float32", engine)  # before anything is loaded
     return placed_synthesizer(loaded_weights(source, adapter=adapter, **told), place, dtype=dtype, engine=engine)
 
 
@@ -134,12 +136,20 @@ def placed_synthesizer(
         networks = networks.to(device, precision(name), memory_format=layout(device))  # pyright: ignore
         return LiveSynthesizer(networks, traits)
     for part, module in networks.named_children():
-        module.to(device, torch.float32 if part in FULL_PRECISION else precision(name))
+        module.to(device, torch.float32 if part in FULL_PRECISION else _stored_in(name, engine))
     if engine != "cuda":
         return Synthesizer(networks, traits)
-    from gcd_model.engines.cuda import CudaEngine  # torch.compile takes seconds to import
+    from gcd_model.engines.cuda import CudaEngine, CudaOptions  # torch.compile takes seconds to import
 
-    return Synthesizer(networks, traits, CudaEngine(networks))
+    options = replace(CudaOptions.of_device(device), float8=name == "float8")
+    return Synthesizer(networks, traits, CudaEngine(networks, options))
+
+
+def _stored_in(name: str, engine: EngineName | None) -> torch.dtype:
+    """What weights are kept in that compute in this precision. Raises OptionError."""
+    if name == "float8" and engine != "cuda":
+        raise OptionError("float8 is for the engine cuda alone; take it, or bfloat16")
+    return precision("bfloat16" if name == "float8" else name)
 
 
 def weights_path(source: str | Path) -> Path:

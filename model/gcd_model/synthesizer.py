@@ -23,7 +23,7 @@ from gcd_model.vae import to_pixels
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
 
-_ENCODE_FRAMES = 2  # frames per encoder call: the largest activations are per frame, so this bounds memory
+_ENCODE_FRAMES = 2  # of a CPU, in one call of an encoder: the largest activations are per frame, so this bounds memory
 
 
 class ViewSynthesizer(Protocol):
@@ -178,16 +178,18 @@ class Synthesizer:
         wanted, given = self._config.extra_condition_channels, 0 if extra is None else extra.shape[1]
         if wanted != given:
             raise ShapeError(f"{self._traits.name} wants {wanted} extra condition channels, got {given}")
-        noise = augmentation.noise
-        if noise is None:
-            noise = unit_noise(tuple(clip.video.shape), augmentation.seed)
-        if noise.shape != clip.video.shape:
+        noise, device = augmentation.noise, self._engine.like.device
+        if noise is not None and noise.shape != clip.video.shape:
             raise ShapeError(f"augmentation noise must be {list(clip.video.shape)}, got {list(noise.shape)}")
-        noisy = clip.video + strength * noise.to(clip.video.device)
-        tokens = [self._engine.tokens(frames) for frames in clip.video.split(_ENCODE_FRAMES)]
+        video = noisy = clip.video.to(device)
+        if strength > 0:
+            noise = unit_noise(tuple(video.shape), augmentation.seed, device=device) if noise is None else noise
+            noisy = video + strength * noise.to(device)
+        at_once = _ENCODE_FRAMES if device.type == "cpu" else len(video)
+        tokens = [self._engine.tokens(frames) for frames in video.split(at_once)]
         return SourceFeatures(
             tokens=torch.cat([each for each in tokens if each is not None]) if self._config.image_encoder else None,
-            latents=torch.cat([self._engine.condition_mean(frames) for frames in noisy.split(_ENCODE_FRAMES)]),
+            latents=torch.cat([self._engine.condition_mean(frames) for frames in noisy.split(at_once)]),
             extra=None if extra is None else extra.to(self._engine.like),
             fps=clip.fps,
             augmentation=strength,

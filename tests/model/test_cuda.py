@@ -9,10 +9,10 @@ import pytest
 import torch
 from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_driving, tiny_synthesizer, tiny_traits
 
-from gcd_model.clip import View
+from gcd_model.clip import Augmentation, View
 from gcd_model.config import SVD_14, ModelConfig
-from gcd_model.diffusion import RenderOptions
-from gcd_model.engines.cuda import CudaEngine, CudaOptions
+from gcd_model.diffusion import RenderOptions, unit_noise
+from gcd_model.engines.cuda import CudaEngine, CudaOptions, psnr_db
 from gcd_model.errors import Cancelled
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
@@ -32,7 +32,9 @@ def latents(device: str, dtype: torch.dtype) -> torch.Tensor:
     traits = tiny_traits(precision=str(dtype), device=device)
     synthesizer = Synthesizer(networks, traits)
     path = traits.plan_view(SphericalDelta(azimuth_deg=30.0))
-    view = synthesizer.render(synthesizer.encode(random_clip()), [path], RenderOptions(steps=3, samples=2))[0]
+    clip = random_clip()
+    noise = Augmentation(noise=unit_noise(tuple(clip.video.shape), 0))
+    view = synthesizer.render(synthesizer.encode(clip, noise), [path], RenderOptions(steps=3, samples=2))[0]
     assert view.samples.device.type == view.latents.device.type == "cpu"
     return view.latents
 
@@ -68,6 +70,7 @@ def test_a_full_device_is_our_own_error_and_leaves_the_device_usable() -> None:
 
 GRAPHS = CudaOptions(backend=None, decoder="float32")
 VARIANTS = {"graphs": GRAPHS, "compiled": CudaOptions(graphs=False, decoder="float32"), "both": CudaOptions()}
+FLOAT8 = CudaOptions(float8=True)
 
 
 @pytest.fixture
@@ -90,7 +93,9 @@ def rendered(synthesizer: Synthesizer, options: RenderOptions, config: ModelConf
     traits = synthesizer.traits
     steered = config.camera != "none"
     paths = [traits.plan_view(SphericalDelta(azimuth_deg=a) if steered else None) for a in (30.0, -20.0)]
-    return synthesizer.render(synthesizer.encode(random_clip(config)), paths, options)
+    clip = random_clip(config)
+    noise = Augmentation(noise=unit_noise(tuple(clip.video.shape), 0))  # a GPU would draw another
+    return synthesizer.render(synthesizer.encode(clip, noise), paths, options)
 
 
 @pytest.mark.usefixtures("exact")
@@ -108,6 +113,14 @@ def test_the_engine_computes_what_plain_torch_computes(variant: str) -> None:
             assert relative_error(mine.samples.float(), other.samples.float()) < (
                 0.02 if options.whole_levels else 1e-3
             )
+
+
+def test_products_in_8_bits_stay_near_plain_torch() -> None:
+    plain = tiny_synthesizer()
+    for mine, other in zip(
+        *(rendered(each, RenderOptions(steps=3)) for each in (on_gpu(plain, FLOAT8), plain)), strict=True
+    ):
+        assert psnr_db(mine.samples, other.samples) > 30
 
 
 @pytest.mark.usefixtures("exact")

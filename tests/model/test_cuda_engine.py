@@ -23,10 +23,15 @@ from gcd_model.diffusion import RenderOptions, Schedule
 from gcd_model.engines.cuda import (
     CudaEngine,
     CudaOptions,
+    Float8,
+    Float8Linear,
     cache_folder,
     checked_decoder,
     join_attention,
     keep_compiled,
+    linear,
+    multiply_in_float8,
+    psnr_db,
     regions,
     twin,
 )
@@ -353,6 +358,33 @@ def test_joined_attention_is_plain_attention_in_the_same_memory() -> None:
     changed.key = nn.Sequential(changed.key)  # as an adapter does
     join_attention(changed)
     assert type(changed) is Attention
+
+
+def test_products_in_8_bits_stay_near_plain_torch_and_leave_an_adapter_alone(plain: Synthesizer) -> None:
+    """On random weights of widths of 32: 37 to 38 dB; bfloat16 keeps 47."""
+    options = RenderOptions(steps=3, guidance=(1.0, 1.5))
+    (other,) = views_of(plain, options, random_clip(), (30.0,))
+    for joined in (False, True):
+        engine = with_engine(plain, options=replace(PLAIN, float8=True, joined=joined))
+        (mine,) = views_of(engine, options, random_clip(), (30.0,))
+        assert 32 < psnr_db(mine.samples, other.samples) < 45
+    changed = Attention(16, 2)
+    changed.key = nn.Sequential(changed.key)  # as an adapter does
+    multiply_in_float8(changed)
+    assert [type(each) for each in changed.children()].count(Float8Linear) == 3
+    narrow = Attention(8, 2)
+    multiply_in_float8(narrow)
+    assert type(narrow.out) is nn.Linear
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e4])
+def test_a_product_in_8_bits_errs_by_less_than_a_sixteenth_whatever_its_rows_are_scaled_by(scale: float) -> None:
+    x, weight, bias = torch.randn(2, 5, 32), torch.randn(48, 32), torch.randn(48)
+    x[0, 0] *= scale
+    expected = nn.functional.linear(x, weight, bias)
+    made = linear(x, Float8.of(weight), bias)
+    errors = (made - expected).norm(dim=-1) / expected.norm(dim=-1)
+    assert 0 < errors.max() < 1 / 16
 
 
 _ONE_REGION = """

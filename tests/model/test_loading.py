@@ -95,6 +95,7 @@ def test_packaged_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.
         {"device": "cpu:1"},
         {"device": "cuda:99"},
         {"dtype": "int8"},
+        {"dtype": "float8"},  # of the engine cuda alone
         {"family": "driving"},
         {"frames": 1},
     ],

@@ -145,6 +145,24 @@ def test_features_of_parts_joined_equal_features_of_the_whole_clip(synthesizer: 
     assert relative_error(joined.latents, whole.latents[1:4]) < 1e-5
 
 
+def test_off_the_cpu_all_frames_are_encoded_at_once(synthesizer: Synthesizer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU has the memory, and each call costs it as much as another frame."""
+    seen = list[tuple[str, int]]()
+
+    class Elsewhere:
+        like = torch.empty(0, device="meta")
+
+        def tokens(self, frames: Tensor) -> Tensor:
+            seen.append((frames.device.type, len(frames)))
+            return frames
+
+        condition_mean = tokens
+
+    monkeypatch.setattr(synthesizer, "_engine", Elsewhere())
+    synthesizer.encode(random_clip(), Augmentation(strength=0.0))
+    assert seen == [("meta", TINY.frames)] * 2
+
+
 def test_the_motion_number_comes_from_the_formula_unless_it_is_given(synthesizer: Synthesizer) -> None:
     features = synthesizer.encode(random_clip())
     (view,) = synthesizer.render(features, [path(synthesizer)])

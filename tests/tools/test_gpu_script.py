@@ -38,7 +38,7 @@ def test_its_options_and_engines_exist() -> None:
     options = set(re.findall(r"--[a-z][a-z-]+", bench))
     engines = set(re.findall(r"ENGINES=\(([a-z0-9 -]+)\)", text)[1].split())
     assert {"--weights", "--engine", "--peer", "--compiled", "--memory"} <= options
-    assert len(engines) == 4
+    assert len(engines) == 5
     assert [word for word in sorted(options | engines) if word not in shown] == []
 
 

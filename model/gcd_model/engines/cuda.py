@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias, TypeVar
+from typing import Any, Literal, NamedTuple, Self, TypeAlias, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +23,7 @@ from gcd_model.conditioning import Conditioning, ImageTransformerLayer
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise, watched
 from gcd_model.engines.graphs import CudaGraphs, Recent, RecordedCall, Recorder, StepMemory, Update, solved
 from gcd_model.engines.torch import NetworkName, TorchEngine
-from gcd_model.layers import Attention, Downsample, ResBlock, Upsample, VideoResBlock, prepare
+from gcd_model.layers import Attention, Downsample, FeedForward, ResBlock, Upsample, VideoResBlock, prepare
 from gcd_model.networks import Networks
 from gcd_model.unet import Stage
 from gcd_model.vae import PixelAttention, TemporalDecoder, to_pixels
@@ -38,7 +38,7 @@ class CudaOptions:
     backend: of torch.compile; None runs the blocks as they are. tuned: inductor tries kernels for each shape, which
         takes many times as long to compile. graphs: record steps, encoders and decoder as CUDA
         graphs. channels_last: lay convolutions out as tensor cores read them. joined: query, key and value of an
-        attention are one product.
+        attention are one product. float8: the U-Net's attention and feed-forward multiply in 8 bits.
     decoder: its precision; "checked" means float16, else bfloat16, where its pictures reach 50 dB against float32,
         see `checked_decoder`.
     """
@@ -48,6 +48,7 @@ class CudaOptions:
     graphs: bool = True
     channels_last: bool = True
     joined: bool = True
+    float8: bool = False
     decoder: Literal["checked", "float32", "float16", "bfloat16"] = "checked"
 
     @classmethod
@@ -76,6 +77,8 @@ class CudaEngine(TorchEngine):
             channels_last(networks)
         if options.joined:
             join_attention(networks)
+        if options.float8:
+            multiply_in_float8(networks.unet)
         prepare(networks)
         super().__init__(networks)
         self._beat: Callable[[], object] = lambda: None  # called before each piece of code is compiled
@@ -252,14 +255,64 @@ def channels_last(model: nn.Module) -> None:
             module.weight = nn.Parameter(weight, requires_grad=False)
 
 
+class Float8(NamedTuple):
+    """A matrix [N, M] in 8 bits: values float8_e4m3fn [N, M], scales float32 [N, 1], one a row, so that its largest
+    number is the largest there is."""
+
+    values: Tensor
+    scales: Tensor
+
+    @classmethod
+    def of(cls, matrix: Tensor) -> Self:
+        """The nearest to it."""
+        largest = torch.finfo(torch.float8_e4m3fn).max
+        scales = matrix.abs().amax(-1, keepdim=True).float().clamp(min=1e-12) / largest
+        return cls((matrix / scales).clamp(-largest, largest).to(torch.float8_e4m3fn), scales)
+
+
+def linear(x: Tensor, weight: Tensor | Float8, bias: Tensor | None = None) -> Tensor:
+    """As F.linear; by a weight in 8 bits, x [..., M] is rounded to 8 bits, too, row by row."""
+    if isinstance(weight, Tensor):
+        return F.linear(x, weight, bias)
+    rows, matrix = Float8.of(x.flatten(0, -2)), weight.values.t()
+    made = torch._scaled_mm(  # pyright: ignore[reportPrivateUsage, reportPrivateImportUsage]  there is no other door to it
+        rows.values, matrix, scale_a=rows.scales, scale_b=weight.scales.t(), out_dtype=torch.bfloat16
+    )
+    made = made.to(x.dtype).unflatten(0, x.shape[:-1])
+    return made if bias is None else made + bias
+
+
+class Float8Linear(nn.Linear):
+    """A linear layer by `float8`, its weight in 8 bits."""
+
+    float8: Float8
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002  torch's name
+        """input: [..., M]."""
+        return linear(input, self.float8, self.bias)
+
+
+def multiply_in_float8(model: nn.Module) -> None:
+    """Have attention and feed-forward multiply in 8 bits, in place; not what an adapter changes, nor sides that are no
+    multiple of 16, which no GPU multiplies so."""
+    for module in model.modules():
+        layers = list(module.children()) if isinstance(module, Attention | FeedForward) else []
+        if isinstance(module, JoinedAttention) and isinstance(module.joint, Tensor):
+            layers = [module.out]  # query, key and value are parts of the joint product
+            module.joint = module.joint if module.joint.shape[1] % 16 else Float8.of(module.joint)
+        for layer in layers:
+            if type(layer) is nn.Linear and not (layer.in_features % 16 or layer.out_features % 16):
+                vars(layer)["float8"], layer.__class__ = Float8.of(layer.weight), Float8Linear
+
+
 class JoinedAttention(Attention):
     """Attention whose query, key and value are one product. joint: their weights, of which theirs are now parts."""
 
-    joint: Tensor
+    joint: Tensor | Float8
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [N, L, C]."""
-        query, key, value = map(self._split, F.linear(x, self.joint).chunk(3, dim=-1))
+        query, key, value = map(self._split, linear(x, self.joint).chunk(3, dim=-1))
         mixed = F.scaled_dot_product_attention(query, key, value)
         return self.out(mixed.transpose(1, 2).flatten(2))
 
