@@ -13,10 +13,10 @@ from gcd_node.config import PublishConfig
 from gcd_node.publisher import Publisher
 
 CLIENT = Path(__file__).parents[2] / "client"
-LIGHTEST_IMPORT_S = 0.15
 PROGRAM = """
 import importlib.util, sys
 from gcd_client import ControlClient, ViewSubscriber
+assert not {"numpy", "asyncio", "cv2"} & sys.modules.keys()  # numpy alone takes longer to import than all the rest
 data, control = sys.argv[1:]
 assert not any(importlib.util.find_spec(name) for name in ("torch", "cv2", "gcd_node", "gcd_model"))
 with ViewSubscriber(data, "top", conflate=False) as views:
@@ -40,13 +40,3 @@ def test_the_client_alone_reads_views_and_commands(tmp_path: Path) -> None:
         publisher.end(end(window_id=4))
         out, _ = reader.communicate(timeout=60)
     assert out.splitlines() == [f"[(4, (2, 4, 6, 3), {sum(bytes(message.payload))})]", "{'role': 'operator'}"]
-    assert min(import_s(python, clean) for _ in range(7)) <= LIGHTEST_IMPORT_S
-
-
-def import_s(python: Path, environment: dict[str, str]) -> float:
-    """How long `import gcd_client` takes in a new process."""
-    command = [python, "-X", "importtime", "-c", "import gcd_client"]
-    told = subprocess.run(
-        command, capture_output=True, text=True, check=True, timeout=60, env=environment, cwd="/"
-    ).stderr
-    return int(told.splitlines()[-1].split("|")[1]) / 1e6
