@@ -24,7 +24,7 @@ from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
 from gcd_model.engines.cuda import psnr_db
-from gcd_model.engines.torch import Engine, TorchEngine, arrange
+from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
@@ -178,7 +178,7 @@ def engine_named(name: str, networks: Networks) -> Engine:
         prepare(networks)
         if next(networks.unet.parameters()).device.type == "cpu":
             arrange(networks)
-        return TorchEngine(networks)
+        return Engine(networks)
     if name in VARIANTS:
         from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin
 

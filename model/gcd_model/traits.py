@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.config import ModelConfig, SemanticClass
-from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
+from gcd_model.errors import OptionError, PoseError, ShapeError, ViewFixedError, ViewRangeError
 from gcd_model.geometry import (
     CameraMount,
     DeltaFit,
@@ -153,6 +154,14 @@ class Traits:
                 f"height and width must be multiples of {factor} for {self.name}, got {height}x{width}; "
                 f"the trained size is {self.config.height}x{self.config.width}"
             )
+
+    def check_lengths(self, frames: int, trajectories: Sequence[Trajectory]) -> None:
+        """Raises ShapeError unless there are paths, and they and the features have as many frames as a clip."""
+        if not trajectories:
+            raise ShapeError("at least one trajectory is wanted, got none")
+        for length in (frames, *(path.frames for path in trajectories)):
+            if length != self.config.frames:
+                raise ShapeError(f"{self.name} works on {self.config.frames} frames, got {length}")
 
     def motion_bucket(self, trajectory: Trajectory) -> float:
         """The motion number for a camera path. Raises OptionError where only the user can know it.

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Hashable
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from gcd_model.engines.cuda import (
     regions,
     twin,
 )
-from gcd_model.engines.graphs import CudaGraphs, Recent, Recorder, Replay
+from gcd_model.engines.graphs import CudaGraphs, Recorder, Replay, recent
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
 from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.layers import Attention, ResBlock
@@ -179,7 +179,7 @@ def test_a_full_device_drops_what_was_recorded_and_the_next_window_starts_anew(p
 
 
 def test_only_the_shapes_last_used_are_kept() -> None:
-    recent: Recent[str] = Recent(limit=2)
+    kept: dict[Hashable, str] = {}
     made: list[int] = []
 
     def make(key: int) -> str:
@@ -187,7 +187,7 @@ def test_only_the_shapes_last_used_are_kept() -> None:
         return str(key)
 
     for key in (1, 2, 1, 3, 1, 2):
-        assert recent.get(key, lambda key=key: make(key)) == str(key)
+        assert recent(kept, key, lambda key=key: make(key), limit=2) == str(key)
     assert made == [1, 2, 3, 2]
 
 

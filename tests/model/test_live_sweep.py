@@ -76,8 +76,6 @@ def test_the_oldest_frame_from_which_the_scene_looks_alike_is_chosen() -> None:
     still = standing.chosen(HERE)
     assert still is not None
     assert float(still.picture[0, 0, 0]) == 4.0  # the oldest of the six that are kept
-    kept.reset()
-    assert kept.chosen(at(2.0)) is None
 
 
 def test_one_depth_everywhere_is_a_median_and_nothing_but_sky_is_none() -> None:

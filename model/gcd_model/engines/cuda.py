@@ -7,7 +7,7 @@ import copy
 import logging
 import math
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from gcd_model.conditioning import Conditioning, ImageTransformerLayer
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise, watched
-from gcd_model.engines.graphs import CudaGraphs, Recent, RecordedCall, Recorder, StepMemory, Update, solved
-from gcd_model.engines.torch import NetworkName, TorchEngine
+from gcd_model.engines.graphs import CudaGraphs, RecordedCall, Recorder, StepMemory, Update, recent, solved
+from gcd_model.engines.torch import Engine, NetworkName
 from gcd_model.layers import Attention, Downsample, ResBlock, Upsample, VideoResBlock, prepare
 from gcd_model.networks import Networks
 from gcd_model.unet import Stage
@@ -58,8 +58,8 @@ class CudaOptions:
         return cls(backend=None, channels_last=False, joined=False, decoder="float32")
 
 
-class CudaEngine(TorchEngine):
-    """Implements Engine. Not for several threads at once."""
+class CudaEngine(Engine):
+    """Not for several threads at once."""
 
     def __init__(
         self, networks: Networks, options: CudaOptions | None = None, recorder: Recorder | None = None
@@ -83,8 +83,8 @@ class CudaEngine(TorchEngine):
         on_gpu = options.graphs and self.like.device.type == "cuda"
         with self._on_device():
             self._recorder = recorder or (CudaGraphs() if on_gpu else Recorder())
-        self._memories: Recent[StepMemory] = Recent()
-        self._calls: Recent[RecordedCall] = Recent()
+        self._memories: dict[Hashable, StepMemory] = {}
+        self._calls: dict[Hashable, RecordedCall] = {}
 
     def forget(self) -> None:
         """Drop what was recorded, and with it the memory it holds."""
@@ -111,7 +111,7 @@ class CudaEngine(TorchEngine):
         with self._at_work():
             work = partial(super().compute, name)
             key = name, given.shape, given.dtype
-            return self._calls.get(key, lambda: RecordedCall(work, given, self._recorder))(given)
+            return recent(self._calls, key, lambda: RecordedCall(work, given, self._recorder))(given)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine. One view and sample after the other: so no number of them has code or graphs of its own, and none
@@ -132,7 +132,8 @@ class CudaEngine(TorchEngine):
         if options.progress is not None:
             self._beat = partial(options.progress, 0, len(widths))
         with self._at_work():
-            memory = self._memories.get(
+            memory = recent(
+                self._memories,
                 (start.shape, given.latents.shape, given.tokens is None),
                 lambda: StepMemory(self, self._update, start, given, schedule),
             )

@@ -1,9 +1,8 @@
 """Work on a GPU recorded once and replayed with one call: no Python and no allocation between its kernels."""
 
-from collections import OrderedDict
 from collections.abc import Callable, Generator, Hashable
 from contextlib import contextmanager
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -87,25 +86,14 @@ def _warm(work: Replay, side: torch.cuda.Stream) -> None:
     main.wait_stream(side)
 
 
-class Recent(Generic[Kept]):
-    """The things last used, by key: what is made for one shape of batch is kept for a few of them."""
-
-    def __init__(self, limit: int = _SHAPES) -> None:
-        self._limit = limit
-        self._kept: OrderedDict[Hashable, Kept] = OrderedDict()
-
-    def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """The one of this key, made where there is none; the one that was not used for longest makes room."""
-        if key not in self._kept:
-            while len(self._kept) >= self._limit:
-                self._kept.popitem(last=False)
-            self._kept[key] = make()
-        self._kept.move_to_end(key)
-        return self._kept[key]
-
-    def clear(self) -> None:
-        """Keep nothing."""
-        self._kept.clear()
+def recent(kept: dict[Hashable, Kept], key: Hashable, make: Callable[[], Kept], limit: int = _SHAPES) -> Kept:
+    """What is kept of this key, made where there is none; beyond the limit the one not used for longest goes."""
+    if key not in kept:
+        while len(kept) >= limit:
+            del kept[next(iter(kept))]
+        kept[key] = make()
+    kept[key] = kept.pop(key)  # the last one is the one last used
+    return kept[key]
 
 
 class RecordedCall:

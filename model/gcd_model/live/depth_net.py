@@ -8,6 +8,7 @@ how far the plane sweep is trusted: bins that explain the earlier frame badly lo
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -249,12 +250,9 @@ def _entropy(logits: Tensor) -> Tensor:
 # Source: the cost volume of Watson et al. 2021 (ManyDepth), with colours instead of features.
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Reference:
-    """An earlier frame of the same camera.
-
-    picture: [3, H, W] in [-1, 1]. reference_from_camera: float64 [4, 4], metres.
-    """
+class Reference(NamedTuple):
+    """An earlier frame of the same camera. picture: [3, H, W] in [-1, 1]. reference_from_camera: float64 [4, 4],
+    metres."""
 
     picture: Tensor
     reference_from_camera: Tensor

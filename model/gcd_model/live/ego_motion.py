@@ -8,7 +8,7 @@ drifts less than a sum of steps. Every sighting's depth improves that place. Ope
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -54,8 +54,7 @@ _OTHER_SURFACE = 0.15
 """Relative step of depth from which on a track's pixel shows something else than its point."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """Where the camera of a frame is.
 
     world_from_camera: float64 [4, 4]; the world is the camera of the first frame, or of the last one that was lost.
@@ -94,28 +93,15 @@ class _LostError(Exception):
 
 
 class EgoMotion:
-    """Follows one source camera; reset() where another lens or another camera takes over."""
+    """Follows one source camera; the first frame is where the world begins."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the last frame: the next one is where the world begins."""
         self._last: _Frame | None = None
         self._new: _Frame | None = None
         self._begin_world()
 
     def _begin_world(self) -> None:
-        self._pose, self._step = np.eye(4), np.eye(4)
-        self._tracks = no_tracks()
-
-    def step(
-        self, picture: Tensor, depth: Tensor, static: Tensor, lens: Intrinsics, odometry: Tensor | None = None
-    ) -> Motion:
-        """`follow` and `settle` at once, where depth is known beforehand."""
-        motion = self.follow(picture, lens, odometry)
-        self.settle(depth, static)
-        return motion
+        self._pose, self._step, self._tracks = np.eye(4), np.eye(4), no_tracks()
 
     def follow(self, picture: Tensor, lens: Intrinsics, odometry: Tensor | None = None) -> Motion:
         """The motion from the last frame that was settled to this one.
@@ -125,23 +111,14 @@ class EgoMotion:
             odometry: float64 [4, 4], world_from_camera in a world of its own; only differences count. Two frames in a
                 row must have it, else the pictures decide.
         """
-        refused = None
-        if odometry is not None:
-            try:
-                odometry = require_rigid(odometry, "odometry").double()
-            except PoseError as error:
-                odometry, refused = None, str(error)
-        last, self._new = self._last, _frame(picture, lens, odometry)
+        lost, last, self._new = None, self._last, _frame(picture, lens, odometry)
         try:
-            if refused:
-                raise _LostError(refused)
-            if last is None:
-                return Motion(world_from_camera=torch.eye(4, dtype=torch.float64))
-            self._advance(last, self._new)
+            if last is not None:
+                self._advance(last, self._new)
         except _LostError as error:
             self._begin_world()
-            return Motion(world_from_camera=torch.eye(4, dtype=torch.float64), lost=str(error))
-        return Motion(world_from_camera=torch.from_numpy(self._pose.copy()))
+            lost = str(error)
+        return Motion(torch.from_numpy(self._pose.copy()), lost)
 
     def settle(self, depth: Tensor, static: Tensor, spread: Tensor | None = None) -> None:
         """What the frame shows that was just followed: the next one's motion hangs on it.
@@ -181,7 +158,7 @@ def _frame(picture: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame
         share=nothing.astype(np.float64),
         usable=nothing,
         lens=lens,
-        odometry=odometry,
+        odometry=None if odometry is None else odometry.cpu(),
     )
 
 

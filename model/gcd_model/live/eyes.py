@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gcd_model.errors import ShapeError
 from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.blocks import likeliest
-from gcd_model.live.config import SIZE_FACTOR, SKY_M
+from gcd_model.live.config import SKY_M
 from gcd_model.live.depth_net import Reference, depth_inputs, pixel_rays, plane_depth, read_depth, sweep_costs
 from gcd_model.live.ego_motion import EgoMotion
 from gcd_model.networks import LiveNetworks
@@ -73,10 +72,6 @@ class References:
         self._frames: deque[tuple[Tensor, Tensor]] = deque(maxlen=_FRAMES)
         self._median_m = 0.0
 
-    def reset(self) -> None:
-        """Forget them."""
-        self._frames.clear()
-
     def add(self, picture: Tensor, world_from_camera: Tensor, metres: Tensor) -> None:
         """picture: [3, H, W]. metres: [H, W]; 0 for holes."""
         self._frames.append((picture, world_from_camera))
@@ -88,7 +83,7 @@ class References:
         for picture, pose in self._frames:
             move = invert_rigid(pose) @ world_from_camera
             if float(move[:3, 3].norm()) <= LONGEST * self._median_m:
-                return Reference(picture=picture, reference_from_camera=move)
+                return Reference(picture, move)
         return None
 
 
@@ -98,15 +93,12 @@ class Eyes:
     def __init__(self, networks: LiveNetworks) -> None:
         self._networks, self._config = networks.eval(), networks.config
         self._device = next(networks.parameters()).device
-        self._ego, self._references = EgoMotion(), References()
         self._lens: Intrinsics | None = None
-        self._begins = True
+        self.reset()
 
     def reset(self) -> None:
         """Forget all frames: the next one begins."""
-        self._ego.reset()
-        self._references.reset()
-        self._begins = True
+        self._ego, self._references, self._begins = EgoMotion(), References(), True
 
     @torch.inference_mode()
     def look(
@@ -120,22 +112,22 @@ class Eyes:
     ) -> FrameGeometry:
         """Depth, classes and motion of one frame; leaves the state alone.
 
-        Args: see `step`. reference: an earlier frame, see `sweep_costs`.
+        Args: see `see`. reference: an earlier frame to compare it with.
         """
-        picture = self._checked(frame, lens)
-        rays = pixel_rays(lens, self._device)
+        picture, rays = frame.to(self._device, torch.float32), pixel_rays(lens, self._device)
         ground = torch.zeros_like(rays[0])
         if floor is not None:
             ground = plane_depth(rays, floor.up.to(self._device), floor.height_m)
         inputs = depth_inputs(picture[None], rays[None], ground[None])
         output = self._networks.depth(inputs, sweep_costs(picture, lens, reference, self._config.depth)[None])
         reading = read_depth(output, self._config.depth)
-        labels = likeliest(output.classes[0])
-        metres = reading.metres[0] if depth is None else _taken(depth, reading.metres[0], lens)
-        static = output.moves[0] < 0
-        ood = float(self._networks.familiarity.score(output.summary, reading.entropy)[0])
-        spread = reading.spread[0] if depth is None else None
-        return FrameGeometry(metres=metres, labels=labels, static=static, ood=ood, spread=spread)
+        return FrameGeometry(
+            metres=reading.metres[0] if depth is None else _taken(depth, reading.metres[0]),
+            labels=likeliest(output.classes[0]),
+            static=output.moves[0] < 0,
+            ood=float(self._networks.familiarity.score(output.summary, reading.entropy)[0]),
+            spread=reading.spread[0] if depth is None else None,
+        )
 
     @torch.inference_mode()
     def see(
@@ -146,7 +138,6 @@ class Eyes:
         depth: Tensor | None = None,
         odometry: Tensor | None = None,
         floor: Floor | None = None,
-        geometry: FrameGeometry | None = None,
     ) -> SeenFrame:
         """Take in one frame: its depth, its classes, and how the camera moved.
 
@@ -156,23 +147,19 @@ class Eyes:
             depth: [H, W] metres, 0 or not finite where unknown, instead of the depth network's.
             odometry: world_from_source [4, 4] of any world that stays the same from frame to frame; None: from the
                 pictures.
-            floor: where the declared mount has the ground. geometry: what the frame shows, if that is known.
-        Raises:
-            ShapeError: frame, depth and lens differ in size, or the size is no multiple of 32.
+            floor: where the declared mount has the ground.
         """
-        picture = self._checked(frame, lens)
+        picture = frame.to(self._device, torch.float32)
         if lens != self._lens:  # another camera, or another size of its pictures
             self.reset()
             self._lens = lens
-        motion = self._ego.follow(picture, lens, odometry)
-        if motion.lost is not None:
-            self._references.reset()
-        pose = motion.world_from_camera
-        if geometry is None:
-            geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
+        pose, lost = self._ego.follow(picture, lens, odometry)
+        if lost is not None:
+            self._references = References()
+        geometry = self.look(picture, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
         self._ego.settle(geometry.metres, geometry.static, geometry.spread)
         self._references.add(picture, pose, geometry.metres)
-        begins, self._begins = self._begins or motion.lost is not None, False
+        begins, self._begins = self._begins or lost is not None, False
         return SeenFrame(
             picture=picture,
             geometry=geometry,
@@ -180,22 +167,11 @@ class Eyes:
             floor=floor,
             world_from_source=pose,
             begins=begins,
-            lost=motion.lost,
+            lost=lost,
         )
 
-    def _checked(self, frame: Tensor, lens: Intrinsics) -> Tensor:
-        if frame.shape != (3, lens.height, lens.width) or lens.height % SIZE_FACTOR or lens.width % SIZE_FACTOR:
-            raise ShapeError(
-                f"a frame must be [3, H, W] of its lens's size ({lens.height} x {lens.width}), in multiples of "
-                f"{SIZE_FACTOR}, got {list(frame.shape)}"
-            )
-        return frame.to(self._device, torch.float32)
 
-
-def _taken(depth: Tensor, learned: Tensor, lens: Intrinsics) -> Tensor:
-    """Depth from elsewhere: bad numbers are holes, a hole in what the network calls sky is sky. Raises ShapeError."""
-    if depth.shape != (lens.height, lens.width):
-        raise ShapeError(f"depth must be [{lens.height}, {lens.width}] as its frame, got {list(depth.shape)}")
-    metres = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).float()
-    metres = metres.to(learned.device)
+def _taken(depth: Tensor, learned: Tensor) -> Tensor:
+    """Depth from elsewhere: bad numbers are holes, a hole in what the network calls sky is sky."""
+    metres = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).float().to(learned.device)
     return torch.where((metres == 0) & (learned >= SKY_M), SKY_M, metres)

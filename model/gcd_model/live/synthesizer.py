@@ -2,19 +2,18 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, View
-from gcd_model.conditioning import SourceFeatures, SourceGeometry
-from gcd_model.diffusion import RenderOptions
-from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
+from gcd_model.conditioning import SourceFeatures
+from gcd_model.diffusion import RenderOptions, watched
+from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.live.eyes import Eyes, Floor, SeenFrame
-from gcd_model.live.memory import PlacedFrame, seen_world
+from gcd_model.live.memory import PlacedFrame, SeenWorld
 from gcd_model.live.painter import COVERED, PAINTED, SEEN_NOW, Painter, ViewFrame
 from gcd_model.live.splat import splat, unproject
 from gcd_model.networks import LiveNetworks
@@ -36,27 +35,16 @@ class LiveSynthesizer:
 
     def __init__(self, networks: LiveNetworks, traits: Traits, *, carries: bool = False) -> None:
         """carries: every call goes on where the one before ended, instead of knowing nothing."""
-        self._networks, self._traits, self._carries = networks.requires_grad_(False), traits, carries
-        self._eyes, self._world = Eyes(networks), seen_world(networks.config, next(networks.parameters()).device)
+        self.networks, self.traits, self._carries = networks.requires_grad_(False), traits, carries
+        self._eyes, self._world = Eyes(networks), SeenWorld(networks.config, next(networks.parameters()).device)
         self._painters: list[Painter] = []
         self._drawn_with: tuple[int, int] | None = None
 
-    @property
-    def traits(self) -> Traits:
-        """Family, sizes and identity of the weights."""
-        return self._traits
-
-    @property
-    def networks(self) -> LiveNetworks:
-        """The networks themselves, for measuring."""
-        return self._networks
-
     def streaming(self) -> "LiveSynthesizer":
         """See FrameSynthesizer. A clip rendered frame by frame is the clip rendered as a whole."""
-        return LiveSynthesizer(self._networks, self._traits.streaming(), carries=True)
+        return LiveSynthesizer(self.networks, self.traits.streaming(), carries=True)
 
     def reset(self) -> None:
-        """See FrameSynthesizer."""
         self._eyes.reset()
 
     @out_of_memory_is_our_error
@@ -70,24 +58,21 @@ class LiveSynthesizer:
         Raises:
             OptionError: height or width is no multiple of 32. ShapeError: there are extra condition channels.
         """
-        self._traits.check_size(*clip.video.shape[-2:])
+        self.traits.check_size(*clip.video.shape[-2:])
         if extra is not None:
-            raise ShapeError(f"{self._traits.name} wants no extra condition channels, got {extra.shape[1]}")
-        stated = clip.depth is not None
+            raise ShapeError(f"{self.traits.name} wants no extra condition channels, got {extra.shape[1]}")
         return SourceFeatures(
             tokens=None,
             latents=clip.video.new_zeros(clip.frames, 0, 1, 1),
             extra=None,
             fps=clip.fps,
             augmentation=0.0,
-            video=clip.video,
             mount=clip.mount,
-            geometry=SourceGeometry(
-                metres=clip.video.new_zeros(clip.video[:, 0].shape) if clip.depth is None else clip.depth,
-                stated=torch.full((clip.frames,), stated),
-                odometry=clip.odometry,
-                lens=lens_of(clip),
-            ),
+            lens=lens_of(clip),
+            video=clip.video,
+            metres=clip.video.new_zeros(clip.video[:, 0].shape) if clip.depth is None else clip.depth,
+            stated=torch.full((clip.frames,), clip.depth is not None),
+            odometry=clip.odometry,
         )
 
     @out_of_memory_is_our_error
@@ -98,18 +83,16 @@ class LiveSynthesizer:
 
         Of the options, solver, guidance, motion number and initial noise mean something to diffusion models only.
         """
-        self._require(features.frames, trajectories)
+        self.traits.check_lengths(features.frames, trajectories)
         return self._painted(self._placed(self._seen(features), trajectories), trajectories, options)
 
     @out_of_memory_is_our_error
     def see(self, features: SourceFeatures) -> tuple[SeenFrame, ...]:
-        """See FrameSynthesizer."""
         return tuple(self._seen(features))
 
     @out_of_memory_is_our_error
     def place(self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory]) -> tuple[PlacedFrame, ...]:
-        """See FrameSynthesizer."""
-        self._require(len(seen), trajectories)
+        self.traits.check_lengths(len(seen), trajectories)
         return tuple(self._placed(seen, trajectories))
 
     @out_of_memory_is_our_error
@@ -122,28 +105,20 @@ class LiveSynthesizer:
         """
         return self._painted(placed, trajectories, options)
 
-    def _require(self, length: int, trajectories: Sequence[Trajectory]) -> None:
-        frames = self._traits.config.frames
-        if not trajectories:
-            raise ShapeError("at least one trajectory is wanted, got none")
-        for each in (length, *(path.frames for path in trajectories)):
-            if each != frames:
-                raise ShapeError(f"{self._traits.name} works on {frames} frames, got {each}")
-
     def _seen(self, features: SourceFeatures) -> Iterator[SeenFrame]:
         """Frame by frame, each when it is asked for: what was seen is large."""
-        video, geometry = features.video, features.geometry
-        if video is None or geometry is None:
+        video, metres, stated, lens = features.video, features.metres, features.stated, features.lens
+        if video is None or metres is None or stated is None or lens is None:
             raise ShapeError(
-                f"{self._traits.name} needs points of the source, which these features lack; encode it here"
+                f"{self.traits.name} needs points of the source, which these features lack; encode it here"
             )
         if not self._carries:
             self._eyes.reset()
-        floor, odometry = _floor(features.mount), geometry.odometry
+        floor, odometry = _floor(features.mount), features.odometry
         for t, frame in enumerate(video):
-            depth = geometry.metres[t] if bool(geometry.stated[t]) else None
+            depth = metres[t] if bool(stated[t]) else None
             pose = None if odometry is None else odometry[t]
-            yield self._eyes.see(frame, lens=geometry.lens, depth=depth, odometry=pose, floor=floor)
+            yield self._eyes.see(frame, lens=lens, depth=depth, odometry=pose, floor=floor)
 
     def _placed(self, seen: Iterable[SeenFrame], trajectories: Sequence[Trajectory]) -> Iterator[PlacedFrame]:
         for t, frame in enumerate(seen):
@@ -153,49 +128,54 @@ class LiveSynthesizer:
         self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None
     ) -> list[View]:
         """`cancel` is asked between two frames."""
-        options = RenderOptions() if options is None else options
-        steps, frames = options.steps or self._traits.config.sampling.steps, self._traits.config.frames
+        options, frames = RenderOptions() if options is None else options, self.traits.config.frames
+        steps = options.steps or self.traits.config.sampling.steps
         draws = options.samples if steps > 1 else 1
         if not self._carries or self._drawn_with != (steps, draws):
-            self._painters = [Painter(self._networks, steps=steps, seed=seed) for seed in _seeds(options.seed, draws)]
+            self._painters = [Painter(self.networks, steps=steps, seed=seed) for seed in _seeds(options.seed, draws)]
             self._drawn_with = (steps, draws)
         made: list[list[tuple[ViewFrame, ...]]] = []  # by frame, then by draw
         scores: list[float] = []
         lost: list[str] = []
-        for t, frame in enumerate(placed):
-            if options.cancel is not None and options.cancel.is_set():
-                raise Cancelled(f"stopped before frame {t} of {frames}, as was asked")
+        placed = iter(placed)
+        for _ in watched(frames, options):
+            frame = next(placed)
             made.append([painter.paint(frame) for painter in self._painters])
             scores.append(frame.seen.geometry.ood)
             lost += [] if frame.seen.lost is None else [frame.seen.lost]
-            if options.progress is not None:
-                options.progress(t + 1, frames)
-        views = [self._joined(made, v, path, options) for v, path in enumerate(trajectories)]
-        views = [replace(view, ood=sum(scores) / frames, lost=tuple(lost)) for view in views]
-        if not all(map(_is_finite, views)):
+        ood = sum(scores) / frames
+        views = [
+            self._joined([[views[v] for views in frame] for frame in zip(*made, strict=True)], path, options, ood, lost)
+            for v, path in enumerate(trajectories)
+        ]
+        if not math.isfinite(ood) or not all(map(_is_finite, views)):
             raise NonFiniteError(
-                f"{self._traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
+                f"{self.traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
             )
         return views
 
     def _joined(
-        self, made: list[list[tuple[ViewFrame, ...]]], number: int, path: Trajectory, options: RenderOptions
+        self, draws: list[list[ViewFrame]], path: Trajectory, options: RenderOptions, ood: float, lost: list[str]
     ) -> View:
-        """One view of all draws; what is no draw, such as depth, is the first one's."""
-        draws = [[views[number] for views in frame] for frame in zip(*made, strict=True)]
+        """One view of all draws, frame by frame each; what is no draw, such as depth, is the first one's."""
         draws += draws[:1] * (options.samples - len(draws))
+
+        def joined(name: str) -> Tensor:
+            return torch.stack([getattr(each, name) for each in draws[0]])
+
         pixels = torch.stack([torch.stack([(each.picture + 1) / 2 for each in frames]) for frames in draws])
-        first = draws[0]
         return View(
             samples=(whole_levels(pixels) if options.whole_levels else pixels).cpu(),
             latents=torch.zeros(*pixels.shape[:2], 0, 1, 1),
             trajectory=path,
-            motion_bucket=self._traits.motion_bucket(path) if options.motion_bucket is None else options.motion_bucket,
+            motion_bucket=self.traits.motion_bucket(path) if options.motion_bucket is None else options.motion_bucket,
             classes=torch.stack([torch.stack([each.classes for each in frames]) for frames in draws]).cpu(),
-            uncertainty_scale=self._traits.uncertainty_scale,
-            visibility=torch.stack([each.visibility for each in first]).cpu(),
-            inverse_depth=torch.stack([each.inverse_depth for each in first]).float().cpu(),
-            log_variance=torch.stack([each.log_variance for each in first]).float().cpu(),
+            uncertainty_scale=self.traits.uncertainty_scale,
+            visibility=joined("visibility").cpu(),
+            inverse_depth=joined("inverse_depth").float().cpu(),
+            log_variance=joined("log_variance").float().cpu(),
+            ood=ood,
+            lost=tuple(lost),
         )
 
 
@@ -243,7 +223,7 @@ def _seeds(seed: int, draws: int) -> list[int]:
 
 def _is_finite(view: View) -> bool:
     pictures = (view.samples, view.inverse_depth, view.log_variance)
-    return math.isfinite(view.ood or 0.0) and all(bool(each.isfinite().all()) for each in pictures if each is not None)
+    return all(bool(each.isfinite().all()) for each in pictures if each is not None)
 
 
 def save_live(
