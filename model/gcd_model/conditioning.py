@@ -26,8 +26,7 @@ class SourceFeatures:
 
     tokens: [T, D] from the image tower, or None without one. latents: [T, C, h, w], not scaled; C is 0 for the live
     model, which has none.
-    extra: [T, C', h, w], further condition channels, or None. fps: what the network is told.
-    augmentation: strength of the noise the VAE saw.
+    fps: what the network is told. augmentation: strength of the noise the VAE saw.
     The rest is what the live model's points are made of, None for others. video: float32 [T, 3, H, W] in [-1, 1].
     metres: float32 [T, H, W], 0 for a hole. stated: bool [T], whether a frame came with a depth at all. odometry:
     float64 [T, 4, 4], world_from_camera, or None.
@@ -35,7 +34,6 @@ class SourceFeatures:
 
     tokens: Tensor | None
     latents: Tensor
-    extra: Tensor | None
     fps: float
     augmentation: float
     mount: CameraMount | None = None
@@ -139,8 +137,7 @@ class CameraEmbedder(nn.Module):
 
 def condition_latents(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor:
     """Condition channels of K views, [R*K*T, C', h, w]; the unconditional branch sees zeros, as released."""
-    rows = features.latents if features.extra is None else torch.cat([features.latents, features.extra], dim=1)
-    return _with_unconditional(rows, views, unconditional)
+    return _with_unconditional(features.latents, views, unconditional)
 
 
 def condition_tokens(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor | None:

@@ -18,8 +18,7 @@ from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, wei
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.weights.card import FULL_PRECISION, Card, precision
-from gcd_model.weights.families import LIVE, family_named
-from gcd_model.weights.infer import Hints
+from gcd_model.weights.families import LIVE, Hints, family_named
 from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]

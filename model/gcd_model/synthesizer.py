@@ -34,9 +34,7 @@ class ViewSynthesizer(Protocol):
         """Family, sizes, limits and identity of the weights."""
         ...
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         """What the network needs to know of the source, computed once per clip."""
         ...
 
@@ -154,19 +152,11 @@ class Synthesizer:
 
     @out_of_memory_is_our_error
     @torch.inference_mode()
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
-        """See ViewSynthesizer. Frames are independent of each other here; any number of them may be given.
-
-        extra: [T, C', h, w], for checkpoints with further condition channels.
-        """
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
+        """See ViewSynthesizer. Frames are independent of each other here; any number of them may be given."""
         augmentation = augmentation or Augmentation()
         strength = self._config.sampling.augmentation if augmentation.strength is None else augmentation.strength
         self.traits.check_size(*clip.video.shape[-2:])
-        wanted, given = self._config.extra_condition_channels, 0 if extra is None else extra.shape[1]
-        if wanted != given:
-            raise ShapeError(f"{self.traits.name} wants {wanted} extra condition channels, got {given}")
         noise = augmentation.noise
         if noise is None:
             noise = unit_noise(tuple(clip.video.shape), augmentation.seed)
@@ -177,7 +167,6 @@ class Synthesizer:
         return SourceFeatures(
             tokens=torch.cat([each for each in tokens if each is not None]) if self._config.image_encoder else None,
             latents=torch.cat([self._engine.condition_mean(frames) for frames in noisy.split(_ENCODE_FRAMES)]),
-            extra=None if extra is None else extra.to(self._engine.like),
             fps=clip.fps,
             augmentation=strength,
         )

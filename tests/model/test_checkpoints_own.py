@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import FamilyName, Provenance, combined, told_by_name, told_by_yaml
+from gcd_model.weights.families import FamilyName, Hints, told_by_name, told_by_yaml
 from gcd_model.weights.load import digest, save_weights
 
 # --- the family ------------------------------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def test_published_names_tell_family_move_time_and_frames_and_others_nothing(
     names: list[str], family: FamilyName | None, move_time: int | None, frames: int | None
 ) -> None:
     told_by = None if family is None else "file name"
-    wanted = Provenance(family=family, move_time=move_time, frames=frames, told_by=told_by)
+    wanted = Hints(family=family, move_time=move_time, frames=frames, told_by=told_by)
     assert [told_by_name(name) for name in names] == [wanted] * len(names)
 
 
@@ -210,13 +210,13 @@ def test_angle_ranges_of_a_yaml_tell_the_family(
     style: tuple[str, str], azimuth: int, elevation: int, family: str
 ) -> None:
     text = YAML.format(azimuth=style[0].format(azimuth), elevation=style[1].format(elevation), move_time=13)
-    assert told_by_yaml(text) == Provenance(family=family, move_time=13, told_by="yaml")
+    assert told_by_yaml(text) == Hints(family=family, move_time=13, told_by="yaml")
 
 
 def test_ranges_that_contradict_each_other_or_no_family_tell_none() -> None:
     for azimuth, elevation in ((90, 60), (45, 30)):
         text = YAML.format(azimuth=INLINE[0].format(azimuth), elevation=INLINE[1].format(elevation), move_time=0)
-        assert told_by_yaml(text) == Provenance(move_time=0)
+        assert told_by_yaml(text) == Hints(move_time=0)
 
 
 def test_driving_views_and_modality_tell_the_driving_families() -> None:
@@ -230,11 +230,11 @@ def test_driving_views_and_modality_tell_the_driving_families() -> None:
     "text", ["", "move_time: soon", "azimuth: [1, 2", "\x00\xff", "a: " + "-" * 200_000, " " * 200_000]
 )
 def test_yaml_that_says_nothing_is_no_error(text: str) -> None:
-    assert told_by_yaml(text) == Provenance()
+    assert told_by_yaml(text) == Hints()
 
 
 def test_each_fact_comes_from_the_first_that_knows_it() -> None:
-    named = Provenance(family="kubric180", move_time=0, told_by="file name")
-    assert combined(Provenance(), named, Provenance(family="kubric90", move_time=13, told_by="yaml")) == named
-    option = Provenance(family="kubric90", told_by="option")
-    assert combined(option, named) == Provenance(family="kubric90", move_time=0, told_by="option")
+    named = Hints(family="kubric180", move_time=0, told_by="file name")
+    assert Hints().over(named, Hints(family="kubric90", move_time=13, told_by="yaml")) == named
+    option = Hints(family="kubric90", told_by="option")
+    assert option.over(named) == Hints(family="kubric90", move_time=0, told_by="option")

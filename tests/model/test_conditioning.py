@@ -49,9 +49,7 @@ def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:
 
 
 def _features(frames: int = 3, extra: Tensor | None = None) -> SourceFeatures:
-    return SourceFeatures(
-        tokens=draw(frames, 5), latents=draw(frames, 4, 2, 3), extra=extra, fps=12.0, augmentation=0.02
-    )
+    return SourceFeatures(tokens=draw(frames, 5), latents=draw(frames, 4, 2, 3), fps=12.0, augmentation=0.02)
 
 
 @pytest.mark.parametrize("views", [1, 3])
@@ -75,7 +73,7 @@ def test_without_guidance_there_is_one_branch_and_without_a_tower_no_token() -> 
     assert tokens is not None
     assert tokens.shape == (6, 5)
     assert condition_latents(features, 2, unconditional=False).shape == (6, 4, 2, 3)
-    blind = SourceFeatures(tokens=None, latents=features.latents, extra=None, fps=12.0, augmentation=0.02)
+    blind = SourceFeatures(tokens=None, latents=features.latents, fps=12.0, augmentation=0.02)
     assert condition_tokens(blind, 2, unconditional=True) is None
 
 

@@ -251,8 +251,8 @@ def test_without_a_family_the_motion_number_must_be_given() -> None:
 
 def test_features_of_another_kind_are_not_joined() -> None:
     latents = torch.zeros(2, 4, 1, 1)
-    plain = SourceFeatures(tokens=None, latents=latents, extra=None, fps=12.0, augmentation=0.02)
-    for other in (replace(plain, tokens=torch.zeros(2, 5)), replace(plain, extra=latents), replace(plain, fps=6.0)):
+    plain = SourceFeatures(tokens=None, latents=latents, fps=12.0, augmentation=0.02)
+    for other in (replace(plain, tokens=torch.zeros(2, 5)), replace(plain, fps=6.0)):
         with pytest.raises(ShapeError):
             plain.followed_by(other)
 
@@ -260,16 +260,6 @@ def test_features_of_another_kind_are_not_joined() -> None:
 def with_unet(**changes: object) -> ModelConfig:
     """TINY with other fields in its U-Net."""
     return msgspec.structs.replace(TINY, unet=msgspec.structs.replace(TINY.unet, **changes))
-
-
-@pytest.mark.parametrize("channels", [0, 3])
-def test_a_checkpoint_with_extra_condition_channels_wants_exactly_those(channels: int) -> None:
-    synthesizer = tiny_synthesizer(with_unet(condition_channels=6))
-    extra = draw(3, channels, *LATENTS[2:]) if channels else None
-    with pytest.raises(ShapeError):
-        synthesizer.encode(random_clip(), extra=extra)
-    features = synthesizer.encode(random_clip(), extra=draw(3, 2, *LATENTS[2:]))
-    assert synthesizer.render(features, [path(synthesizer)])[0].samples.isfinite().all()
 
 
 def test_a_model_without_image_tower_has_no_tokens_and_still_renders() -> None:

@@ -109,12 +109,10 @@ class FakeSynthesizer:
         self.clips: list[Clip] = []
         self._act = act
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         self.clips.append(clip)
         strength = None if augmentation is None else augmentation.strength
-        return SourceFeatures(tokens=None, latents=clip.video, extra=extra, fps=clip.fps, augmentation=strength or 0.0)
+        return SourceFeatures(tokens=None, latents=clip.video, fps=clip.fps, augmentation=strength or 0.0)
 
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None

@@ -48,23 +48,17 @@ class LiveSynthesizer:
         self._eyes.reset()
 
     @out_of_memory_is_our_error
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         """See ViewSynthesizer. Nothing is worked out here: depth looks at earlier frames; any number may be given.
 
         The lens is the clip's, else of its mount's field of view, else of CameraMount()'s, 85 degrees. The ground is
         known where the clip states a mount. Augmentation is for diffusion models and means nothing here.
-        Raises:
-            OptionError: height or width is no multiple of 32. ShapeError: there are extra condition channels.
+        Raises: OptionError: height or width is no multiple of 32.
         """
         self.traits.check_size(*clip.video.shape[-2:])
-        if extra is not None:
-            raise ShapeError(f"{self.traits.name} wants no extra condition channels, got {extra.shape[1]}")
         return SourceFeatures(
             tokens=None,
             latents=clip.video.new_zeros(clip.frames, 0, 1, 1),
-            extra=None,
             fps=clip.fps,
             augmentation=0.0,
             mount=clip.mount,

@@ -19,6 +19,7 @@ from gcd_model.config import (
     VAEConfig,
 )
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.weights.families import Hints
 from gcd_model.weights.names import Levels, Naming, published_names, published_shape
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -30,27 +31,6 @@ _PUBLISHED_GROUPS = 32  # of every group norm
 def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
     """Names and shapes."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Hints:
-    """What neither names nor shapes tell; None where nobody says.
-
-    head_width: channels of an attention head of the U-Net; or heads: their number, one for all levels or one each.
-    image_heads: attention heads of the image tower. frames: T. latent_scale: see `VAEConfig.scale`.
-    """
-
-    head_width: int | None = None
-    heads: int | tuple[int, ...] | None = None
-    image_heads: int | None = None
-    frames: int | None = None
-    latent_scale: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, least in (("head_width", 1), ("image_heads", 1), ("frames", 2)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise OptionError(f"{name} must be at least {least}, got {value}")
 
 
 RELEASED = Hints(head_width=SVD_14.unet.head_width, image_heads=16)
