@@ -205,7 +205,7 @@ class Traits:
         """
         frames, move_time = self.config.frames, self.move_time if move_time is None else move_time
         if self.live and source is None and delta is None:
-            return driving_trajectory(frames=frames, move_time=move_time, mount=mount or CameraMount())
+            return driving_trajectory(frames=frames, move_time=move_time, mount=mount)
         if self.live:
             source = source or _orbit_of(mount)
         elif mount is not None:

@@ -23,7 +23,6 @@ from gcd_model.diffusion import RenderOptions, Schedule
 from gcd_model.engines.cuda import (
     CudaEngine,
     CudaOptions,
-    cache_folder,
     checked_decoder,
     join_attention,
     keep_compiled,
@@ -216,9 +215,9 @@ def test_compiled_code_is_kept_in_the_folder_that_is_named(tmp_path: Path, monke
     for name in ("TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
-    assert cache_folder() == tmp_path / "compiled" / torch.__version__
-    keep_compiled(cache_folder())
-    assert cache_folder().is_dir()
+    keep_compiled()
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(tmp_path / "compiled" / torch.__version__)
+    assert (tmp_path / "compiled" / torch.__version__).is_dir()
 
 
 def test_whole_levels_are_the_nearest_to_the_same_pictures(plain: Synthesizer) -> None:
@@ -357,10 +356,9 @@ def test_joined_attention_is_plain_attention_in_the_same_memory() -> None:
 
 _ONE_REGION = """
 import json, torch
-from pathlib import Path
 from gcd_model.engines.cuda import compile_regions, keep_compiled
 from gcd_model.layers import ResBlock
-keep_compiled(Path({folder!r}))
+keep_compiled()
 block = ResBlock(8, 8, groups=4, eps=1e-6).eval().to({device!r})
 compile_regions(block, "inductor")
 with torch.inference_mode():
@@ -378,8 +376,8 @@ def _compile_in_a_process(folder: Path) -> dict[str, int]:
     }
     path = os.pathsep.join(entry for entry in sys.path if entry)
     done = subprocess.run(
-        [sys.executable, "-c", _ONE_REGION.format(folder=str(folder), device=device)],
-        env=environment | {"PYTHONPATH": path},
+        [sys.executable, "-c", _ONE_REGION.format(device=device)],
+        env=environment | {"PYTHONPATH": path, "GCD_CACHE_DIR": str(folder)},
         capture_output=True,
         text=True,
         timeout=900,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -50,13 +50,6 @@ class CudaOptions:
     joined: bool = True
     decoder: Literal["checked", "float32", "float16", "bfloat16"] = "checked"
 
-    @classmethod
-    def of_device(cls, device: torch.device) -> Self:
-        """Everything on a GPU, and nothing on a CPU, where none of it would gain."""
-        if device.type == "cuda":
-            return cls()
-        return cls(backend=None, channels_last=False, joined=False, decoder="float32")
-
 
 class CudaEngine(Engine):
     """Not for several threads at once."""
@@ -68,10 +61,14 @@ class CudaEngine(Engine):
 
         recorder: what replays work; by default as `options` and the device say.
         """
-        options = CudaOptions.of_device(networks.unet.stem.weight.device) if options is None else options
+        options = options or CudaOptions()
         networks.requires_grad_(False)
         prepare(networks)
-        _settle_decoder(networks, options.decoder)
+        if options.decoder == "checked":
+            networks.decoder, psnr = checked_decoder(networks)
+            _LOG.info("decoder in %s: %.1f dB from float32", networks.decoder.stem.weight.dtype, psnr)
+        elif options.decoder != "float32":  # a copy: others may share its weights
+            networks.decoder = copy.deepcopy(networks.decoder).to(getattr(torch, options.decoder))
         if options.channels_last:
             channels_last(networks)
         if options.joined:
@@ -164,19 +161,11 @@ def of_view(given: Conditioning, k: int, views: int) -> Conditioning:
     return Conditioning(**{field.name: rows(getattr(given, field.name)) for field in fields(given)})
 
 
-def _settle_decoder(networks: Networks, precision: str) -> None:
-    if precision in ("float16", "bfloat16"):
-        networks.decoder = copy.deepcopy(networks.decoder).to(getattr(torch, precision))  # others may share its weights
-    elif precision == "checked":
-        networks.decoder, psnr = checked_decoder(networks)
-        _LOG.info("decoder in %s: %.1f dB from float32", networks.decoder.stem.weight.dtype, psnr)
-
-
 def _compiled(networks: Networks, options: CudaOptions, beat: Callable[[], object]) -> Update:
     if options.backend is None:
         return solved
     if options.backend == "inductor":
-        keep_compiled(cache_folder())
+        keep_compiled()
     backend = _heard(options.backend, beat, tuned=options.tuned)
     compile_regions(networks, backend)
     return torch.compile(solved, backend=backend, fullgraph=True, dynamic=False)
@@ -277,18 +266,14 @@ def join_attention(model: nn.Module) -> None:
             module.joint = joint
 
 
-def cache_folder() -> Path:
-    """Where compiled code lies unless TORCHINDUCTOR_CACHE_DIR says otherwise; GCD_CACHE_DIR names another."""
-    own = os.environ.get("GCD_CACHE_DIR")
-    root = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gcd-node"
-    return root / "compiled" / torch.__version__
-
-
-def keep_compiled(folder: Path) -> None:
-    """Have all that is compiled in this process kept in a folder, so that the next one finds it.
+def keep_compiled() -> None:
+    """Have all that is compiled kept for later processes: in GCD_CACHE_DIR, else the user's cache folder.
 
     What TORCHINDUCTOR_CACHE_DIR and TRITON_CACHE_DIR say already stands.
     """
+    own = os.environ.get("GCD_CACHE_DIR")
+    root = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gcd-node"
+    folder = root / "compiled" / torch.__version__
     folder.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
     os.environ.setdefault("TRITON_CACHE_DIR", str(folder / "triton"))
