@@ -135,17 +135,8 @@ class CameraEmbedder(nn.Module):
         return self.proj(camera_features(self.control, trajectory).to(self.proj.weight))
 
 
-def condition_latents(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor:
-    """Condition channels of K views, [R*K*T, C', h, w]; the unconditional branch sees zeros, as released."""
-    return _with_unconditional(features.latents, views, unconditional)
-
-
-def condition_tokens(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor | None:
-    """Image tokens of K views, [R*K*T, D]; the unconditional branch sees zeros, as released."""
-    return None if features.tokens is None else _with_unconditional(features.tokens, views, unconditional)
-
-
-def _with_unconditional(rows: Tensor, views: int, unconditional: bool) -> Tensor:
+def with_unconditional(rows: Tensor, views: int, unconditional: bool) -> Tensor:
+    """Image tokens or latents of a clip for K views: [R*K*T, ...]; the unconditional branch sees zeros, as released."""
     repeated = rows.repeat(views, *[1] * (rows.ndim - 1))
     return torch.cat([torch.zeros_like(repeated), repeated]) if unconditional else repeated
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, View, nearest_classes
-from gcd_model.conditioning import Conditioning, SourceFeatures, condition_latents, condition_tokens, micro_conditioning
+from gcd_model.conditioning import Conditioning, SourceFeatures, micro_conditioning, with_unconditional
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
 from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
@@ -210,12 +210,12 @@ class Synthesizer:
         vectors = [micro_conditioning(features.fps, bucket, strength, width) for bucket in buckets]
         cameras = [self._engine.camera(path) for path in trajectories]
         cameras = [each.repeat(samples, 1) for each in cameras if each is not None]
-        unconditional = schedule.branches == 2
+        unconditional, rows = schedule.branches == 2, views * samples
         given = Conditioning(
             vector=torch.cat([vector.expand(samples * config.frames, -1) for vector in vectors]).to(like),
             camera=torch.cat(cameras) if cameras else None,
-            tokens=condition_tokens(features, views * samples, unconditional=unconditional),
-            latents=condition_latents(features, views * samples, unconditional=unconditional),
+            tokens=None if features.tokens is None else with_unconditional(features.tokens, rows, unconditional),
+            latents=with_unconditional(features.latents, rows, unconditional),
         )
         noise = self._noise(tuple(features.latents.shape[1:]), options)
         latents = self._engine.sample(schedule.start(noise.to(like.device), views), given, schedule, options)

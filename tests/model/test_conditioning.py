@@ -11,11 +11,9 @@ from torch.testing import assert_close
 from gcd_model.clip import Augmentation
 from gcd_model.conditioning import (
     CameraEmbedder,
-    SourceFeatures,
-    condition_latents,
-    condition_tokens,
     relative_pose_features,
     spherical_features,
+    with_unconditional,
 )
 from gcd_model.errors import ShapeError
 from gcd_model.geometry import pose_trajectory
@@ -48,33 +46,13 @@ def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:
         CameraEmbedder("spherical", 5)(free)
 
 
-def _features(frames: int = 3, extra: Tensor | None = None) -> SourceFeatures:
-    return SourceFeatures(tokens=draw(frames, 5), latents=draw(frames, 4, 2, 3), fps=12.0, augmentation=0.02)
-
-
 @pytest.mark.parametrize("views", [1, 3])
-def test_the_unconditional_branch_comes_first_and_sees_zeros_in_both_image_streams(views: int) -> None:
-    features = _features()
-    tokens = condition_tokens(features, views, unconditional=True)
-    latents = condition_latents(features, views, unconditional=True)
-    assert tokens is not None
-    assert features.tokens is not None
-    assert not tokens[: 3 * views].any()
-    assert not latents[: 3 * views].any()
-    for view in range(views):
-        rows = slice(3 * (views + view), 3 * (views + view + 1))
-        assert torch.equal(tokens[rows], features.tokens)
-        assert torch.equal(latents[rows], features.latents)
-
-
-def test_without_guidance_there_is_one_branch_and_without_a_tower_no_token() -> None:
-    features = _features()
-    tokens = condition_tokens(features, 2, unconditional=False)
-    assert tokens is not None
-    assert tokens.shape == (6, 5)
-    assert condition_latents(features, 2, unconditional=False).shape == (6, 4, 2, 3)
-    blind = SourceFeatures(tokens=None, latents=features.latents, fps=12.0, augmentation=0.02)
-    assert condition_tokens(blind, 2, unconditional=True) is None
+@pytest.mark.parametrize("rows", [draw(3, 5), draw(3, 4, 2, 3)], ids=["tokens", "latents"])
+def test_the_unconditional_branch_comes_first_and_sees_zeros_in_both_image_streams(rows: Tensor, views: int) -> None:
+    both = with_unconditional(rows, views, True).unflatten(0, (2, views, 3))
+    assert not both[0].any()
+    assert torch.equal(both[1], rows.expand_as(both[1]))
+    assert torch.equal(with_unconditional(rows, views, False), both[1].flatten(0, 1))
 
 
 def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_and_not_scaled() -> None:

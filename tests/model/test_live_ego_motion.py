@@ -8,7 +8,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.ego_motion import EgoMotion, Motion
 
 LENS = Intrinsics.from_hfov(80.0, 192, 128)
@@ -28,7 +27,7 @@ def pose(right: float = 0.0, ahead: float = 0.0, yaw_deg: float = 0.0) -> Tensor
 
 def filmed(world_from_camera: Tensor) -> tuple[Tensor, Tensor]:
     """A wall, a floor and a side wall, each painted with smooth noise: picture [3, H, W] and exact depth [H, W]."""
-    x, y = pixel_rays(LENS).double()
+    x, y = LENS.rays().double()
     rays = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ world_from_camera[:3, :3].T
     eye = world_from_camera[:3, 3]
     depth = torch.full((LENS.height, LENS.width), math.inf, dtype=torch.float64)

@@ -6,7 +6,7 @@ from live_room import LENS, room
 from torch.testing import assert_close
 
 from gcd_model.live.config import DepthConfig
-from gcd_model.live.depth_net import DepthNet, Reference, depth_inputs, pixel_rays, read_depth, sweep_costs
+from gcd_model.live.depth_net import DepthNet, Reference, depth_inputs, read_depth, sweep_costs
 from gcd_model.live.eyes import LONGEST, References
 
 CONFIG = DepthConfig(bins=32, nearest_m=1.0, farthest_m=10.0)
@@ -43,7 +43,7 @@ def test_a_network_that_trusts_the_sweep_reads_its_depth_off_it() -> None:
         bias.zero_()
         bias[-1] = 50.0
         picture = room().video[3]
-        inputs = depth_inputs(picture[None], pixel_rays(LENS)[None], torch.zeros(1, LENS.height, LENS.width))
+        inputs = depth_inputs(picture[None], LENS.rays()[None], torch.zeros(1, LENS.height, LENS.width))
         costs = sweep_costs(picture, LENS, reference(3), net.config)[None]
         output = net(inputs, costs)
         some = torch.randint(0, LENS.height * LENS.width, (1, 40))

@@ -51,6 +51,12 @@ class Intrinsics:
         rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
         return torch.tensor(rows, dtype=torch.float64)
 
+    def rays(self, device: torch.device | None = None) -> Tensor:
+        """x / z and y / z through each pixel's centre: float32 [2, H, W]."""
+        x = (torch.arange(self.width, dtype=torch.float32, device=device) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=torch.float32, device=device) + 0.5 - self.cy) / self.fy
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"))
+
     @property
     def hfov_deg(self) -> float:
         """Angle from the left to the right edge, degrees."""

@@ -163,17 +163,10 @@ def depth_inputs(pictures: Tensor, rays: Tensor, ground_m: Tensor) -> Tensor:
     return torch.cat([pictures, rays, ground[:, None], known[:, None].to(pictures)], dim=1)
 
 
-def pixel_rays(lens: Intrinsics, device: torch.device | None = None) -> Tensor:
-    """x / z and y / z through each pixel's centre: float32 [2, H, W]."""
-    x = (torch.arange(lens.width, dtype=torch.float32, device=device) + 0.5 - lens.cx) / lens.fx
-    y = (torch.arange(lens.height, dtype=torch.float32, device=device) + 0.5 - lens.cy) / lens.fy
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"))
-
-
 def plane_depth(rays: Tensor, up: Tensor, height_m: Tensor | float) -> Tensor:
     """Depth of a plane below each camera: float32 [..., H, W], 0 where no ray meets it.
 
-    rays: [..., 2, H, W], see `pixel_rays`. up: [..., 3], the plane's normal in camera axes, towards the camera.
+    rays: [..., 2, H, W], see `Intrinsics.rays`. up: [..., 3], the plane's normal in camera axes, towards the camera.
     height_m: [...], of the camera over the plane.
     """
     x, y = rays.unbind(dim=-3)

@@ -12,7 +12,7 @@ from torch import Tensor
 from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.blocks import likeliest
 from gcd_model.live.config import SKY_M
-from gcd_model.live.depth_net import Reference, depth_inputs, pixel_rays, plane_depth, read_depth, sweep_costs
+from gcd_model.live.depth_net import Reference, depth_inputs, plane_depth, read_depth, sweep_costs
 from gcd_model.live.ego_motion import EgoMotion
 from gcd_model.networks import LiveNetworks
 
@@ -114,7 +114,7 @@ class Eyes:
 
         Args: see `see`. reference: an earlier frame to compare it with.
         """
-        picture, rays = frame.to(self._device, torch.float32), pixel_rays(lens, self._device)
+        picture, rays = frame.to(self._device, torch.float32), lens.rays(self._device)
         ground = torch.zeros_like(rays[0])
         if floor is not None:
             ground = plane_depth(rays, floor.up.to(self._device), floor.height_m)

@@ -8,7 +8,7 @@ from torch import Tensor
 from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.blocks import likeliest
 from gcd_model.live.config import SKY_M, LiveConfig
-from gcd_model.live.depth_net import pixel_rays, plane_depth
+from gcd_model.live.depth_net import plane_depth
 from gcd_model.live.eyes import Floor
 from gcd_model.live.memory import PlacedFrame
 from gcd_model.live.paint_net import Painted, Seen, camera_features, filled, seen_of
@@ -67,7 +67,7 @@ class Painter:
         painted, carried = self._painted.get(index), None
         if painted is not None and len(painted):
             carried = splat(painted, target, lens, len(self._config.classes), 0.0)
-        rays = pixel_rays(lens, self._device)
+        rays = lens.rays(self._device)
         ground = torch.zeros_like(rays[0])
         if frame.seen.floor is not None:
             ground = _floor_of(frame.seen.floor, invert_rigid(target) @ source, rays)
@@ -125,7 +125,7 @@ class Painter:
 
 
 def _floor_of(floor: Floor, target_from_source: Tensor, rays: Tensor) -> Tensor:
-    """Depth of the floor in a target camera: [H, W]; 0 where it is below the floor, too. rays: see `pixel_rays`."""
+    """Depth of the floor in a target camera: [H, W]; 0 where it is below the floor, too. rays: of `lens.rays`."""
     turn, move = target_from_source[:3, :3].float(), target_from_source[:3, 3].float()
     up = turn @ floor.up
     height = floor.height_m - float(up @ move)

@@ -152,7 +152,7 @@ def unproject(
     index = true_at(taken.flatten())
     z, slope_right, slope_down, red, green, blue, x, y = (
         each.flatten().index_select(0, index)
-        for each in (1 / inverse, *relative_slopes(inverse), *colour.float(), *_rays(lens, depth.device))
+        for each in (1 / inverse, *relative_slopes(inverse), *colour.float(), *lens.rays(depth.device))
     )
     # p = z ray; one pixel on, the ray turns by 1 / f and z changes by -z (step of 1/z) / (1/z)
     right, down = -z * slope_right, -z * slope_down
@@ -198,14 +198,6 @@ def _slope(inverse: Tensor) -> Tensor:
     relative = slope / inverse
     same = (relative.abs() <= _SAME_SURFACE_JUMP) | in_line
     return torch.where(same & relative.isfinite(), relative, 0.0).clamp(-_STEEPEST, _STEEPEST)
-
-
-def _rays(lens: Intrinsics, device: torch.device) -> tuple[Tensor, Tensor]:
-    """x / z and y / z through the pixel centres, [H, W] each."""
-    right = (torch.arange(lens.width, device=device) + 0.5 - lens.cx) / lens.fx
-    down = (torch.arange(lens.height, device=device) + 0.5 - lens.cy) / lens.fy
-    x, y = torch.meshgrid(right, down, indexing="xy")
-    return x, y
 
 
 @torch.no_grad()

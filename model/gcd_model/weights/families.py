@@ -34,17 +34,12 @@ class ViewLimits:
         """Intervals of the three differences; narrower when it is known where the source stands."""
         elevation, radius = (-self.elevation_deg, self.elevation_deg), (-self.radius_m, self.radius_m)
         if source is not None:
-            elevation = _within(elevation, self.absolute_elevation_deg, source.elevation_deg)
-            radius = _within(radius, self.absolute_radius_m, source.radius_m)
-        return {
-            "azimuth_deg": (-self.azimuth_deg, self.azimuth_deg),
-            "elevation_deg": elevation,
-            "radius_m": radius,
-        }
-
-
-def _within(relative: tuple[float, float], absolute: tuple[float, float], at: float) -> tuple[float, float]:
-    return max(relative[0], absolute[0] - at), min(relative[1], absolute[1] - at)
+            (low, high), at = self.absolute_elevation_deg, source.elevation_deg
+            elevation = max(elevation[0], low - at), min(elevation[1], high - at)
+            (low, high), at = self.absolute_radius_m, source.radius_m
+            radius = max(radius[0], low - at), min(radius[1], high - at)
+        azimuth = (-self.azimuth_deg, self.azimuth_deg)
+        return {"azimuth_deg": azimuth, "elevation_deg": elevation, "radius_m": radius}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -23,7 +23,6 @@ from gcd_model import hatched
 from gcd_model.errors import ModelError
 from gcd_model.geometry import invert_rigid
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.eyes import Eyes, Floor
 from gcd_model.live.memory import SeenWorld
 from gcd_model.live.paint_net import filled, seen_of
@@ -99,7 +98,7 @@ class ExactSplat:
     def views(self, clip: LiveClip) -> MethodViews:
         """See Method."""
         source, lens, classes = pictures_of(clip), clip.lens("target"), len(LiveConfig().classes)
-        rays, nothing, labels = pixel_rays(lens), torch.zeros(lens.height, lens.width), source.labels.to(torch.uint8)
+        rays, nothing, labels = lens.rays(), torch.zeros(lens.height, lens.width), source.labels.to(torch.uint8)
         made, video = [], []
         for t, (pose, target) in enumerate(zip(clip.poses("source"), clip.poses("target"), strict=True)):
             surfels = unproject(source.metres[t], source.video[t], labels[t], source.lenses[t], pose, 1.0)
