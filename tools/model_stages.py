@@ -3,12 +3,14 @@
 `bench_model.py` is its command. What belongs to no stage that was asked for is not computed.
 """
 
+import copy
 import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as with_changes
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Literal, get_args
@@ -180,14 +182,21 @@ def engine_named(name: str, networks: Networks) -> Engine:
             arrange(networks)
         return Engine(networks)
     if name in VARIANTS:
-        from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin
+        from gcd_model.engines.cuda import CudaEngine, CudaOptions
 
-        # with a copy of what it lays out anew, since others use the same networks
-        return CudaEngine(twin(networks), CudaOptions(**VARIANTS[name]) if VARIANTS[name] else None)
+        on_cpu = not networks.unet.stem.weight.is_cuda  # where nothing of what a GPU gains by is tried unasked
+        options = VARIANTS[name] or (VARIANTS["ours, graphs alone"] if on_cpu else {})
+        return CudaEngine(_twin(networks), CudaOptions(**options))
     from diffusers_peer import DiffusersEngine, compile_modules, diffusers_modules
 
     modules = diffusers_modules(networks)
     return DiffusersEngine(compile_modules(modules) if name == "diffusers compiled" else modules)
+
+
+def _twin(networks: Networks) -> Networks:
+    """The same weights in memory, to be laid out and compiled without touching networks that others use."""
+    memo: dict[int, object] = {id(each): each for each in chain(networks.parameters(), networks.buffers())}
+    return copy.deepcopy(networks, memo).eval()
 
 
 def still_clip(frames: int, height: int, width: int, fps: float) -> Clip:

@@ -204,33 +204,32 @@ INLINE = ("delta_azimuth_range: [-{0}, {0}]", "delta_elevation_range: [ -{0}.0 ,
 BLOCK = ("delta_azimuth_range:\n    - -{0}\n    - {0}", "delta_elevation_range:\n      - -{0}.0\n      - {0}.0")
 
 
-@pytest.mark.parametrize("style", [INLINE, BLOCK], ids=["inline", "block"])
-@pytest.mark.parametrize(("azimuth", "elevation", "family"), [(90, 30, "kubric90"), (180, 60, "kubric180")])
-def test_angle_ranges_of_a_yaml_tell_the_family(
-    style: tuple[str, str], azimuth: int, elevation: int, family: str
-) -> None:
-    text = YAML.format(azimuth=style[0].format(azimuth), elevation=style[1].format(elevation), move_time=13)
-    assert told_by_yaml(text) == Hints(family=family, move_time=13, told_by="yaml")
+DRIVING = "input_mode: ego_forward\noutput_mode: topdown1\nmove_time: 13\noutput_modality: {}\n"
+KUBRIC90, KUBRIC180 = (Hints(family=f"kubric{angle}", move_time=13, told_by="yaml") for angle in (90, 180))
 
 
-def test_ranges_that_contradict_each_other_or_no_family_tell_none() -> None:
-    for azimuth, elevation in ((90, 60), (45, 30)):
-        text = YAML.format(azimuth=INLINE[0].format(azimuth), elevation=INLINE[1].format(elevation), move_time=0)
-        assert told_by_yaml(text) == Hints(move_time=0)
-
-
-def test_driving_views_and_modality_tell_the_driving_families() -> None:
-    text = "input_mode: ego_forward\noutput_mode: topdown1\nmove_time: 13\noutput_modality: {}\n"
-    assert told_by_yaml(text.format("rgb")).family == "driving"
-    assert told_by_yaml(text.format("segm")).family == "driving-semantic"
-    assert told_by_yaml(text.format("'segm'")).move_time == 13
+def ranges(style: tuple[str, str], azimuth: int, elevation: int) -> str:
+    return YAML.format(azimuth=style[0].format(azimuth), elevation=style[1].format(elevation), move_time=13)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "move_time: soon", "azimuth: [1, 2", "\x00\xff", "a: " + "-" * 200_000, " " * 200_000]
+    ("text", "told"),
+    [
+        (ranges(INLINE, 90, 30), KUBRIC90),
+        (ranges(BLOCK, 90, 30), KUBRIC90),
+        (ranges(INLINE, 180, 60), KUBRIC180),
+        (ranges(BLOCK, 180, 60), KUBRIC180),
+        (ranges(INLINE, 90, 60), Hints(move_time=13)),  # they contradict each other
+        (ranges(INLINE, 45, 30), Hints(move_time=13)),  # of no family
+        (DRIVING.format("rgb"), Hints(family="driving", move_time=13, told_by="yaml")),
+        (DRIVING.format("segm"), Hints(family="driving-semantic", move_time=13, told_by="yaml")),
+        (DRIVING.format("'segm'"), Hints(family="driving-semantic", move_time=13, told_by="yaml")),
+        *((text, Hints()) for text in ("", "move_time: soon", "azimuth: [1, 2", "\x00\xff", "a: " + "-" * 200_000)),
+        (" " * 200_000, Hints()),
+    ],
 )
-def test_yaml_that_says_nothing_is_no_error(text: str) -> None:
-    assert told_by_yaml(text) == Hints()
+def test_angle_ranges_or_driving_views_of_a_yaml_tell_the_family_and_others_nothing(text: str, told: Hints) -> None:
+    assert told_by_yaml(text) == told
 
 
 def test_each_fact_comes_from_the_first_that_knows_it() -> None:

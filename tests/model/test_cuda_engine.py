@@ -1,5 +1,6 @@
 """The engine for GPUs on a CPU: the same numbers as plain torch, recorded, compiled or not, whatever is replayed."""
 
+import copy
 import json
 import os
 import subprocess
@@ -27,7 +28,6 @@ from gcd_model.engines.cuda import (
     join_attention,
     keep_compiled,
     regions,
-    twin,
 )
 from gcd_model.engines.graphs import CudaGraphs, Recorder, Replay, recent
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
@@ -44,7 +44,7 @@ def with_engine(
     synthesizer: Synthesizer, recorder: Recorder | None = None, options: CudaOptions = PLAIN
 ) -> Synthesizer:
     """The same checkpoint behind the engine."""
-    engine = CudaEngine(twin(synthesizer.networks), options, recorder)
+    engine = CudaEngine(copy.deepcopy(synthesizer.networks), options, recorder)
     return Synthesizer(synthesizer.networks, synthesizer.traits, engine)
 
 
@@ -190,14 +190,6 @@ def test_only_the_shapes_last_used_are_kept() -> None:
     assert made == [1, 2, 3, 2]
 
 
-def test_a_twin_has_the_same_weights_in_memory_and_its_own_modules(plain: Synthesizer) -> None:
-    first, second = plain.networks, twin(plain.networks)
-    pairs = list(zip(first.parameters(), second.parameters(), strict=True))
-    assert all(mine.data_ptr() == other.data_ptr() for mine, other in pairs)
-    assert not {id(module) for module in first.modules()} & {id(module) for module in second.modules()}
-    assert not any(module._compiled_call_impl for module in first.modules())
-
-
 @pytest.mark.parametrize("config", [TINY, TINY_DRIVING])
 def test_every_convolution_of_the_unet_but_its_ends_lies_in_a_compiled_region(config: ModelConfig) -> None:
     networks = (tiny_synthesizer if config is TINY else tiny_driving)(config).networks
@@ -307,7 +299,7 @@ def test_the_engine_decodes_in_half_precision_where_pictures_stay_alike(
     decoder, psnr = checked_decoder(networks)
     assert decoder.stem.weight.dtype == dtype
     assert psnr > 50
-    taken = twin(networks)
+    taken = copy.deepcopy(networks)
     engine = CudaEngine(taken, CudaOptions(backend=None, channels_last=False))
     assert taken.decoder.stem.weight.dtype == dtype
     assert networks.decoder.stem.weight.dtype == torch.float32
@@ -335,7 +327,7 @@ def test_a_second_gpu_is_the_current_one_while_its_engine_works(monkeypatch: pyt
             entered.append(device)
             super().__init__()
 
-    engine = CudaEngine(twin(tiny_synthesizer().networks), PLAIN)
+    engine = CudaEngine(copy.deepcopy(tiny_synthesizer().networks), PLAIN)
     monkeypatch.setattr(torch.cuda, "device", On)
     monkeypatch.setattr(CudaEngine, "like", SimpleNamespace(device=torch.device("cuda:1")))
     with engine._at_work():
@@ -402,7 +394,7 @@ def test_a_second_process_compiles_nothing_anew(tmp_path: Path) -> None:
 def test_compiled_blocks_are_plain_torch(backend: str) -> None:
     plain = tiny_synthesizer()
     options = CudaOptions(backend=backend, channels_last=backend == "eager", decoder="float32")
-    engine = Synthesizer(plain.networks, plain.traits, CudaEngine(twin(plain.networks), options))
+    engine = Synthesizer(plain.networks, plain.traits, CudaEngine(copy.deepcopy(plain.networks), options))
     path = plain.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
     asked = RenderOptions(steps=3, guidance=(1.0, 2.5))
     mine, other = (s.render(s.encode(random_clip(TINY)), [path], asked)[0] for s in (engine, plain))

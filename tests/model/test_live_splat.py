@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model.errors import ShapeError
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.splat import Splat, Surfels, splat, unproject
 
@@ -171,8 +170,3 @@ def test_without_surfels_in_sight_the_picture_is_empty(pose: Tensor) -> None:
     out = seen(surfels, pose)
     assert float(out.coverage.max()) == 0.0
     assert all(bool((each == 0).all()) for each in (out.colour, out.votes, out.inverse_depth, out.age))
-
-
-def test_pictures_of_another_size_than_the_lens_are_refused() -> None:
-    with pytest.raises(ShapeError):
-        unproject(torch.ones(4, 4), torch.ones(3, 4, 4), torch.ones(4, 4, dtype=torch.uint8), LENS, HERE, 0.0)

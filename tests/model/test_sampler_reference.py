@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import msgspec
 import torch
-from naming import released_unet
 from plain_unet import plain_unet
+from published import released_unet
 from small_models import TINY, draw, random_clip, relative_error, tiny_synthesizer
 from torch import Tensor
 

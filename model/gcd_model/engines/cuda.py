@@ -11,9 +11,8 @@ from collections.abc import Callable, Generator, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -57,7 +56,7 @@ class CudaEngine(Engine):
     def __init__(
         self, networks: Networks, options: CudaOptions | None = None, recorder: Recorder | None = None
     ) -> None:
-        """Take the networks over: they are laid out and compiled in place; give a `twin` of those that others use.
+        """Take the networks over: they are laid out and compiled in place.
 
         recorder: what replays work; by default as `options` and the device say.
         """
@@ -174,21 +173,11 @@ def _compiled(networks: Networks, options: CudaOptions, beat: Callable[[], objec
 # --- compiling networks region by region -----------------------------------------------------------------------------
 
 
-Model = TypeVar("Model", bound=nn.Module)
 Backend: TypeAlias = Callable[[Any, Any], Any]
 
 _REGIONS = (Stage, VideoResBlock, ResBlock, PixelAttention, ImageTransformerLayer, Downsample, Upsample)
 _SHAPES = 256  # of one kind of region: the U-Net has about 20, with and without the unconditional branch
 _ALL_SHAPES = 4096  # of all kinds together, as torch counts them by the code that every module's call begins with
-
-
-def twin(model: Model) -> Model:
-    """The same network with the same weights in memory, to be compiled without touching the first.
-
-    To move or to convert one of the two would do so to both.
-    """
-    memo: dict[int, object] = {id(each): each for each in chain(model.parameters(), model.buffers())}
-    return copy.deepcopy(model, memo).eval()
 
 
 def regions(model: nn.Module) -> Iterator[nn.Module]:

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_model.errors import ShapeError
 from gcd_model.geometry import Intrinsics, invert_rigid
 
 _NEAREST_M = 0.1
@@ -138,15 +137,7 @@ def unproject(
         depth: [H, W] metres along the optical axis; 0, negative or not finite: none.
         colour: [3, H, W] in [-1, 1]. label: uint8 [H, W].
         world_from_camera: [4, 4]. keep: bool [H, W], the pixels to take; None: all.
-    Raises:
-        ShapeError: the pictures and the lens differ in size.
     """
-    size = (lens.height, lens.width)
-    if depth.shape != size or colour.shape != (3, *size) or label.shape != size:
-        raise ShapeError(
-            f"depth, colour and label must be {lens.height} x {lens.width} as the lens is, "
-            f"got {list(depth.shape)}, {list(colour.shape)}, {list(label.shape)}"
-        )
     inverse = inverse_depth(depth)
     taken = inverse > 0 if keep is None else (inverse > 0) & keep
     index = true_at(taken.flatten())
