@@ -131,7 +131,7 @@ class _Look:
         device = section.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        precision = section.dtype or default_precision(torch.device(device), live=report.family == "live")
+        precision = section.dtype or default_precision(torch.device(device), live=report.live)
         needed, free = report.parameters * (4 if precision == "float32" else 2), self._free_memory
         if free is None:
             on_gpu = device.startswith("cuda")

@@ -169,7 +169,7 @@ def _full_size(stages: Collection[StageName]) -> LoadedWeights:
         vae = replace(vae, width=32, blocks_per_level=1)
     networks = random_networks(replace(SVD_14, image_encoder=tower, vae=vae), seed=0)
     last = networks.config.frames - 1
-    card = Card(name="random-full", config=networks.config, family=KUBRIC90.name, move_time=last, trained=False)
+    card = Card(name="random-full", config=networks.config, family=KUBRIC90, move_time=last, trained=False)
     return LoadedWeights(card=card, networks=networks)
 
 

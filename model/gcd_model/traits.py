@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
 import msgspec
@@ -28,8 +28,8 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.live.config import LiveConfig
-from gcd_model.weights.card import NO_DIFFUSION, Card
-from gcd_model.weights.families import KUBRIC90, LIVE_LENS_DEG, Family, family_named
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import KUBRIC90, LIVE_LENS_DEG
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
@@ -39,47 +39,22 @@ ASSUMED_SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=5.0, radius_m=15.0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Traits:
-    """One loaded checkpoint as its users need to know it.
+class Traits(Card):
+    """One loaded checkpoint as its users need to know it: what it says of itself, and where it runs.
 
-    family: None if nobody could tell; then no limits are checked.
-    move_time: frame in which the goal pose is reached; 0 for a direct checkpoint.
     sha256_12: 12 hex digits that name the weights: of SHA-256 over the file, over samples of it above 512 MiB.
-    trained: False for random weights, whose pictures are noise.
-    uncertainty_scale: the deviation over samples times this covers the truth as often as it says, as was measured on
-        held-out clips; None where nobody did.
     """
 
-    name: str
-    config: ModelConfig | LiveConfig
-    family: Family | None
-    move_time: int
     sha256_12: str
     precision: str
     device: str
-    trained: bool = True
-    uncertainty_scale: float | None = None
     ASSUMED_SOURCE: ClassVar[Spherical] = ASSUMED_SOURCE
 
     @classmethod
     def of(cls, card: Card, *, sha256_12: str, precision: str, device: str) -> Self:
-        """What a card says, and where the model runs. Raises OptionError for a family nobody knows."""
-        return cls(
-            name=card.name,
-            config=card.config,
-            family=None if card.family is None else family_named(card.family),
-            move_time=card.move_time,
-            sha256_12=sha256_12,
-            precision=precision,
-            device=device,
-            trained=card.trained,
-            uncertainty_scale=card.uncertainty_scale,
-        )
-
-    @property
-    def live(self) -> bool:
-        """Whether it is the live model, which needs to know the lens and takes a mount, depth and odometry."""
-        return isinstance(self.config, LiveConfig)
+        """What a card says, and where the model runs."""
+        facts = {field.name: getattr(card, field.name) for field in fields(Card)}
+        return cls(**facts, sha256_12=sha256_12, precision=precision, device=device)
 
     @staticmethod
     def assumed_hfov_deg(*, on_sphere: bool) -> float:
@@ -105,13 +80,6 @@ class Traits:
     def takes_any_pose(self) -> bool:
         """Whether views may stand anywhere and look anywhere."""
         return self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None)
-
-    @property
-    def diffusion(self) -> ModelConfig:
-        """The config of a diffusion model. Raises OptionError for the live model, which has none."""
-        if isinstance(self.config, LiveConfig):
-            raise OptionError(f"{self.name} {NO_DIFFUSION}")
-        return self.config
 
     @property
     def fps(self) -> float:

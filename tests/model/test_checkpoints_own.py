@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import FamilyName, Hints, told_by_name, told_by_yaml
+from gcd_model.weights.families import FAMILIES, FamilyName, Hints, told_by_name, told_by_yaml
 from gcd_model.weights.load import digest, save_weights
 
 # --- the family ------------------------------------------------------------------------------------------------------
@@ -33,17 +33,17 @@ def test_the_family_follows_option_metadata_name_and_yaml_in_that_order(tmp_path
     path = write_gcd(tmp_path, "kubric_direct_max180.ckpt")
     path.with_suffix(".yaml").write_text("move_time: 13\ndelta_azimuth_range: [-90, 90]\n")
     report = inspect(path)
-    assert (report.family, report.told_by, report.move_time) == ("kubric180", "file name", 0)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric180"], "file name", 0)
     report = inspect(path, family="kubric90")
-    assert (report.family, report.told_by, report.move_time) == ("kubric90", "option", 0)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric90"], "option", 0)
     other = path.rename(tmp_path / "mine.ckpt")
     other.with_suffix(".yaml").write_text("move_time: 5\ndelta_azimuth_range: [-90, 90]\n")
     report = inspect(other)
-    assert (report.family, report.told_by, report.move_time) == ("kubric90", "yaml", 5)
-    card = Card(name="small", config=SMALL_GCD, family="kubric180", move_time=7)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric90"], "yaml", 5)
+    card = Card(name="small", config=SMALL_GCD, family=FAMILIES["kubric180"], move_time=7)
     save_weights(filled(), tmp_path / "kubric_gradual_max90.safetensors", card)
     report = inspect(tmp_path / "kubric_gradual_max90.safetensors")
-    assert (report.family, report.told_by, report.move_time) == ("kubric180", "metadata", 7)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric180"], "metadata", 7)
 
 
 def test_an_unknown_family_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -120,7 +120,7 @@ def test_an_impossible_output_is_refused(tmp_path: Path, out: str) -> None:
 
 
 def own_file(tmp_path: Path, **metadata: str) -> Path:
-    card = Card(name="small", config=SMALL_GCD, family="kubric90", move_time=13).to_metadata()
+    card = Card(name="small", config=SMALL_GCD, family=FAMILIES["kubric90"], move_time=13).to_metadata()
     path = tmp_path / "ours.safetensors"
     save_file({k: v.contiguous() for k, v in filled().state_dict().items()}, path, metadata=card | metadata)
     return path

@@ -39,6 +39,7 @@ from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.networks import LiveNetworks, random_networks
 from gcd_model.weights.card import packed, unpacked
+from gcd_model.weights.families import LIVE
 from gcd_model.weights.load import load_weights
 
 
@@ -286,7 +287,7 @@ def test_weights_survive_their_file(tmp_path: Path) -> None:
     for name, tensor in networks.state_dict().items():
         assert torch.equal(loaded.networks.state_dict()[name], tensor.half().float())
     report = inspect_weights(tmp_path / "mine.safetensors")
-    assert (report.family, report.config, report.trained) == ("live", LIVE_TINY, True)
+    assert (report.family, report.config, report.trained) == (LIVE, LIVE_TINY, True)
     assert [each.name for each in report.networks] == ["depth", "paint", "familiarity"]
     assert report.parameters == sum(each.numel() for each in networks.state_dict().values())
     converted = convert_weights(tmp_path / "mine.safetensors", tmp_path / "wide.safetensors", dtype="float32")

@@ -79,7 +79,7 @@ def test_packaged_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(loading, "PACKAGED", tmp_path)
     with pytest.raises(CheckpointError):
         load_synthesizer("package:small")
-    card = Card(name="small", config=SMALL_GCD, family="kubric90", move_time=13)
+    card = Card(name="small", config=SMALL_GCD, family=FAMILIES["kubric90"], move_time=13)
     save_weights(filled(), tmp_path / "small.safetensors", card)
     assert load_synthesizer("package:small", device="cpu").traits.name == "small"
     with pytest.raises(CheckpointError):

@@ -27,6 +27,7 @@ from gcd_model.loading import load_synthesizer
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import digest
 
 
@@ -141,7 +142,7 @@ def test_the_cpu_comes_last_and_tensorrt_keeps_what_it_built(tmp_path: Path) -> 
 
 
 def manifest(*files: FileRecord, height: int = TINY.height) -> Manifest:
-    card = Card(name="tiny", config=structs.replace(TINY, height=height), family="kubric90", move_time=2)
+    card = Card(name="tiny", config=structs.replace(TINY, height=height), family=FAMILIES["kubric90"], move_time=2)
     return Manifest(
         format=FORMAT,
         card=card.to_metadata(),

@@ -14,9 +14,10 @@ from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_weights, save_weights
 
-CARD = Card(name="small", config=TINY, family="kubric90", move_time=2, uncertainty_scale=1.75)
+CARD = Card(name="small", config=TINY, family=FAMILIES["kubric90"], move_time=2, uncertainty_scale=1.75)
 
 
 @pytest.fixture(scope="module")

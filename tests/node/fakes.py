@@ -310,6 +310,6 @@ TINY = struct_replace(
 def write_tiny(folder: Path) -> Path:
     """`tiny.safetensors` in a folder: real weights of a tiny driving model at random, which paint class colours and
     take no time."""
-    card = Card(name="tiny", config=TINY, family="driving-semantic", move_time=13, trained=False)
+    card = Card(name="tiny", config=TINY, family=FAMILIES["driving-semantic"], move_time=13, trained=False)
     save_weights(random_networks(TINY, seed=0), folder / "tiny.safetensors", card)
     return folder / "tiny.safetensors"

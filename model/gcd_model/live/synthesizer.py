@@ -228,5 +228,5 @@ def save_live(
     Raises: OptionError if `path` exists and `overwrite` is not set; CheckpointError if it cannot be written.
     """
     halves: dict[str, Tensor] = {name: weight.half() for name, weight in networks.state_dict().items()}
-    card = Card(name=name, config=networks.config, family=LIVE.name, move_time=0, trained=trained)
+    card = Card(name=name, config=networks.config, family=LIVE, move_time=0, trained=trained)
     write_safetensors(Path(path), halves, card.to_metadata(), overwrite=overwrite)

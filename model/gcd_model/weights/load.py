@@ -97,9 +97,7 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
 
 
 def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
-    """A base and what was trained on it, as one. Raises CheckpointError as `adapted`; OptionError for its family."""
-    if adapter.card.family is not None:
-        family_named(adapter.card.family)
+    """A base and what was trained on it, as one. Raises CheckpointError as `adapted`;"""
     weights = {f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}
     return replace(
         base,
@@ -282,8 +280,9 @@ def _examined(path: Path, told: Told) -> _Examined:
         known = options.over(file.hints)
         config = at_trained_size(infer_config(shapes, naming, known), known)
     else:
-        named = None if stated.family is None else "metadata"
-        own = Hints(family=stated.family, told_by=named, move_time=stated.move_time)
+        own = Hints(move_time=stated.move_time)
+        if stated.family is not None:
+            own = replace(own, family=stated.family.name, told_by="metadata")
         known, config = options.over(own, file.hints), _with_frames(stated.config, options)
     require_family(known, config)
     try:
@@ -299,7 +298,7 @@ def _examined(path: Path, told: Told) -> _Examined:
     card = Card(
         name=file.name if stated is None or not stated.name else stated.name,
         config=config,
-        family=known.family,
+        family=None if known.family is None else family_named(known.family),
         move_time=last if known.move_time is None else min(known.move_time, last),
         trained=stated is None or stated.trained,
         uncertainty_scale=None if stated is None else stated.uncertainty_scale,
