@@ -15,7 +15,6 @@ from gcd_model.errors import OptionError, PoseError, ShapeError, ViewFixedError,
 from gcd_model.geometry import (
     CameraMount,
     DeltaFit,
-    Interpolation,
     Spherical,
     SphericalDelta,
     Trajectory,
@@ -154,7 +153,6 @@ class Traits(Card):
         *,
         source: Spherical | None = None,
         move_time: int | None = None,
-        interpolation: Interpolation | None = None,
         mount: CameraMount | None = None,
     ) -> Trajectory:
         """The camera path to a goal given as differences of angles and radius.
@@ -182,10 +180,9 @@ class Traits(Card):
             return self._fixed_view(delta, move_time)
         delta = SphericalDelta() if delta is None else delta
         self._check_limits(delta, source)
-        if interpolation is None:
-            interpolation = "linear" if self.family is None else self.family.interpolation
+        pace = "linear" if self.family is None else self.family.interpolation
         start = source or ASSUMED_SOURCE
-        return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=interpolation)
+        return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=pace)
 
     def plan_placed(
         self, position_m: tuple[float, ...], look_at_m: tuple[float, ...], *, mount: CameraMount | None = None
