@@ -133,16 +133,15 @@ class CudaEngine(Engine):
                 (start.shape, given.latents.shape, given.tokens is None),
                 lambda: StepMemory(self, self._update, start, given, schedule),
             )
-            memory.begin(start, given, schedule)
+            memory.load(start, given, schedule)
             if memory.record(set(widths), self._recorder):
-                memory.begin(start, given, schedule)
+                memory.load(start, given, schedule)
             for i in watched(len(widths), options):
-                memory.seek(i)
-                memory.advance(widths[i])
+                memory.step(i, widths[i])
                 if done is not None:
                     done.record()
                     done.synchronize()  # of the event alone: the device does not notice
-            return memory.result()
+            return memory.x.clone()
 
 
 def _tell(progress: Callable[[int, int], object], k: int, views: int, done: int, steps: int) -> None:

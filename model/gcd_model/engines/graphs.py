@@ -132,21 +132,21 @@ def solved(x: Tensor, before: Tensor, raw: Tensor, inputs: StepInputs) -> tuple[
 
 
 class StepMemory:
-    """All that a step reads and writes, for batches of one shape, and the steps recorded on it."""
+    """All that a step reads and writes, for batches of one shape, and the steps recorded on it. x: the latents."""
 
     def __init__(
         self, backbone: Backbone, update: Update, start: Tensor, given: Conditioning, schedule: Schedule
     ) -> None:
         self._backbone, self._update = backbone, update
-        self._x, self._before = start.clone(), start.clone()
+        self.x, self._before = start.clone(), start.clone()
         self._denoiser = GuidedDenoiser(backbone, given, schedule, start)
         self._inputs = StepInputs._make(each if each is None else each.clone() for each in self._denoiser.inputs(0))
         self._replays: dict[int, Replay] = {}
 
-    def begin(self, start: Tensor, given: Conditioning, schedule: Schedule) -> None:
-        """Load a batch."""
+    def load(self, start: Tensor, given: Conditioning, schedule: Schedule) -> None:
+        """A batch takes the place of the one before."""
         self._denoiser = GuidedDenoiser(self._backbone, given, schedule, start)
-        self._x.copy_(start)
+        self.x.copy_(start)
         self._before.copy_(start)
 
     def record(self, branches: set[int], recorder: Recorder) -> bool:
@@ -154,26 +154,22 @@ class StepMemory:
         Whether anything was."""
         missing = branches - self._replays.keys()
         for each in missing:
-            self.seek(0)
+            self._seek(0)
             self._replays[each] = recorder.record(lambda each=each: self._advance(each))
         return bool(missing)
 
-    def seek(self, step: int) -> None:
-        """Bring what this step needs."""
+    def step(self, number: int, branches: int) -> None:
+        """Do a step of the schedule."""
+        self._seek(number)
+        self._replays[branches]()
+
+    def _seek(self, step: int) -> None:
         for memory, value in zip(self._inputs, self._denoiser.inputs(step), strict=True):
             if memory is not None and value is not None:
                 memory.copy_(value)
 
-    def advance(self, branches: int) -> None:
-        """Do the step."""
-        self._replays[branches]()
-
-    def result(self) -> Tensor:
-        """Latents, a copy."""
-        return self._x.clone()
-
     def _advance(self, branches: int) -> None:
-        raw = evaluated(self._backbone, self._x, self._inputs, branches)
-        after, clean = self._update(self._x, self._before, raw, self._inputs)
-        self._x.copy_(after)
+        raw = evaluated(self._backbone, self.x, self._inputs, branches)
+        after, clean = self._update(self.x, self._before, raw, self._inputs)
+        self.x.copy_(after)
         self._before.copy_(clean)

@@ -80,22 +80,18 @@ class DepthNet(nn.Module):
     def __init__(self, config: DepthConfig, classes: int) -> None:
         super().__init__()
         self.config, self.classes = config, classes
-        beside = sweep_channels(config) * self._sweep_patch**2
+        beside = (config.bins + 1) * (config.patch // SWEEP_SCALE) ** 2
         self.trunk = Trunk(INPUTS, config.widths, config.patch, mixers=config.mixers, beside=beside)
         outputs = 2 * config.bins - 1 + classes + 3
         self.head = FineHead(
             INPUTS, config.widths[0], config.fine_width, outputs, config.patch, half_width=config.half_width
         )
 
-    @property
-    def _sweep_patch(self) -> int:
-        return self.config.patch // SWEEP_SCALE
-
     def features(self, inputs: Tensor, sweep: Tensor | None = None) -> Tensor:
         """What the heads look at: [N, widths[0], H / patch, W / patch]. Args: see `forward`."""
         n, _, height, width = inputs.shape
         if sweep is None:
-            sweep = inputs.new_zeros(n, sweep_channels(self.config), height // SWEEP_SCALE, width // SWEEP_SCALE)
+            sweep = inputs.new_zeros(n, self.config.bins + 1, height // SWEEP_SCALE, width // SWEEP_SCALE)
         return self.trunk(inputs, beside=sweep.to(inputs))
 
     def forward(self, inputs: Tensor, sweep: Tensor | None = None, pixels: Tensor | None = None) -> DepthOutput:
@@ -251,15 +247,10 @@ class Reference(NamedTuple):
     reference_from_camera: Tensor
 
 
-def sweep_channels(config: DepthConfig) -> int:
-    """A cost for every bin, the sky's among them, and whether there is a reference at all."""
-    return config.bins + 1
-
-
 def sweep_costs(picture: Tensor, lens: Intrinsics, reference: Reference | None, config: DepthConfig) -> Tensor:
     """`plane_sweep` of one picture [3, H, W], with an earlier one or none: [bins + 1, H/2, W/2]."""
     if reference is None:
-        return picture.new_zeros(sweep_channels(config), lens.height // SWEEP_SCALE, lens.width // SWEEP_SCALE)
+        return picture.new_zeros(config.bins + 1, lens.height // SWEEP_SCALE, lens.width // SWEEP_SCALE)
     earlier = reference.picture.to(picture)
     lenses = torch.tensor([[lens.fx, lens.fy, lens.cx, lens.cy]], device=picture.device)
     return plane_sweep(picture[None], lenses, earlier[None], reference.reference_from_camera[None], config)[0]

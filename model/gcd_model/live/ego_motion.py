@@ -7,7 +7,7 @@ drifts less than a sum of steps. Every sighting's depth improves that place. Ope
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,11 +20,11 @@ from gcd_model.geometry import Intrinsics
 from gcd_model.geometry.pose import require_rigid
 from gcd_model.live.track_pose import (
     BEHIND_M,
+    NO_TRACKS,
     OUTLIER,
     Tracks,
     inverse,
     likeliest_pose,
-    no_tracks,
     projected,
     unprojected,
 )
@@ -66,26 +66,16 @@ class Motion(NamedTuple):
     lost: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Frame:
+class _Frame(NamedTuple):
     """grey: u8 [H, W]. depth: [H, W] metres. share: [H, W], its standard error in parts of it. usable: u8 [H, W], 1
     where something static has a depth."""
 
     grey: Array
+    lens: Intrinsics
+    odometry: Array | None
     depth: Array
     share: Array
     usable: Array
-    lens: Intrinsics
-    odometry: Tensor | None
-
-    def with_depth(self, depth: Tensor, static: Tensor, spread: Tensor | None) -> "_Frame":
-        depth, static = depth.cpu(), static.cpu()
-        usable = (static & depth.isfinite() & (depth > 0)).to(torch.uint8)
-        inner = torch.zeros_like(usable)
-        inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
-        inner[inside] = usable[inside]
-        share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread.cpu() * _SPREADS).clamp(min=_SUREST)
-        return replace(self, depth=depth.double().numpy(), share=share.double().numpy(), usable=inner.numpy())
 
 
 class _LostError(Exception):
@@ -97,11 +87,10 @@ class EgoMotion:
 
     def __init__(self) -> None:
         self._last: _Frame | None = None
-        self._new: _Frame | None = None
         self._begin_world()
 
     def _begin_world(self) -> None:
-        self._pose, self._step, self._tracks = np.eye(4), np.eye(4), no_tracks()
+        self._pose, self._step, self._tracks = np.eye(4), np.eye(4), NO_TRACKS
 
     def follow(self, picture: Tensor, lens: Intrinsics, odometry: Tensor | None = None) -> Motion:
         """The motion from the last frame that was settled to this one.
@@ -111,10 +100,12 @@ class EgoMotion:
             odometry: float64 [4, 4], world_from_camera in a world of its own; only differences count. Two frames in a
                 row must have it, else the pictures decide.
         """
-        lost, last, self._new = None, self._last, _frame(picture, lens, odometry)
+        grey = torch.tensordot(torch.tensor([0.299, 0.587, 0.114]), picture.cpu().float(), dims=1) * 127.5 + 127.5
+        stated = None if odometry is None else odometry.cpu().numpy()
+        self._new, lost = (grey.round().clamp(0, 255).to(torch.uint8).numpy(), lens, stated), None
         try:
-            if last is not None:
-                self._advance(last, self._new)
+            if self._last is not None:
+                self._advance(self._last, *self._new)
         except _LostError as error:
             self._begin_world()
             lost = str(error)
@@ -127,39 +118,29 @@ class EgoMotion:
             depth: [H, W] metres, 1000 for the sky; 0 or not finite: a hole. static: bool [H, W], what does not move.
             spread: [H, W], standard deviation of log-depth; None for depth from elsewhere.
         """
-        if self._new is None:
-            return
-        self._last = frame = self._new.with_depth(depth, static, spread)
+        depth = depth.cpu()
+        inner = torch.zeros(depth.shape, dtype=torch.uint8)
+        inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
+        inner[inside] = (static.cpu() & depth.isfinite() & (depth > 0))[inside].to(torch.uint8)
+        share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread.cpu() * _SPREADS).clamp(min=_SUREST)
+        self._last = frame = _Frame(
+            *self._new, depth=depth.double().numpy(), share=share.double().numpy(), usable=inner.numpy()
+        )
         if len(self._tracks):
             column, row = np.rint(self._tracks.place).astype(int).T
-            here = self._pose
-            self._tracks = _placed_better(self._tracks, frame, here).rows(frame.usable[row, column] > 0)
+            self._tracks = _placed_better(self._tracks, frame, self._pose).rows(frame.usable[row, column] > 0)
 
-    def _advance(self, last: _Frame, frame: _Frame) -> None:
+    def _advance(self, last: _Frame, grey: Array, lens: Intrinsics, odometry: Array | None) -> None:
         """The pose, the last step and the tracks of this frame. Raises _LostError."""
-        if last.odometry is not None and frame.odometry is not None:
-            step = inverse(last.odometry.numpy()) @ frame.odometry.numpy()
+        if last.odometry is not None and odometry is not None:
+            step = inverse(last.odometry) @ odometry
             _require_plausible(step, "the odometry")
-            pose, tracks = self._pose @ step, no_tracks()
+            pose, tracks = self._pose @ step, NO_TRACKS
         else:
-            pose, tracks = _followed(last, frame, self._tracks, self._pose, self._pose @ self._step)
+            pose, tracks = _followed(last, grey, lens, self._tracks, self._pose, self._pose @ self._step)
             step = inverse(self._pose) @ pose
             _require_plausible(step, "the picture")
         self._pose, self._step, self._tracks = pose, step, tracks
-
-
-def _frame(picture: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame:
-    weights = torch.tensor([0.299, 0.587, 0.114])
-    grey = torch.tensordot(weights, picture.cpu().float(), dims=1) * 127.5 + 127.5
-    nothing = np.zeros(grey.shape, np.uint8)
-    return _Frame(
-        grey=grey.round().clamp(0, 255).to(torch.uint8).numpy(),
-        depth=nothing.astype(np.float64),
-        share=nothing.astype(np.float64),
-        usable=nothing,
-        lens=lens,
-        odometry=None if odometry is None else odometry.cpu(),
-    )
 
 
 def require_motion(before: Tensor | None, after: Tensor) -> Tensor:
@@ -186,25 +167,25 @@ def _require_plausible(step: Array, what: str) -> None:
         )
 
 
-def _followed(last: _Frame, frame: _Frame, tracks: Tracks, pose: Array, guess: Array) -> tuple[Array, Tracks]:
+def _followed(
+    last: _Frame, grey: Array, lens: Intrinsics, tracks: Tracks, pose: Array, guess: Array
+) -> tuple[Array, Tracks]:
     """world_from_camera of the frame, and the tracks that agree with it; of the frame itself no depth is asked.
 
     pose: of the last frame. guess: of this one, had the camera gone on as before.
     """
-    pictures = _contrasted(last.grey, frame.grey)
+    pictures = _contrasted(last.grey, grey)
     tracks = _with_new_corners(tracks, last, pictures[0], pose)
-    seen = _seen_again(tracks, pictures, frame.lens, pose, guess) if len(tracks) else tracks
+    seen = _seen_again(tracks, pictures, lens, pose, guess) if len(tracks) else tracks
     if len(seen) < _FEWEST:
         raise _LostError(f"only {len(seen)} of {len(tracks)} static corners are seen again; {_FEWEST} are needed")
-    here, errors = likeliest_pose(seen, frame.lens, pose, guess)
+    here, errors = likeliest_pose(seen, lens, pose, guess)
     agree = errors < OUTLIER
     needed = max(_FEWEST, math.ceil(_SMALLEST_SHARE * len(seen)))
     if agree.sum() < needed:
         raise _LostError(f"only {agree.sum()} of {len(seen)} static corners agree on a motion; {needed} are needed")
     seen = seen.rows(agree)
-    shift = np.linalg.norm(
-        projected(seen.point, here, frame.lens)[1] - projected(seen.point, pose, frame.lens)[1], axis=1
-    )
+    shift = np.linalg.norm(projected(seen.point, here, lens)[1] - projected(seen.point, pose, lens)[1], axis=1)
     if np.quantile(shift, _STANDS_SHARE) < _STANDS_PX:
         here = pose
     return here, seen

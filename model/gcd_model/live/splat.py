@@ -205,10 +205,13 @@ def splat(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics, classes
     size = (lens.height + 2 * _MARGIN, lens.width + 2 * _MARGIN)
     pixels = size[0] * size[1]
     pixel, owner, weight, z = _in_front(_fragments(footprints, size[1]), pixels)
-    label, standing, facts = _shown(surfels, number, now)
+    stamp, painted = surfels.stamp.index_select(0, number), surfels.painted.index_select(0, number)
+    fresh = (stamp == now) & ~painted
+    standing = torch.where(painted, _PAINTED_WEIGHT, torch.where(fresh, 1.0, _OLD_WEIGHT))
+    colour, label = surfels.colour.index_select(0, number).T.contiguous(), surfels.label.index_select(0, number).long()
     share = weight * standing.index_select(0, owner)
     sums = weight.new_zeros(7, pixels)
-    for total, fact in zip(sums, facts, strict=False):
+    for total, fact in zip(sums, (*colour, now - stamp, fresh.float()), strict=False):
         total.scatter_add_(0, pixel, fact.index_select(0, owner).mul_(share))
     sums[5].scatter_add_(0, pixel, share / z)
     sums[6].scatter_add_(0, pixel, share)
@@ -226,19 +229,6 @@ def splat(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics, classes
         age=mean[3],
         now_share=mean[4],
     )
-
-
-def _shown(surfels: Surfels, number: Tensor, now: float) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """What surfels by number tell a pixel: label (int64), how much it counts, and five facts, [M] each.
-
-    The facts: red, green, blue, age, whether seen now.
-    """
-    stamp, painted = surfels.stamp.index_select(0, number), surfels.painted.index_select(0, number)
-    fresh = (stamp == now) & ~painted
-    standing = torch.where(painted, _PAINTED_WEIGHT, torch.where(fresh, 1.0, _OLD_WEIGHT))
-    colour = surfels.colour.index_select(0, number).T.contiguous()
-    facts = (*colour, now - stamp, fresh.float())
-    return surfels.label.index_select(0, number).long(), standing, facts
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

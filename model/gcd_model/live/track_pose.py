@@ -46,6 +46,9 @@ class Tracks:
         return Tracks(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
 
+NO_TRACKS = Tracks(place=np.zeros((0, 2), np.float32), point=np.zeros((0, 3)), eye=np.zeros((0, 3)), share=np.zeros(0))
+
+
 def likeliest_pose(tracks: Tracks, lens: Intrinsics, pose: Array, guess: Array) -> tuple[Array, Array]:
     """The pose with which most tracks agree, and by how many standard errors each differs: [N].
 
@@ -121,16 +124,6 @@ def _reprojection(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array,
     residual = residual - excess * (along * residual).sum(1, keepdims=True)
     slope = slope - excess[:, :, None] * (along[:, None] @ slope)
     return residual / _FLOW_PX, slope / _FLOW_PX
-
-
-def no_tracks() -> Tracks:
-    """None at all."""
-    return Tracks(
-        place=np.zeros((0, 2), np.float32),
-        point=np.zeros((0, 3)),
-        eye=np.zeros((0, 3)),
-        share=np.zeros(0),
-    )
 
 
 def unprojected(place: Array, depth: Array, lens: Intrinsics, pose: Array) -> Array:
