@@ -3,10 +3,12 @@
 import json
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
+import torch
 from published import (
     SMALL_GCD,
     assert_same_weights,
@@ -20,11 +22,15 @@ from published import (
     write_svd,
 )
 from safetensors.torch import save_file
+from small_models import TINY, random_clip, tiny_synthesizer, tiny_traits
 
+from gcd_model import RenderOptions, SphericalDelta, convert_weights, load_synthesizer
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.networks import random_networks
+from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import FAMILIES, FamilyName, Hints, told_by_name, told_by_yaml
-from gcd_model.weights.load import digest, save_weights
+from gcd_model.weights.load import digest, load_weights, save_weights
 
 # --- the family ------------------------------------------------------------------------------------------------------
 
@@ -139,6 +145,7 @@ def tampered(**changes: object) -> str:
         {"gcd.config": tampered(shiny=1)},
         {"gcd.config": tampered(camera="none")},
         {"gcd.move_time": "soon"},
+        *({"gcd.uncertainty_scale": scale} for scale in ("much", "0", "nan")),
     ],
 )
 def test_damaged_metadata_is_refused(tmp_path: Path, metadata: dict[str, str]) -> None:
@@ -237,3 +244,37 @@ def test_each_fact_comes_from_the_first_that_knows_it() -> None:
     assert Hints().over(named, Hints(family="kubric90", move_time=13, told_by="yaml")) == named
     option = Hints(family="kubric90", told_by="option")
     assert option.over(named) == Hints(family="kubric90", move_time=0, told_by="option")
+
+
+CARD = Card(name="small", config=TINY, family=FAMILIES["kubric90"], move_time=2, uncertainty_scale=1.75)
+
+
+def test_the_uncertainty_scale_comes_with_the_weights_and_converting_keeps_or_replaces_it(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "small.safetensors"
+    save_weights(random_networks(TINY, seed=0), file, CARD)
+    assert load_weights(file).card.uncertainty_scale == 1.75
+    assert load_synthesizer(file, device="cpu").traits.uncertainty_scale == 1.75
+    kept = convert_weights(file, tmp_path / "kept.safetensors", dtype="float16")
+    given = convert_weights(file, tmp_path / "given.safetensors", uncertainty_scale=3.0)
+    assert (kept.uncertainty_scale, given.uncertainty_scale) == (1.75, 3.0)
+    assert_same_weights(load_weights(tmp_path / "given.safetensors").networks, load_weights(file).networks)
+    for scale in (0.0, float("nan")):
+        with pytest.raises(OptionError):
+            convert_weights(file, tmp_path / "bad.safetensors", uncertainty_scale=scale)
+    assert not (tmp_path / "bad.safetensors").exists()
+
+
+def test_views_carry_the_scale_of_their_weights() -> None:
+    plain = tiny_synthesizer()
+    measured = Synthesizer(plain.networks, replace(tiny_traits(), uncertainty_scale=2.5))
+    trajectory, options = plain.traits.plan_view(SphericalDelta(azimuth_deg=20.0)), RenderOptions(samples=2, steps=1)
+    (view,) = measured.render(measured.encode(random_clip()), [trajectory], options)
+    (other,) = plain.render(plain.encode(random_clip()), [trajectory], options)
+    assert view.std is not None
+    assert view.uncertainty is not None
+    assert torch.equal(view.samples, other.samples)
+    assert torch.equal(view.uncertainty, 2.5 * view.std)
+    assert other.uncertainty is None
+    assert replace(view, samples=view.samples[:1]).uncertainty is None
