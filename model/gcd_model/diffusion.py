@@ -215,10 +215,7 @@ def watched(count: int, options: RenderOptions) -> Iterator[int]:
             options.progress(i + 1, count)
 
 
-Number: TypeAlias = Tensor | float
-
-
-def advanced(x: Tensor, denoised: Tensor, before: Tensor, keep: Number, gain: Number) -> Tensor:
+def advanced(x: Tensor, denoised: Tensor, before: Tensor, keep: Tensor | float, gain: Tensor | float) -> Tensor:
     """One step on, see `SolverStep`."""
     return torch.lerp(denoised, x, keep) + gain * (denoised - before)
 
@@ -340,11 +337,9 @@ class Backbone(Protocol):
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         """All that does not depend on the pixels. labels: float32 [S], c_noise of every evaluation, anywhere."""
-        ...
 
     def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
         """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
-        ...
 
 
 class GuidedDenoiser:

@@ -14,7 +14,6 @@ from gcd_model.config import ModelConfig, SemanticClass
 from gcd_model.errors import OptionError, PoseError, ShapeError, ViewFixedError, ViewRangeError
 from gcd_model.geometry import (
     CameraMount,
-    DeltaFit,
     Spherical,
     SphericalDelta,
     Trajectory,
@@ -213,14 +212,23 @@ class Traits(Card):
             raise ViewFixedError(f"{self.name} has one fixed view and takes no poses; leave the poses out")
         if source_from_target.shape[:1] != (self.config.frames,):
             raise PoseError(f"poses must be [{self.config.frames}, 4, 4], got {list(source_from_target.shape)}")
-        if self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None):
+        if self.takes_any_pose:
             return pose_trajectory(source_from_target)
         fitted, fits = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
         assert fitted.delta is not None
         for azimuth, elevation, radius in fitted.delta.tolist():
             self._check_limits(SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius), source)
         if self.config.camera == "spherical":
-            _warn_of_residual(fits)
+            position_m, rotation_deg = (
+                max(getattr(fit, name) for fit in fits) for name in ("position_error_m", "rotation_error_deg")
+            )
+            if position_m > _TOLERATED_M or rotation_deg > _TOLERATED_DEG:
+                _LOG.warning(
+                    "the network is steered by angles and radius: the nearest path misses the asked poses by up to "
+                    "%.3g m and %.3g degrees",
+                    position_m,
+                    rotation_deg,
+                )
             return fitted
         asked = pose_trajectory(source_from_target)
         return replace(fitted, source_from_target=asked.source_from_target, at_goal=asked.at_goal)
@@ -263,15 +271,3 @@ def _orbit_of(mount: CameraMount | None) -> Spherical:
     reach_m = ASSUMED_SOURCE.radius_m
     radius_m = min(reach_m, mount.height_m / falling) if falling > 0 else reach_m
     return Spherical(azimuth_deg=0.0, elevation_deg=mount.tilt_deg, radius_m=radius_m)
-
-
-def _warn_of_residual(fits: list[DeltaFit]) -> None:
-    position_m = max(fit.position_error_m for fit in fits)
-    rotation_deg = max(fit.rotation_error_deg for fit in fits)
-    if position_m > _TOLERATED_M or rotation_deg > _TOLERATED_DEG:
-        _LOG.warning(
-            "the network is steered by angles and radius: the nearest path misses the asked poses by up to %.3g m "
-            "and %.3g degrees",
-            position_m,
-            rotation_deg,
-        )

@@ -114,9 +114,9 @@ LIVE = replace(MANIPULATION, name="live", height=128, width=192)
 LIVE_LENS_DEG = (40.0, 120.0)
 """Horizontal fields of view of the live model's training."""
 
-_ALL = (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, MANIPULATION, SVD, LIVE)
-
-FAMILIES: dict[str, Family] = {family.name: family for family in _ALL}
+FAMILIES: dict[str, Family] = {
+    family.name: family for family in (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, MANIPULATION, SVD, LIVE)
+}
 
 
 def family_named(name: str) -> Family:

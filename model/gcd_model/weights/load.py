@@ -48,12 +48,7 @@ _log = logging.getLogger(__name__)
 _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
 _USABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
-_NAMINGS: dict[Layout, Naming] = {
-    "gcd-ckpt": "gcd",
-    "sgm-safetensors": "gcd",
-    "diffusers": "diffusers",
-    "gcd-node": "own",
-}
+_NAMINGS: dict[Layout, Naming] = {"diffusers": "diffusers", "gcd-node": "own"}  # others have Stability's names
 
 
 class Told(TypedDict, total=False):
@@ -274,7 +269,7 @@ def _examined(path: Path, told: Told) -> _Examined:
     """Raises CheckpointError: the file does not fit, name by name. OptionError: what is told is impossible."""
     options = Hints(**told, told_by=None if told.get("family") is None else "option")
     file = read_weights(path)
-    naming, shapes = _NAMINGS[file.layout], shapes_of(file.tensors)
+    naming, shapes = _NAMINGS.get(file.layout, "gcd"), shapes_of(file.tensors)
     stated = Card.from_metadata(file.metadata) if CONFIG_KEY in file.metadata else None
     if stated is None:
         known = options.over(file.hints)
