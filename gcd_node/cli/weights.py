@@ -79,8 +79,7 @@ def convert(
             image_heads=image_heads,
             overwrite=overwrite,
         )
-    console = Console(markup=False)
-    _show(console, report)
+    _show(console := Console(markup=False), report)
     console.print(f"wrote {out}", soft_wrap=True)
 
 

@@ -14,8 +14,7 @@ from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
-from gcd_model.live.eyes import SeenFrame
-from gcd_model.live.memory import PlacedFrame
+from gcd_model.live.eyes import PlacedFrame, SeenFrame
 from gcd_model.networks import Networks
 from gcd_model.traits import Traits
 from gcd_model.vae import to_pixels

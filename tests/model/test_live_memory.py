@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.memory import remembered, unrefuted
+from gcd_model.live.eyes import remembered, unrefuted
 from gcd_model.live.splat import Surfels, unproject
 
 LENS = Intrinsics.from_hfov(70.0, 48, 32)

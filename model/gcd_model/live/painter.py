@@ -9,8 +9,7 @@ from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.blocks import likeliest
 from gcd_model.live.config import SKY_M, LiveConfig
 from gcd_model.live.depth_net import plane_depth
-from gcd_model.live.eyes import Floor
-from gcd_model.live.memory import PlacedFrame
+from gcd_model.live.eyes import Floor, PlacedFrame
 from gcd_model.live.paint_net import Painted, Seen, camera_features, filled, seen_of
 from gcd_model.live.splat import Surfels, splat, unproject
 from gcd_model.networks import LiveNetworks

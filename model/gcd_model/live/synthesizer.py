@@ -12,8 +12,7 @@ from gcd_model.conditioning import SourceFeatures
 from gcd_model.diffusion import RenderOptions, watched
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
-from gcd_model.live.eyes import Eyes, Floor, SeenFrame
-from gcd_model.live.memory import PlacedFrame, SeenWorld
+from gcd_model.live.eyes import Eyes, Floor, PlacedFrame, SeenFrame, SeenWorld
 from gcd_model.live.painter import COVERED, PAINTED, SEEN_NOW, Painter, ViewFrame
 from gcd_model.live.splat import splat, unproject
 from gcd_model.networks import LiveNetworks

@@ -23,8 +23,7 @@ from gcd_model import hatched
 from gcd_model.errors import ModelError
 from gcd_model.geometry import invert_rigid
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.eyes import Eyes, Floor
-from gcd_model.live.memory import SeenWorld
+from gcd_model.live.eyes import Eyes, Floor, SeenWorld
 from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.painter import COVERED, Painter
 from gcd_model.live.splat import splat, unproject

@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LIVE_CLASSES, SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, plane_depth, read_depth
-from gcd_model.live.memory import SeenWorld
+from gcd_model.live.eyes import SeenWorld
 from gcd_model.live.paint_net import Painted, Seen, camera_features
 from gcd_model.live.splat import Splat, splat, unproject
 from gcd_train.data.sample import to_network
