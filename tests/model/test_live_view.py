@@ -14,8 +14,7 @@ from gcd_model import Intrinsics, RenderOptions, SeenFrame, load_synthesizer
 from gcd_model.live.config import LIVE_TINY, SKY_M, DepthConfig
 from gcd_model.live.depth_net import DepthNet, Reference, depth_inputs, read_depth, sweep_costs
 from gcd_model.live.eyes import LONGEST, Eyes, References, SeenWorld
-from gcd_model.live.painter import Painter, ViewFrame
-from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.synthesizer import LiveSynthesizer, Painter, ViewFrame
 from gcd_model.networks import LiveNetworks, random_networks
 
 HERE = torch.eye(4, dtype=torch.float64)

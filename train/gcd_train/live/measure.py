@@ -25,9 +25,8 @@ from gcd_model.geometry import invert_rigid
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.eyes import Eyes, Floor, SeenWorld
 from gcd_model.live.paint_net import filled, seen_of
-from gcd_model.live.painter import COVERED, Painter
 from gcd_model.live.splat import splat, unproject
-from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.synthesizer import COVERED, LiveSynthesizer, Painter
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError, TrainError
