@@ -200,11 +200,11 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     spread = ((places - place[:, None]).square() * weight).sum(dim=1).sqrt()
     sky = probability[:, -1] > best
     confidence = torch.maximum(best, probability[:, -1])
-    metres = torch.where(sky, SKY_M, place.exp())
+    metres, log = torch.where(sky, SKY_M, place.exp()), output.classes.log_softmax(dim=1)
     return DepthReading(
         metres=torch.where(sky, SKY_M, _smoothed(metres, confidence)),
         spread=spread,
-        entropy=_entropy(output.classes),
+        entropy=-(log.exp() * log).sum(dim=1).mean(dim=(1, 2)) / math.log(log.shape[1]),
     )
 
 
@@ -224,12 +224,6 @@ def _smoothed(metres: Tensor, confidence: Tensor) -> Tensor:
                     weights.narrow(*here).addcmul_(near, sure.narrow(*there))
             inverse = (total / weights).narrow(axis, _SMOOTH_PX, size - 2 * _SMOOTH_PX)
     return 1 / inverse
-
-
-def _entropy(logits: Tensor) -> Tensor:
-    """Mean over pixels of the entropy of choices [N, C, H, W], in parts of log C: [N]."""
-    log = logits.log_softmax(dim=1)
-    return -(log.exp() * log).sum(dim=1).mean(dim=(1, 2)) / math.log(logits.shape[1])
 
 
 # --- what the camera's own motion tells of depth: how well each depth explains an earlier frame ----------------------

@@ -233,7 +233,9 @@ class LiveSynthesizer:
             )
         if not self._carries:
             self._eyes.reset()
-        floor, odometry = _floor(features.mount), features.odometry
+        floor, mount, odometry = None, features.mount, features.odometry
+        if mount is not None:
+            floor = Floor(up=mount.vehicle_from_camera[2, :3].float(), height_m=mount.height_m)
         for t, frame in enumerate(video):
             depth = metres[t] if bool(stated[t]) else None
             pose = None if odometry is None else odometry[t]
@@ -251,7 +253,8 @@ class LiveSynthesizer:
         steps = options.steps or self.traits.config.sampling.steps
         draws = options.samples if steps > 1 else 1
         if not self._carries or self._drawn_with != (steps, draws):
-            self._painters = [Painter(self.networks, steps=steps, seed=seed) for seed in _seeds(options.seed, draws)]
+            seeds = [(options.seed + s * _SEED_STEP) % _SEEDS for s in range(draws)]
+            self._painters = [Painter(self.networks, steps=steps, seed=seed) for seed in seeds]
             self._drawn_with = (steps, draws)
         made: list[list[tuple[ViewFrame, ...]]] = []  # by frame, then by draw
         scores: list[float] = []
@@ -327,17 +330,6 @@ def visibility_of(clip: Clip, path: Trajectory) -> Tensor:
         splat(unproject(metres, frame, labels, lens, here, 0.0), pose, lens, 1, 0.0) for frame, metres, pose in frames
     ]
     return torch.stack([torch.where(each.coverage >= COVERED, SEEN_NOW, PAINTED).to(torch.uint8) for each in splats])
-
-
-def _floor(mount: CameraMount | None) -> Floor | None:
-    """The ground that a camera on a vehicle knows."""
-    if mount is None:
-        return None
-    return Floor(up=mount.vehicle_from_camera[2, :3].float(), height_m=mount.height_m)
-
-
-def _seeds(seed: int, draws: int) -> list[int]:
-    return [(seed + s * _SEED_STEP) % _SEEDS for s in range(draws)]
 
 
 def _is_finite(view: View) -> bool:

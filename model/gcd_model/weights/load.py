@@ -6,7 +6,7 @@ Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffu
 
 import hashlib
 import logging
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -288,7 +288,13 @@ def _examined(path: Path, told: Told) -> _Examined:
     levels = Levels.of(config) if isinstance(config, ModelConfig) else Levels()
     sources = {name: published_names(name, naming, levels) or (name,) for name in expected}
     leftovers = match_weights(sources, expected, shapes)
-    _require_usable({name: file.tensors[name].dtype for names in sources.values() for name in names})
+    unusable = [name for names in sources.values() for name in names if file.tensors[name].dtype not in _USABLE]
+    if unusable:  # quantised weights have the right names and shapes and mean nothing without their scales
+        stored = sorted({str(file.tensors[name].dtype).removeprefix("torch.") for name in unusable})
+        raise CheckpointError(
+            f"{len(unusable)} weights are stored as {', '.join(stored)}, first: {', '.join(unusable[:5])}; wanted are "
+            "float32, float16 or bfloat16"
+        )
     last = config.frames - 1
     card = Card(
         name=file.name if stated is None or not stated.name else stated.name,
@@ -313,13 +319,3 @@ def _with_frames(config: ModelConfig | LiveConfig, hints: Hints) -> ModelConfig 
             if given is not None and given != value:
                 raise OptionError(f"{name} is {value} in this file, which states it itself, got {given}; leave it out")
     return config if hints.frames is None else msgspec.structs.replace(config, frames=hints.frames)
-
-
-def _require_usable(dtypes: Mapping[str, torch.dtype]) -> None:
-    """Quantised weights have the right names and shapes and mean nothing without their scales."""
-    bad = {name: str(dtype).removeprefix("torch.") for name, dtype in dtypes.items() if dtype not in _USABLE}
-    if bad:
-        raise CheckpointError(
-            f"{len(bad)} weights are stored as {', '.join(sorted(set(bad.values())))}, first: "
-            f"{', '.join(list(bad)[:5])}; wanted are float32, float16 or bfloat16"
-        )
