@@ -190,7 +190,12 @@ def regions(model: nn.Module) -> Iterator[nn.Module]:
 
 def compile_regions(model: nn.Module, backend: str | Backend) -> int:
     """Compile every region, in place, when it is first called; how many there are. backend: of torch.compile."""
-    _allow_shapes()
+    from torch._dynamo import config  # takes seconds
+
+    # all blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise
+    name = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before torch 2.7
+    for each, least in ((name, _SHAPES), (f"accumulated_{name}", _ALL_SHAPES)):
+        setattr(config, each, max(least, getattr(config, each)))
     found = list(regions(model))
     for region in found:
         region.compile(backend=backend, fullgraph=True, dynamic=False)
@@ -210,15 +215,6 @@ def _heard(name: str, beat: Callable[[], object], *, tuned: bool = False) -> Bac
         return compiler(graph, inputs, **how)
 
     return compiled
-
-
-def _allow_shapes() -> None:
-    """All blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise."""
-    from torch._dynamo import config  # takes seconds
-
-    name = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before torch 2.7
-    for each, least in ((name, _SHAPES), (f"accumulated_{name}", _ALL_SHAPES)):
-        setattr(config, each, max(least, getattr(config, each)))
 
 
 def channels_last(model: nn.Module) -> None:
@@ -283,7 +279,12 @@ def checked_decoder(networks: Networks) -> tuple[TemporalDecoder, float]:
     """The decoder in float16, which has three bits more, or else in bfloat16, which no activation is too large for, if
     its pictures of a test clip are good enough for that; and their PSNR, infinite for float32."""
     config, full = networks.config, networks.decoder
-    frames = drifting_clip(min(config.frames, _FRAMES), config.height, config.width)
+    height, width = config.height, config.width  # a smooth random picture with a fine pattern, a pixel on each frame
+    coarse = unit_noise((1, 3, max(2, height // _COARSE), max(2, width // _COARSE)), _SEED)
+    picture = F.interpolate(coarse, size=(height, width), mode="bilinear")[0] + 0.2 * unit_noise(
+        (3, height, width), _SEED, 1
+    )
+    frames = torch.stack([picture.roll(t, dims=-1) for t in range(min(config.frames, _FRAMES))]).clamp(-1, 1)
     encoder = networks.condition_encoder
     latents = torch.cat([encoder(each[None].to(encoder.stem.weight)).mean for each in frames]).float()
     truth = to_pixels(full(latents.to(full.stem.weight), len(latents)))
@@ -292,14 +293,6 @@ def checked_decoder(networks: Networks) -> tuple[TemporalDecoder, float]:
         if (psnr := psnr_db(to_pixels(half(latents.to(precision), len(latents))), truth)) > WANTED_DB:
             return half, psnr
     return full, math.inf
-
-
-def drifting_clip(frames: int, height: int, width: int) -> Tensor:
-    """A smooth random picture with a fine pattern that moves by a pixel a frame: [frames, 3, height, width]."""
-    coarse = unit_noise((1, 3, max(2, height // _COARSE), max(2, width // _COARSE)), _SEED)
-    smooth = F.interpolate(coarse, size=(height, width), mode="bilinear")[0]
-    fine = 0.2 * unit_noise((3, height, width), _SEED, 1)
-    return torch.stack([(smooth + fine).roll(t, dims=-1) for t in range(frames)]).clamp(-1, 1)
 
 
 def psnr_db(ours: Tensor, truth: Tensor) -> float:

@@ -271,7 +271,9 @@ def plane_sweep(
     y = ((torch.arange(height, device=here.device) + 0.5) * SWEEP_SCALE - cy[:, None]) / fy[:, None]
     u, v = x[:, None].expand(n, height, width), y[:, :, None].expand(n, height, width)
     turned = into @ turn @ torch.stack([u, v, torch.ones_like(u)], dim=1).flatten(2)  # [N, 3, h*w], of points 1 m ahead
-    shifts = (into @ step[..., None]) * _inverse_depths(config).to(here.device)  # [N, 3, bins]
+    steps = (torch.arange(config.bins - 1) + 0.5) / (config.bins - 1)
+    inverse = torch.cat([(config.nearest_m / config.farthest_m) ** steps / config.nearest_m, torch.zeros(1)])  # 1 / m
+    shifts = (into @ step[..., None]) * inverse.to(here.device)  # [N, 3, bins], the sky's last
     across, down, z = (turned[:, :, None] + shifts[..., None]).unbind(dim=1)  # [N, bins, h*w] each
     inside = (z > _BEHIND_M) & (across.abs() <= z) & (down.abs() <= z)
     place = torch.stack([across, down], dim=-1) / z.clamp(min=_BEHIND_M)[..., None]  # [N, bins, h*w, 2]
@@ -279,12 +281,6 @@ def plane_sweep(
     difference = (looked_up - here.flatten(2)[:, :, None]).abs().mean(dim=1) * _CONTRAST  # [N, bins, h*w]
     costs = torch.where(inside, difference, _UNSEEN)
     return torch.cat([costs, torch.ones_like(costs[:, :1])], dim=1).view(n, -1, height, width)
-
-
-def _inverse_depths(config: DepthConfig) -> Tensor:
-    """Of the bins' centres, 1 / m; 0 for the sky: [bins]."""
-    steps = (torch.arange(config.bins - 1) + 0.5) / (config.bins - 1)
-    return torch.cat([(config.nearest_m / config.farthest_m) ** steps / config.nearest_m, torch.zeros(1)])
 
 
 # --- how unlike its training a picture looks: classes it is unsure of, features it never had -------------------------
