@@ -243,7 +243,7 @@ class LiveSynthesizer:
 
     def _placed(self, seen: Iterable[SeenFrame], trajectories: Sequence[Trajectory]) -> Iterator[PlacedFrame]:
         for t, frame in enumerate(seen):
-            yield self._world.place(frame, [path.source_from_target[t] for path in trajectories])
+            yield self._world.place(frame, [path.source_from_target[t].cpu() for path in trajectories])
 
     def _painted(
         self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None
