@@ -337,9 +337,11 @@ class Backbone(Protocol):
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         """All that does not depend on the pixels. labels: float32 [S], c_noise of every evaluation, anywhere."""
+        ...
 
     def predict(self, rows: Tensor, condition: Tensor, embeddings: Tensor, crosses: Tensor | None) -> Tensor:
         """One evaluation, see `VideoUNet.forward`. rows: float32 [N, C, h, w] -> float32, the same shape."""
+        ...
 
 
 class GuidedDenoiser:

@@ -31,9 +31,11 @@ class ViewSynthesizer(Protocol):
     @property
     def traits(self) -> Traits:
         """Family, sizes, limits and identity of the weights."""
+        ...
 
     def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         """What the network needs to know of the source, computed once per clip."""
+        ...
 
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
@@ -45,6 +47,7 @@ class ViewSynthesizer(Protocol):
             Cancelled: `options.cancel` was set; noticed between two denoising steps.
             NonFiniteError: the result holds NaN or Inf. DeviceMemoryError: the device ran out of memory.
         """
+        ...
 
 
 @runtime_checkable
@@ -53,6 +56,7 @@ class FrameSynthesizer(ViewSynthesizer, Protocol):
 
     def streaming(self) -> "FrameSynthesizer":
         """The same weights for clips of one frame, each of which goes on where the one before ended."""
+        ...
 
     def reset(self) -> None:
         """Forget all frames: the next one is the first."""
@@ -63,14 +67,17 @@ class FrameSynthesizer(ViewSynthesizer, Protocol):
         The thirds keep their own state, so three threads may be at work on consecutive clips, each in their order.
         Raises: ShapeError: the features are another model's. DeviceMemoryError.
         """
+        ...
 
     def place(self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory]) -> Sequence[PlacedFrame]:
         """What is known of every view before anything is painted. Raises: ShapeError, DeviceMemoryError."""
+        ...
 
     def paint(
         self, placed: Sequence[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
         """The views. trajectories: as placed. Raises: as `render`."""
+        ...
 
 
 def out_of_memory_is_our_error(method: Callable[Given, Made]) -> Callable[Given, Made]:
