@@ -129,8 +129,7 @@ class _Look:
             path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
         )
         try:
-            live = report.family == "live"
-            device, precision = placement(section.device, section.engine, section.dtype, live=live)
+            device, precision = placement(section.device, section.engine, section.dtype, live=report.live)
         except OptionError as error:
             raise ConfigError(f"[model]: {error}") from error
         needed, free = report.parameters * (4 if precision == "float32" else 2), self._free_memory

@@ -3,12 +3,14 @@
 `bench_model.py` is its command. What belongs to no stage that was asked for is not computed.
 """
 
+import copy
 import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as with_changes
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Literal, get_args
@@ -24,7 +26,7 @@ from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
 from gcd_model.engines.cuda import psnr_db
-from gcd_model.engines.torch import Engine, TorchEngine, arrange
+from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
@@ -168,7 +170,7 @@ def _full_size(stages: Collection[StageName]) -> LoadedWeights:
         vae = replace(vae, width=32, blocks_per_level=1)
     networks = random_networks(replace(SVD_14, image_encoder=tower, vae=vae), seed=0)
     last = networks.config.frames - 1
-    card = Card(name="random-full", config=networks.config, family=KUBRIC90.name, move_time=last, trained=False)
+    card = Card(name="random-full", config=networks.config, family=KUBRIC90, move_time=last, trained=False)
     return LoadedWeights(card=card, networks=networks)
 
 
@@ -179,16 +181,23 @@ def engine_named(name: str, networks: Networks) -> Engine:
         prepare(networks)
         if next(networks.unet.parameters()).device.type == "cpu":
             arrange(networks)
-        return TorchEngine(networks)
+        return Engine(networks)
     if name in VARIANTS:
-        from gcd_model.engines.cuda import CudaEngine, CudaOptions, twin
+        from gcd_model.engines.cuda import CudaEngine, CudaOptions
 
-        # with a copy of what it lays out anew, since others use the same networks
-        return CudaEngine(twin(networks), CudaOptions(**VARIANTS[name]) if VARIANTS[name] else None)
+        on_cpu = not networks.unet.stem.weight.is_cuda  # where nothing of what a GPU gains by is tried unasked
+        options = VARIANTS[name] or (VARIANTS["ours, graphs alone"] if on_cpu else {})
+        return CudaEngine(_twin(networks), CudaOptions(**options))
     from diffusers_peer import DiffusersEngine, compile_modules, diffusers_modules
 
     modules = diffusers_modules(networks)
     return DiffusersEngine(compile_modules(modules) if name == "diffusers compiled" else modules)
+
+
+def _twin(networks: Networks) -> Networks:
+    """The same weights in memory, to be laid out and compiled without touching networks that others use."""
+    memo: dict[int, object] = {id(each): each for each in chain(networks.parameters(), networks.buffers())}
+    return copy.deepcopy(networks, memo).eval()
 
 
 def still_clip(frames: int, height: int, width: int, fps: float) -> Clip:

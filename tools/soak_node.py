@@ -172,10 +172,10 @@ class StandInModel:
         self.taken_ns = 0
         """When it was last given something, monotonic clock."""
 
-    def encode(self, clip, augmentation=None, extra=None):
+    def encode(self, clip, augmentation=None):
         self.taken_ns = time.monotonic_ns()
         latents = clip.video[:, :, ::8, ::8]
-        return SourceFeatures(tokens=None, latents=latents, extra=extra, fps=clip.fps, augmentation=0.0)
+        return SourceFeatures(tokens=None, latents=latents, fps=clip.fps, augmentation=0.0)
 
     def render(self, features, trajectories, options=None):
         self.taken_ns = time.monotonic_ns()

@@ -79,8 +79,7 @@ def convert(
             image_heads=image_heads,
             overwrite=overwrite,
         )
-    console = Console(markup=False)
-    _show(console, report)
+    _show(console := Console(markup=False), report)
     console.print(f"wrote {out}", soft_wrap=True)
 
 
@@ -88,6 +87,7 @@ def _show(console: Console, report: WeightsReport) -> None:
     """All that is known, by its names in WeightsReport; sizes are bytes."""
     facts = {each.name: getattr(report, each.name) for each in fields(report)}
     networks, leftovers, config = (facts.pop(name) for name in ("networks", "leftovers", "config"))
+    facts["family"] = report.family and report.family.name
     facts |= {"parameters": f"{report.parameters:,}", "config": msgspec.json.encode(config).decode()}
     console.print(table(facts.items()))
     console.print(table(map(astuple, networks), ("network", ">parameters", ">tensors", "stored as", ">bytes"), "Used"))

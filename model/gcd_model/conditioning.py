@@ -1,6 +1,5 @@
 """Clip, relative camera, frame rate, motion and noise strength become everything the U-Net takes, once a window."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -20,20 +19,6 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class SourceGeometry:
-    """What is stated of T source frames, for the live model.
-
-    metres: float32 [T, H, W], 0 for a hole. stated: bool [T], whether a frame came with a depth at all. odometry:
-    float64 [T, 4, 4], world_from_camera, or None. lens: of all of them.
-    """
-
-    metres: Tensor
-    stated: Tensor
-    odometry: Tensor | None
-    lens: Intrinsics
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class SourceFeatures:
     """What the network needs to know of the source; every row belongs to one frame alone.
 
@@ -41,59 +26,44 @@ class SourceFeatures:
 
     tokens: [T, D] from the image tower, or None without one. latents: [T, C, h, w], not scaled; C is 0 for the live
     model, which has none.
-    extra: [T, C', h, w], further condition channels, or None. fps: what the network is told.
-    augmentation: strength of the noise the VAE saw.
-    video: float32 [T, 3, H, W] in [-1, 1], mount, geometry: what the live model's points are made of; None for others.
+    fps: what the network is told. augmentation: strength of the noise the VAE saw.
+    The rest is what the live model's points are made of, None for others. video: float32 [T, 3, H, W] in [-1, 1].
+    metres: float32 [T, H, W], 0 for a hole. stated: bool [T], whether a frame came with a depth at all. odometry:
+    float64 [T, 4, 4], world_from_camera, or None.
     """
 
     tokens: Tensor | None
     latents: Tensor
-    extra: Tensor | None
     fps: float
     augmentation: float
-    video: Tensor | None = None
     mount: CameraMount | None = None
-    geometry: SourceGeometry | None = None
+    lens: Intrinsics | None = None
+    video: Tensor | None = None
+    metres: Tensor | None = None
+    stated: Tensor | None = None
+    odometry: Tensor | None = None
 
     @property
     def frames(self) -> int:
         """T."""
         return self.latents.shape[0]
 
-    def _kind(self) -> tuple[object, ...]:
-        """What must agree where features are joined: numbers, and which rows there are."""
-        geometry = self.geometry
-        stated = () if geometry is None else (geometry.lens, frozenset(_rows(geometry)))
-        return self.fps, self.augmentation, self.mount, frozenset(_rows(self)), stated
+    def _tensors(self) -> dict[str, Tensor]:
+        named = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in named.items() if isinstance(value, Tensor)}
 
     def rows(self, start: int, stop: int) -> Self:
         """The features of frames start..stop-1."""
-        geometry = self.geometry
-        if geometry is not None:
-            geometry = replace(geometry, **{name: each[start:stop] for name, each in _rows(geometry).items()})
-        return replace(self, geometry=geometry, **{name: each[start:stop] for name, each in _rows(self).items()})
+        return replace(self, **{name: each[start:stop] for name, each in self._tensors().items()})
 
     def followed_by(self, *later: Self) -> Self:
         """These frames and then the later ones, in the order given. Raises ShapeError unless all were encoded alike."""
-        if any(self._kind() != each._kind() for each in later):
+        parts = [(each, each._tensors()) for each in (self, *later)]
+        if len({(each.fps, each.augmentation, each.mount, each.lens, *tensors) for each, tensors in parts}) > 1:
             raise ShapeError(
                 "features of another frame rate, augmentation, mount, lens or model cannot be joined; encode them alike"
             )
-        geometry, parts = self.geometry, [self, *later]
-        if geometry is not None:
-            geometry = replace(geometry, **_joined([each.geometry for each in parts if each.geometry is not None]))
-        return replace(self, geometry=geometry, **_joined(parts))
-
-
-def _rows(of: SourceFeatures | SourceGeometry) -> dict[str, Tensor]:
-    """Its tensors that are there, by field; every one has a row a frame."""
-    named = {field.name: getattr(of, field.name) for field in fields(of)}
-    return {name: value for name, value in named.items() if isinstance(value, Tensor)}
-
-
-def _joined(parts: Sequence[SourceFeatures] | Sequence[SourceGeometry]) -> dict[str, Tensor]:
-    rows = [_rows(part) for part in parts]
-    return {name: torch.cat([each[name] for each in rows]) for name in rows[0]}
+        return replace(self, **{name: torch.cat([tensors[name] for _, tensors in parts]) for name in parts[0][1]})
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -165,18 +135,8 @@ class CameraEmbedder(nn.Module):
         return self.proj(camera_features(self.control, trajectory).to(self.proj.weight))
 
 
-def condition_latents(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor:
-    """Condition channels of K views, [R*K*T, C', h, w]; the unconditional branch sees zeros, as released."""
-    rows = features.latents if features.extra is None else torch.cat([features.latents, features.extra], dim=1)
-    return _with_unconditional(rows, views, unconditional)
-
-
-def condition_tokens(features: SourceFeatures, views: int, *, unconditional: bool) -> Tensor | None:
-    """Image tokens of K views, [R*K*T, D]; the unconditional branch sees zeros, as released."""
-    return None if features.tokens is None else _with_unconditional(features.tokens, views, unconditional)
-
-
-def _with_unconditional(rows: Tensor, views: int, unconditional: bool) -> Tensor:
+def with_unconditional(rows: Tensor, views: int, unconditional: bool) -> Tensor:
+    """Image tokens or latents of a clip for K views: [R*K*T, ...]; the unconditional branch sees zeros, as released."""
     repeated = rows.repeat(views, *[1] * (rows.ndim - 1))
     return torch.cat([torch.zeros_like(repeated), repeated]) if unconditional else repeated
 

@@ -25,7 +25,7 @@ def require_multiple(what: str, width: int, of: str, divisor: int) -> None:
 class UNetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Shape of the video U-Net.
 
-    condition_channels: channels joined to the noisy latents: the source latents, then any extra ones.
+    condition_channels: channels of the source latents, which are joined to the noisy ones.
     attention: for each level, shallowest first, whether it has transformers; the middle always has one.
     context_width: width of the image token; None leaves cross-attention out.
     vector_width: width of the micro-conditioning vector. camera_width: of the camera vector, 0 for none.
@@ -202,8 +202,8 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise OptionError(f"the image tower gives width {token}, the U-Net wants {self.unet.context_width}")
         if self.unet.latent_channels != self.vae.latent_channels:
             raise OptionError(f"latent channels: U-Net {self.unet.latent_channels}, VAE {self.vae.latent_channels}")
-        if self.unet.condition_channels < self.vae.latent_channels:
-            raise OptionError(f"condition_channels must hold {self.vae.latent_channels} source latent channels")
+        if self.unet.condition_channels != self.vae.latent_channels:
+            raise OptionError(f"condition_channels must be the {self.vae.latent_channels} of the source latents")
         if self.semantic_classes:
             require_ontology("semantic_classes", self.semantic_classes)
 
@@ -217,11 +217,6 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         """Whether any of the switches is on that the paper's model does not have."""
         vae = self.vae
         return self.prediction != "v" or vae.patch > 1 or vae.linear or self.sampling.shared_noise
-
-    @property
-    def extra_condition_channels(self) -> int:
-        """Condition channels beyond the source latents: the caller brings them."""
-        return self.unet.condition_channels - self.vae.latent_channels
 
 
 # --- named set-ups ---------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """The paper's letters: noise levels, preconditioning, solvers, guidance, presets, and the network they drive."""
 
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,14 +27,6 @@ Guidance: TypeAlias = tuple[float, float]
 """Scale of the first and of the last frame, linear between."""
 NoiseInterval: TypeAlias = tuple[float, float]
 """A lowest and a highest noise level, both within."""
-
-
-class CancelSignal(Protocol):
-    """Whatever can be asked to stop: a threading.Event."""
-
-    def is_set(self) -> bool:
-        """True once the work should stop."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,7 +57,7 @@ class RenderOptions:
     motion_bucket: float | None = None
     whole_levels: bool = False
     progress: Callable[[int, int], None] | None = None
-    cancel: CancelSignal | None = None
+    cancel: threading.Event | None = None
 
     def __post_init__(self) -> None:
         if self.samples < 1 or (self.steps is not None and self.steps < 1):
@@ -84,8 +77,7 @@ class RenderOptions:
 # --- noise levels and preconditioning ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Preconditioning:
+class Preconditioning(NamedTuple):
     """The four coefficients of a denoiser, shaped like the noise level they were made from."""
 
     c_skip: Tensor
@@ -121,11 +113,6 @@ def edm_sigmas(config: SamplingConfig, steps: int) -> Tensor:
     ramp = torch.linspace(0, 1, steps, dtype=torch.float64)
     sigmas = (high + ramp * (low - high)) ** config.rho
     return torch.cat([sigmas, sigmas.new_zeros(1)])
-
-
-def guidance_scale(first: float, last: float, frames: int) -> Tensor:
-    """Guidance per frame, linear from the first to the last: float64 [T]. Source: Blattmann et al. 2023 (SVD)."""
-    return torch.linspace(first, last, frames, dtype=torch.float64)
 
 
 def unit_noise(shape: tuple[int, ...], seed: int, stream: int = 0, device: torch.device | str = "cpu") -> Tensor:
@@ -229,10 +216,7 @@ def watched(count: int, options: RenderOptions) -> Iterator[int]:
             options.progress(i + 1, count)
 
 
-Number: TypeAlias = Tensor | float
-
-
-def advanced(x: Tensor, denoised: Tensor, before: Tensor, keep: Number, gain: Number) -> Tensor:
+def advanced(x: Tensor, denoised: Tensor, before: Tensor, keep: Tensor | float, gain: Tensor | float) -> Tensor:
     """One step on, see `SolverStep`."""
     return torch.lerp(denoised, x, keep) + gain * (denoised - before)
 
@@ -297,8 +281,8 @@ class Sampler:
 class Schedule:
     """One run of the sampler, all of it known before it starts.
 
-    steps: one per network evaluation. guidance: float64 [T], scale per frame. guided: per evaluation, whether the
-    unconditional branch counts, too.
+    steps: one per network evaluation. guidance: float64 [T], scale per frame, linear (Blattmann et al. 2023). guided:
+    per evaluation, whether the unconditional branch counts, too.
     """
 
     steps: tuple[SolverStep, ...]
@@ -315,7 +299,7 @@ class Schedule:
         low, high = sampler.guidance_interval or (0.0, math.inf)
         return cls(
             steps=steps,
-            guidance=guidance_scale(*sampler.guidance, config.frames),
+            guidance=torch.linspace(*sampler.guidance, config.frames, dtype=torch.float64),
             guided=tuple(guides and low <= step.sigma <= high for step in steps),
             prediction=config.prediction,
         )

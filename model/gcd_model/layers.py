@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from typing import Generic, TypeVar, cast
 
 import torch
@@ -125,10 +126,11 @@ class ResBlock(nn.Module):
     ) -> None:
         super().__init__()
         self.norm1 = nn.GroupNorm(groups, in_channels, eps)
-        self.conv1 = _conv3(in_channels, out_channels, temporal)
+        conv = FrameConv if temporal else partial(nn.Conv2d, kernel_size=3, padding=1)
+        self.conv1 = conv(in_channels, out_channels)
         self.embed = None if embedding_width is None else nn.Linear(embedding_width, out_channels)
         self.norm2 = nn.GroupNorm(groups, out_channels, eps)
-        self.conv2 = _conv3(out_channels, out_channels, temporal)
+        self.conv2 = conv(out_channels, out_channels)
         self.skip = None if in_channels == out_channels else nn.Conv2d(in_channels, out_channels, 1)
 
     def project(self, embedding: Tensor) -> Tensor:
@@ -162,12 +164,6 @@ class FrameConv(nn.Conv3d):
         """[B, C, T, H, W] -> [B, C', T, H, W]."""
         rows = F.conv2d(input.flatten(3), self.weight.squeeze(-1), self.bias, padding=(1, 0))
         return rows.unflatten(3, input.shape[-2:])
-
-
-def _conv3(in_channels: int, out_channels: int, temporal: bool) -> nn.Module:
-    if temporal:
-        return FrameConv(in_channels, out_channels)
-    return nn.Conv2d(in_channels, out_channels, 3, padding=1)
 
 
 class Attention(nn.Module):

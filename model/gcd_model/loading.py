@@ -1,7 +1,6 @@
 """From the name of a checkpoint to a synthesizer on a device."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Unpack, get_args
 
@@ -19,8 +18,7 @@ from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, wei
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.weights.card import FULL_PRECISION, Card, precision
-from gcd_model.weights.families import LIVE, family_named
-from gcd_model.weights.infer import Hints
+from gcd_model.weights.families import LIVE, Hints, family_named
 from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]
@@ -141,7 +139,7 @@ def placed_synthesizer(
         return Synthesizer(networks, traits)
     from gcd_model.engines.cuda import CudaEngine, CudaOptions  # torch.compile takes seconds to import
 
-    options = replace(CudaOptions.of_device(device), float8=name == "float8")
+    options = CudaOptions(float8=name == "float8")
     return Synthesizer(networks, traits, CudaEngine(networks, options))
 
 
@@ -181,7 +179,7 @@ def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:
     card = Card(
         name=f"random-{family}",
         config=networks.config,
-        family=family,
+        family=chosen,
         move_time=0 if chosen is LIVE else networks.config.frames - 1,
         trained=False,
         origin=weights_digest(networks.state_dict()),

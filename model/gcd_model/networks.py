@@ -17,7 +17,7 @@ from gcd_model.live.paint_net import PaintNet
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights.card import NO_DIFFUSION, Card, Layout
-from gcd_model.weights.families import FAMILIES, Family
+from gcd_model.weights.families import Family
 
 
 class Networks(nn.Module):
@@ -78,7 +78,7 @@ class LoadedWeights:
     @property
     def family(self) -> Family | None:
         """None if nobody could tell."""
-        return None if self.card.family is None else FAMILIES[self.card.family]
+        return self.card.family
 
     @property
     def sha256_12(self) -> str:

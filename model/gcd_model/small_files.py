@@ -159,19 +159,13 @@ def explain_settings_error(message: str, root: type[msgspec.Struct]) -> str:
     if unknown is None:
         return message.replace("`$.", "`")
     key, place = unknown.group(1), unknown.group(2) or ""
-    known = _keys_at(place, root)
+    for part in filter(None, place.replace("[...]", "").split(".")):
+        root = _struct_of_field(root, part)
+    known = list(root.__struct_fields__)
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     where = f" in [{place.replace('[...]', '.*')}]" if place else ""
     hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(known)}"
     return f"unknown key `{key}`{where}; {hint}"
-
-
-def _keys_at(place: str, root: type[msgspec.Struct]) -> list[str]:
-    """Keys of the table at a place such as `source.pose` or `view[...]`."""
-    struct = root
-    for part in filter(None, place.replace("[...]", "").split(".")):
-        struct = _struct_of_field(struct, part)
-    return list(struct.__struct_fields__)
 
 
 def _choices_at(place: str, root: type[msgspec.Struct]) -> list[str]:

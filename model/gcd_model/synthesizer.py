@@ -8,14 +8,13 @@ import torch
 from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, View, nearest_classes
-from gcd_model.conditioning import Conditioning, SourceFeatures, condition_latents, condition_tokens, micro_conditioning
+from gcd_model.conditioning import Conditioning, SourceFeatures, micro_conditioning, with_unconditional
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
-from gcd_model.engines.torch import Engine, TorchEngine, arrange
+from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Trajectory
 from gcd_model.layers import prepare
-from gcd_model.live.eyes import SeenFrame
-from gcd_model.live.memory import PlacedFrame
+from gcd_model.live.eyes import PlacedFrame, SeenFrame
 from gcd_model.networks import Networks
 from gcd_model.traits import Traits
 from gcd_model.vae import to_pixels
@@ -34,9 +33,7 @@ class ViewSynthesizer(Protocol):
         """Family, sizes, limits and identity of the weights."""
         ...
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         """What the network needs to know of the source, computed once per clip."""
         ...
 
@@ -63,7 +60,6 @@ class FrameSynthesizer(ViewSynthesizer, Protocol):
 
     def reset(self) -> None:
         """Forget all frames: the next one is the first."""
-        ...
 
     def see(self, features: SourceFeatures) -> Sequence[SeenFrame]:
         """What was encoded of a clip is looked at: the first third of `render`.
@@ -145,39 +141,20 @@ class Synthesizer:
 
     def __init__(self, networks: Networks, traits: Traits, engine: Engine | None = None) -> None:
         """engine: what computes the networks; torch itself where none is given."""
-        self._networks, self._traits = networks, traits
-        self._config = networks.config
+        self.networks, self.traits, self._config = networks, traits, networks.config
         networks.requires_grad_(False)
         prepare(networks)
         if engine is None and next(networks.unet.parameters()).device.type == "cpu":
             arrange(networks)
-        self._engine: Engine = engine or TorchEngine(networks)
-
-    @property
-    def traits(self) -> Traits:
-        """Family, sizes, limits and identity of the weights."""
-        return self._traits
-
-    @property
-    def networks(self) -> Networks:
-        """The networks themselves, for measuring and exporting."""
-        return self._networks
+        self._engine = engine or Engine(networks)
 
     @out_of_memory_is_our_error
     @torch.inference_mode()
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
-        """See ViewSynthesizer. Frames are independent of each other here; any number of them may be given.
-
-        extra: [T, C', h, w], for checkpoints with further condition channels.
-        """
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
+        """See ViewSynthesizer. Frames are independent of each other here; any number of them may be given."""
         augmentation = augmentation or Augmentation()
         strength = self._config.sampling.augmentation if augmentation.strength is None else augmentation.strength
-        self._traits.check_size(*clip.video.shape[-2:])
-        wanted, given = self._config.extra_condition_channels, 0 if extra is None else extra.shape[1]
-        if wanted != given:
-            raise ShapeError(f"{self._traits.name} wants {wanted} extra condition channels, got {given}")
+        self.traits.check_size(*clip.video.shape[-2:])
         noise, device = augmentation.noise, self._engine.like.device
         if noise is not None and noise.shape != clip.video.shape:
             raise ShapeError(f"augmentation noise must be {list(clip.video.shape)}, got {list(noise.shape)}")
@@ -190,7 +167,6 @@ class Synthesizer:
         return SourceFeatures(
             tokens=torch.cat([each for each in tokens if each is not None]) if self._config.image_encoder else None,
             latents=torch.cat([self._engine.condition_mean(frames) for frames in noisy.split(at_once)]),
-            extra=None if extra is None else extra.to(self._engine.like),
             fps=clip.fps,
             augmentation=strength,
         )
@@ -201,9 +177,9 @@ class Synthesizer:
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
         options = RenderOptions() if options is None else options
-        self._check_lengths(features, trajectories)
+        self.traits.check_lengths(features.frames, trajectories)
         given = options.motion_bucket
-        buckets = [self._traits.motion_bucket(path) if given is None else given for path in trajectories]
+        buckets = [self.traits.motion_bucket(path) if given is None else given for path in trajectories]
         latents = self._denoise(features, trajectories, buckets, options)
         pictures, classes = self._decode(latents / self._config.vae.scale, as_levels=options.whole_levels)
         return [
@@ -213,20 +189,12 @@ class Synthesizer:
                 trajectory=path,
                 motion_bucket=bucket,
                 classes=ids,
-                uncertainty_scale=self._traits.uncertainty_scale,
+                uncertainty_scale=self.traits.uncertainty_scale,
             )
             for samples, own, path, bucket, ids in zip(
                 pictures, latents.cpu(), trajectories, buckets, classes, strict=True
             )
         ]
-
-    def _check_lengths(self, features: SourceFeatures, trajectories: Sequence[Trajectory]) -> None:
-        frames = self._config.frames
-        if not trajectories:
-            raise ShapeError("at least one trajectory is wanted, got none")
-        for length in (features.frames, *(path.frames for path in trajectories)):
-            if length != frames:
-                raise ShapeError(f"{self._traits.name} works on {frames} frames, got {length}")
 
     def _denoise(
         self,
@@ -242,18 +210,18 @@ class Synthesizer:
         vectors = [micro_conditioning(features.fps, bucket, strength, width) for bucket in buckets]
         cameras = [self._engine.camera(path) for path in trajectories]
         cameras = [each.repeat(samples, 1) for each in cameras if each is not None]
-        unconditional = schedule.branches == 2
+        unconditional, rows = schedule.branches == 2, views * samples
         given = Conditioning(
             vector=torch.cat([vector.expand(samples * config.frames, -1) for vector in vectors]).to(like),
             camera=torch.cat(cameras) if cameras else None,
-            tokens=condition_tokens(features, views * samples, unconditional=unconditional),
-            latents=condition_latents(features, views * samples, unconditional=unconditional),
+            tokens=None if features.tokens is None else with_unconditional(features.tokens, rows, unconditional),
+            latents=with_unconditional(features.latents, rows, unconditional),
         )
         noise = self._noise(tuple(features.latents.shape[1:]), options)
         latents = self._engine.sample(schedule.start(noise.to(like.device), views), given, schedule, options)
         if not latents.isfinite().all():
             raise NonFiniteError(
-                f"{self._traits.name} produced NaN or Inf in the latents (precision {self._traits.precision}, seed "
+                f"{self.traits.name} produced NaN or Inf in the latents (precision {self.traits.precision}, seed "
                 f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
             )
         return latents.unflatten(0, (views, samples))
@@ -275,7 +243,7 @@ class Synthesizer:
 
         One clip at a time; while one is decoded, the one before it arrives.
         """
-        painted, finite = self._traits.painted_classes, list[Tensor]()
+        painted, finite = self.traits.painted_classes, list[Tensor]()
         pictures, classes = list[Download](), list[Download]()
         for clip in latents.flatten(0, 1):
             decoded = self._engine.decode(clip)
@@ -285,7 +253,7 @@ class Synthesizer:
                 classes.append(Download(nearest_classes(pixels, painted)))
             pictures.append(Download(whole_levels(pixels) if as_levels else pixels))
         if not all(each.item() for each in finite):
-            raise NonFiniteError(f"{self._traits.name} decoded to NaN or Inf; the weights are damaged")
+            raise NonFiniteError(f"{self.traits.name} decoded to NaN or Inf; the weights are damaged")
         views, samples = latents.shape[:2]
 
         def by_view(clips: list[Download]) -> list[Tensor]:

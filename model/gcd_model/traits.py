@@ -2,7 +2,8 @@
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
 import msgspec
@@ -10,11 +11,9 @@ import torch
 from torch import Tensor
 
 from gcd_model.config import ModelConfig, SemanticClass
-from gcd_model.errors import OptionError, PoseError, ViewFixedError, ViewRangeError
+from gcd_model.errors import OptionError, PoseError, ShapeError, ViewFixedError, ViewRangeError
 from gcd_model.geometry import (
     CameraMount,
-    DeltaFit,
-    Interpolation,
     Spherical,
     SphericalDelta,
     Trajectory,
@@ -27,8 +26,8 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.live.config import LiveConfig
-from gcd_model.weights.card import NO_DIFFUSION, Card
-from gcd_model.weights.families import KUBRIC90, LIVE_LENS_DEG, Family, family_named
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import KUBRIC90, LIVE_LENS_DEG
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
@@ -38,47 +37,22 @@ ASSUMED_SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=5.0, radius_m=15.0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Traits:
-    """One loaded checkpoint as its users need to know it.
+class Traits(Card):
+    """One loaded checkpoint as its users need to know it: what it says of itself, and where it runs.
 
-    family: None if nobody could tell; then no limits are checked.
-    move_time: frame in which the goal pose is reached; 0 for a direct checkpoint.
     sha256_12: 12 hex digits that name the weights: of SHA-256 over the file, over samples of it above 512 MiB.
-    trained: False for random weights, whose pictures are noise.
-    uncertainty_scale: the deviation over samples times this covers the truth as often as it says, as was measured on
-        held-out clips; None where nobody did.
     """
 
-    name: str
-    config: ModelConfig | LiveConfig
-    family: Family | None
-    move_time: int
     sha256_12: str
     precision: str
     device: str
-    trained: bool = True
-    uncertainty_scale: float | None = None
     ASSUMED_SOURCE: ClassVar[Spherical] = ASSUMED_SOURCE
 
     @classmethod
     def of(cls, card: Card, *, sha256_12: str, precision: str, device: str) -> Self:
-        """What a card says, and where the model runs. Raises OptionError for a family nobody knows."""
-        return cls(
-            name=card.name,
-            config=card.config,
-            family=None if card.family is None else family_named(card.family),
-            move_time=card.move_time,
-            sha256_12=sha256_12,
-            precision=precision,
-            device=device,
-            trained=card.trained,
-            uncertainty_scale=card.uncertainty_scale,
-        )
-
-    @property
-    def live(self) -> bool:
-        """Whether it is the live model, which needs to know the lens and takes a mount, depth and odometry."""
-        return isinstance(self.config, LiveConfig)
+        """What a card says, and where the model runs."""
+        facts = {field.name: getattr(card, field.name) for field in fields(Card)}
+        return cls(**facts, sha256_12=sha256_12, precision=precision, device=device)
 
     @staticmethod
     def assumed_hfov_deg(*, on_sphere: bool) -> float:
@@ -104,13 +78,6 @@ class Traits:
     def takes_any_pose(self) -> bool:
         """Whether views may stand anywhere and look anywhere."""
         return self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None)
-
-    @property
-    def diffusion(self) -> ModelConfig:
-        """The config of a diffusion model. Raises OptionError for the live model, which has none."""
-        if isinstance(self.config, LiveConfig):
-            raise OptionError(f"{self.name} {NO_DIFFUSION}")
-        return self.config
 
     @property
     def fps(self) -> float:
@@ -154,6 +121,14 @@ class Traits:
                 f"the trained size is {self.config.height}x{self.config.width}"
             )
 
+    def check_lengths(self, frames: int, trajectories: Sequence[Trajectory]) -> None:
+        """Raises ShapeError unless there are paths, and they and the features have as many frames as a clip."""
+        if not trajectories:
+            raise ShapeError("at least one trajectory is wanted, got none")
+        for length in (frames, *(path.frames for path in trajectories)):
+            if length != self.config.frames:
+                raise ShapeError(f"{self.name} works on {self.config.frames} frames, got {length}")
+
     def motion_bucket(self, trajectory: Trajectory) -> float:
         """The motion number for a camera path. Raises OptionError where only the user can know it.
 
@@ -177,7 +152,6 @@ class Traits:
         *,
         source: Spherical | None = None,
         move_time: int | None = None,
-        interpolation: Interpolation | None = None,
         mount: CameraMount | None = None,
     ) -> Trajectory:
         """The camera path to a goal given as differences of angles and radius.
@@ -196,7 +170,7 @@ class Traits:
         """
         frames, move_time = self.config.frames, self.move_time if move_time is None else move_time
         if self.live and source is None and delta is None:
-            return driving_trajectory(frames=frames, move_time=move_time, mount=mount or CameraMount())
+            return driving_trajectory(frames=frames, move_time=move_time, mount=mount)
         if self.live:
             source = source or _orbit_of(mount)
         elif mount is not None:
@@ -205,10 +179,9 @@ class Traits:
             return self._fixed_view(delta, move_time)
         delta = SphericalDelta() if delta is None else delta
         self._check_limits(delta, source)
-        if interpolation is None:
-            interpolation = "linear" if self.family is None else self.family.interpolation
+        pace = "linear" if self.family is None else self.family.interpolation
         start = source or ASSUMED_SOURCE
-        return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=interpolation)
+        return spherical_trajectory(start, delta, frames=frames, move_time=move_time, interpolation=pace)
 
     def plan_placed(
         self, position_m: tuple[float, ...], look_at_m: tuple[float, ...], *, mount: CameraMount | None = None
@@ -239,14 +212,23 @@ class Traits:
             raise ViewFixedError(f"{self.name} has one fixed view and takes no poses; leave the poses out")
         if source_from_target.shape[:1] != (self.config.frames,):
             raise PoseError(f"poses must be [{self.config.frames}, 4, 4], got {list(source_from_target.shape)}")
-        if self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None):
+        if self.takes_any_pose:
             return pose_trajectory(source_from_target)
         fitted, fits = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
         assert fitted.delta is not None
         for azimuth, elevation, radius in fitted.delta.tolist():
             self._check_limits(SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius), source)
         if self.config.camera == "spherical":
-            _warn_of_residual(fits)
+            position_m, rotation_deg = (
+                max(getattr(fit, name) for fit in fits) for name in ("position_error_m", "rotation_error_deg")
+            )
+            if position_m > _TOLERATED_M or rotation_deg > _TOLERATED_DEG:
+                _LOG.warning(
+                    "the network is steered by angles and radius: the nearest path misses the asked poses by up to "
+                    "%.3g m and %.3g degrees",
+                    position_m,
+                    rotation_deg,
+                )
             return fitted
         asked = pose_trajectory(source_from_target)
         return replace(fitted, source_from_target=asked.source_from_target, at_goal=asked.at_goal)
@@ -289,15 +271,3 @@ def _orbit_of(mount: CameraMount | None) -> Spherical:
     reach_m = ASSUMED_SOURCE.radius_m
     radius_m = min(reach_m, mount.height_m / falling) if falling > 0 else reach_m
     return Spherical(azimuth_deg=0.0, elevation_deg=mount.tilt_deg, radius_m=radius_m)
-
-
-def _warn_of_residual(fits: list[DeltaFit]) -> None:
-    position_m = max(fit.position_error_m for fit in fits)
-    rotation_deg = max(fit.rotation_error_deg for fit in fits)
-    if position_m > _TOLERATED_M or rotation_deg > _TOLERATED_DEG:
-        _LOG.warning(
-            "the network is steered by angles and radius: the nearest path misses the asked poses by up to %.3g m "
-            "and %.3g degrees",
-            position_m,
-            rotation_deg,
-        )

@@ -222,13 +222,20 @@ class VideoUNet(nn.Module):
             Stage(config.widths[-1], config.widths[-1], config, attends=attends, frames=frames)
             for attends in (True, False)
         )
-        skips, above = _skip_widths(config), [*config.widths[1:], config.widths[-1]]
+        above, skips = [*config.widths[1:], config.widths[-1]], [width]  # of the stem, every stage and down-sampling
+        for level, channels in enumerate(config.widths):
+            skips += [channels] * (config.blocks_per_level + (level + 1 < len(config.widths)))
         self.up = Layers[UpLevel](
             UpLevel(above[i], skips, i, config, frames) for i in reversed(range(len(config.widths)))
         )
         self.norm_out = nn.GroupNorm(config.norm_groups, width, eps=1e-5)
         self.conv_out = nn.Conv2d(width, config.latent_channels, 3, padding=1)
-        self._start_as_identity()
+        for stage in self.all_stages():  # so that it starts as the identity
+            zeroed(stage.res.spatial.conv2)
+            zeroed(stage.res.temporal.conv2)
+            if stage.attention is not None:
+                zeroed(stage.attention.proj_out)
+        zeroed(self.conv_out)
 
     def plan(self, noise_labels: Tensor, vector: Tensor, camera: Tensor | None, tokens: Tensor | None) -> UNetPlan:
         """Compute all that does not depend on the pixels.
@@ -316,19 +323,3 @@ class VideoUNet(nn.Module):
         for stage in self.all_stages():
             if stage.attention is not None:
                 stage.attention.start_apart()
-
-    def _start_as_identity(self) -> None:
-        for stage in self.all_stages():
-            zeroed(stage.res.spatial.conv2)
-            zeroed(stage.res.temporal.conv2)
-            if stage.attention is not None:
-                zeroed(stage.attention.proj_out)
-        zeroed(self.conv_out)
-
-
-def _skip_widths(config: UNetConfig) -> list[int]:
-    """Channels of the stem and of every stage and down-sampling, in forward order."""
-    widths = [config.width]
-    for level, width in enumerate(config.widths):
-        widths += [width] * (config.blocks_per_level + (level + 1 < len(config.widths)))
-    return widths

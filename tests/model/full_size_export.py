@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from gcd_model.config import SVD_14
-from gcd_model.engines.onnx_export import step_graph, write_graph
+from gcd_model.engines.onnx_export import graphs, write_graph
 from gcd_model.networks import empty_networks
 
 SMALL = 64
@@ -33,7 +33,7 @@ def fill(module: nn.Module) -> None:
 def main(folder: Path) -> None:
     networks = empty_networks(SVD_14)
     fill(networks)
-    graph = step_graph(networks)
+    graph = next(each for each in graphs(networks) if each.name == "step")
     files = write_graph(graph, folder)
     model = onnx.load(folder / "step.onnx", load_external_data=False)
     large = [each for each in model.graph.initializer if math.prod(each.dims) > SMALL]

@@ -4,18 +4,15 @@
 
 `write` puts random weights under diffusers' names into FOLDER/unet.safetensors; the other two map them into memory,
 run both branches of 14 frames at 32x48 latents in one batch, float32, store the result, and print a line of JSON:
-seconds of the step, CPU seconds (of user and system) of the step and of building, peak resident memory with mapped
-pages, peak private memory, both in GB.
+seconds of the step, CPU seconds (of user and system) of the step and of building, peak resident memory in GB, mapped
+pages included: whoever copies the 6 GB of weights has them twice.
 """
 
 import json
 import resource
 import sys
-import threading
 import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -91,36 +88,9 @@ def _diffusers(weights: dict[str, Tensor]) -> Step:
     return step
 
 
-@dataclass(slots=True)
-class _Private:
-    peak_bytes: int = 0
-
-
-def _private_bytes() -> int:
-    """Memory that is this process's own: mapped weights do not count, what was copied from them does."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:"))
-
-
-@contextmanager
-def _private_watched() -> Generator[_Private]:
-    """The largest private memory seen meanwhile; the kernel keeps no peak of it, so it is read 50 times a second."""
-    seen, over = _Private(), threading.Event()
-
-    def watch() -> None:
-        while not over.wait(0.02):
-            seen.peak_bytes = max(seen.peak_bytes, _private_bytes())
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    yield seen
-    over.set()
-    watcher.join()
-
-
 def _measure(folder: Path, build: Callable[[dict[str, Tensor]], Step], name: str) -> None:
     started = time.process_time()
-    with torch.inference_mode(), _private_watched() as private:
+    with torch.inference_mode():
         step = build(load_file(folder / "unet.safetensors"))
         prepared, wall = time.process_time(), time.perf_counter()
         # the unconditional branch gets a token of zeros
@@ -133,7 +103,6 @@ def _measure(folder: Path, build: Callable[[dict[str, Tensor]], Step], name: str
         "cpu_s": time.process_time() - prepared,
         "build_cpu_s": prepared - started,
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9,
-        "private_gb": private.peak_bytes / 1e9,
         "threads": torch.get_num_threads(),
     }
     sys.stdout.write(json.dumps(line) + "\n")

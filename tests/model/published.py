@@ -12,13 +12,14 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from small_models import randomise
-from torch import Tensor
+from torch import Tensor, nn
 
 from gcd_model.config import ImageEncoderConfig, ModelConfig, UNetConfig, VAEConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.networks import Networks
+from gcd_model.unet import VideoUNet
 from gcd_model.weights.load import convert_weights, inspect_weights, load_weights
-from gcd_model.weights.names import Levels, Naming, published_names, taken_apart
+from gcd_model.weights.names import GCD_UNET, Levels, Naming, published_names, taken_apart
 
 MANIFEST = Path(__file__).parents[2].parent / "shared" / "spec" / "checkpoint-manifest.json.gz"
 
@@ -70,10 +71,30 @@ def filled(config: ModelConfig = SMALL_GCD, seed: int = 0) -> Networks:
 
 def published_state(networks: Networks, naming: Naming) -> dict[str, Tensor]:
     """All weights by published name."""
-    levels, state = Levels.of(networks.config), dict[str, Tensor]()
-    for name, tensor in networks.state_dict().items():
-        state |= taken_apart(published_names(name, naming, levels), tensor.detach())
+    state = _renamed(networks.state_dict(), naming, Levels.of(networks.config))
     return {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in state.items()}
+
+
+def _renamed(weights: Mapping[str, Tensor], naming: Naming, levels: Levels) -> dict[str, Tensor]:
+    parts = (taken_apart(published_names(name, naming, levels), value.detach()) for name, value in weights.items())
+    return {name: tensor for part in parts for name, tensor in part.items()}
+
+
+def released_unet(unet: VideoUNet, *, gradients: bool = False) -> dict[str, Tensor]:
+    """Weights (or gradients, where there is one) as the released code calls them: `input_blocks.0.0.weight`."""
+    levels = Levels(attention=unet.config.attention, unet_blocks=unet.config.blocks_per_level)
+    values = {f"unet.{name}": each.grad if gradients else each for name, each in unet.named_parameters()}
+    renamed = _renamed({name: each for name, each in values.items() if each is not None}, "gcd", levels)
+    return {name.removeprefix(f"{GCD_UNET}."): value for name, value in renamed.items()}
+
+
+def diffusers_state(module: nn.Module, own: str, folder: str) -> dict[str, Tensor]:
+    """State of the diffusers (or transformers) module that corresponds to ours.
+
+    own: what `Networks` calls our module. folder: what precedes the names of theirs, "unet/".
+    """
+    weights = {f"{own}.{name}": value for name, value in module.state_dict().items()}
+    return {name.removeprefix(folder): each for name, each in _renamed(weights, "diffusers", Levels()).items()}
 
 
 def gcd_state(networks: Networks) -> dict[str, Tensor]:

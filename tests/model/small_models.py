@@ -161,8 +161,9 @@ def synthesize(synthesizer: Synthesizer, clip: Clip, path: Trajectory, options: 
 def as_loaded(synthesizer: Synthesizer) -> LoadedWeights:
     """What a file of a synthesizer's networks would give."""
     networks, traits = synthesizer.networks, synthesizer.traits
-    family = None if traits.family is None else traits.family.name
-    card = Card(name=traits.name, config=networks.config, family=family, move_time=traits.move_time, trained=False)
+    card = Card(
+        name=traits.name, config=networks.config, family=traits.family, move_time=traits.move_time, trained=False
+    )
     return LoadedWeights(card=card, networks=networks)
 
 

@@ -23,6 +23,7 @@ from gcd_model.errors import CheckpointError
 from gcd_model.loading import load_synthesizer
 from gcd_model.weights.adapter import DIFFUSION, Adapter, adapted, base_digest, carried_over, unshared
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_adapted, read_adapter
 from gcd_model.weights.save import write_adapter
 
@@ -41,7 +42,7 @@ def adapter(base: str | None = None) -> Adapter:
         rank=RANK,
         alpha=ALPHA,
         base=base or base_digest(filled(FIXED).state_dict()),
-        card=Card(name="steered", config=SMALL_GCD, family="kubric90", move_time=13),
+        card=Card(name="steered", config=SMALL_GCD, family=FAMILIES["kubric90"], move_time=13),
         tensors=factors | camera,
     )
 

@@ -3,10 +3,12 @@
 import json
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
+import torch
 from published import (
     SMALL_GCD,
     assert_same_weights,
@@ -20,11 +22,15 @@ from published import (
     write_svd,
 )
 from safetensors.torch import save_file
+from small_models import TINY, random_clip, tiny_synthesizer, tiny_traits
 
+from gcd_model import RenderOptions, SphericalDelta, convert_weights, load_synthesizer
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.networks import random_networks
+from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
-from gcd_model.weights.families import FamilyName, Provenance, combined, told_by_name, told_by_yaml
-from gcd_model.weights.load import digest, save_weights
+from gcd_model.weights.families import FAMILIES, FamilyName, Hints, told_by_name, told_by_yaml
+from gcd_model.weights.load import digest, load_weights, save_weights
 
 # --- the family ------------------------------------------------------------------------------------------------------
 
@@ -33,17 +39,17 @@ def test_the_family_follows_option_metadata_name_and_yaml_in_that_order(tmp_path
     path = write_gcd(tmp_path, "kubric_direct_max180.ckpt")
     path.with_suffix(".yaml").write_text("move_time: 13\ndelta_azimuth_range: [-90, 90]\n")
     report = inspect(path)
-    assert (report.family, report.told_by, report.move_time) == ("kubric180", "file name", 0)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric180"], "file name", 0)
     report = inspect(path, family="kubric90")
-    assert (report.family, report.told_by, report.move_time) == ("kubric90", "option", 0)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric90"], "option", 0)
     other = path.rename(tmp_path / "mine.ckpt")
     other.with_suffix(".yaml").write_text("move_time: 5\ndelta_azimuth_range: [-90, 90]\n")
     report = inspect(other)
-    assert (report.family, report.told_by, report.move_time) == ("kubric90", "yaml", 5)
-    card = Card(name="small", config=SMALL_GCD, family="kubric180", move_time=7)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric90"], "yaml", 5)
+    card = Card(name="small", config=SMALL_GCD, family=FAMILIES["kubric180"], move_time=7)
     save_weights(filled(), tmp_path / "kubric_gradual_max90.safetensors", card)
     report = inspect(tmp_path / "kubric_gradual_max90.safetensors")
-    assert (report.family, report.told_by, report.move_time) == ("kubric180", "metadata", 7)
+    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric180"], "metadata", 7)
 
 
 def test_an_unknown_family_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -120,7 +126,7 @@ def test_an_impossible_output_is_refused(tmp_path: Path, out: str) -> None:
 
 
 def own_file(tmp_path: Path, **metadata: str) -> Path:
-    card = Card(name="small", config=SMALL_GCD, family="kubric90", move_time=13).to_metadata()
+    card = Card(name="small", config=SMALL_GCD, family=FAMILIES["kubric90"], move_time=13).to_metadata()
     path = tmp_path / "ours.safetensors"
     save_file({k: v.contiguous() for k, v in filled().state_dict().items()}, path, metadata=card | metadata)
     return path
@@ -139,6 +145,7 @@ def tampered(**changes: object) -> str:
         {"gcd.config": tampered(shiny=1)},
         {"gcd.config": tampered(camera="none")},
         {"gcd.move_time": "soon"},
+        *({"gcd.uncertainty_scale": scale} for scale in ("much", "0", "nan")),
     ],
 )
 def test_damaged_metadata_is_refused(tmp_path: Path, metadata: dict[str, str]) -> None:
@@ -185,7 +192,7 @@ def test_published_names_tell_family_move_time_and_frames_and_others_nothing(
     names: list[str], family: FamilyName | None, move_time: int | None, frames: int | None
 ) -> None:
     told_by = None if family is None else "file name"
-    wanted = Provenance(family=family, move_time=move_time, frames=frames, told_by=told_by)
+    wanted = Hints(family=family, move_time=move_time, frames=frames, told_by=told_by)
     assert [told_by_name(name) for name in names] == [wanted] * len(names)
 
 
@@ -204,37 +211,70 @@ INLINE = ("delta_azimuth_range: [-{0}, {0}]", "delta_elevation_range: [ -{0}.0 ,
 BLOCK = ("delta_azimuth_range:\n    - -{0}\n    - {0}", "delta_elevation_range:\n      - -{0}.0\n      - {0}.0")
 
 
-@pytest.mark.parametrize("style", [INLINE, BLOCK], ids=["inline", "block"])
-@pytest.mark.parametrize(("azimuth", "elevation", "family"), [(90, 30, "kubric90"), (180, 60, "kubric180")])
-def test_angle_ranges_of_a_yaml_tell_the_family(
-    style: tuple[str, str], azimuth: int, elevation: int, family: str
-) -> None:
-    text = YAML.format(azimuth=style[0].format(azimuth), elevation=style[1].format(elevation), move_time=13)
-    assert told_by_yaml(text) == Provenance(family=family, move_time=13, told_by="yaml")
+DRIVING = "input_mode: ego_forward\noutput_mode: topdown1\nmove_time: 13\noutput_modality: {}\n"
+KUBRIC90, KUBRIC180 = (Hints(family=f"kubric{angle}", move_time=13, told_by="yaml") for angle in (90, 180))
 
 
-def test_ranges_that_contradict_each_other_or_no_family_tell_none() -> None:
-    for azimuth, elevation in ((90, 60), (45, 30)):
-        text = YAML.format(azimuth=INLINE[0].format(azimuth), elevation=INLINE[1].format(elevation), move_time=0)
-        assert told_by_yaml(text) == Provenance(move_time=0)
-
-
-def test_driving_views_and_modality_tell_the_driving_families() -> None:
-    text = "input_mode: ego_forward\noutput_mode: topdown1\nmove_time: 13\noutput_modality: {}\n"
-    assert told_by_yaml(text.format("rgb")).family == "driving"
-    assert told_by_yaml(text.format("segm")).family == "driving-semantic"
-    assert told_by_yaml(text.format("'segm'")).move_time == 13
+def ranges(style: tuple[str, str], azimuth: int, elevation: int) -> str:
+    return YAML.format(azimuth=style[0].format(azimuth), elevation=style[1].format(elevation), move_time=13)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "move_time: soon", "azimuth: [1, 2", "\x00\xff", "a: " + "-" * 200_000, " " * 200_000]
+    ("text", "told"),
+    [
+        (ranges(INLINE, 90, 30), KUBRIC90),
+        (ranges(BLOCK, 90, 30), KUBRIC90),
+        (ranges(INLINE, 180, 60), KUBRIC180),
+        (ranges(BLOCK, 180, 60), KUBRIC180),
+        (ranges(INLINE, 90, 60), Hints(move_time=13)),  # they contradict each other
+        (ranges(INLINE, 45, 30), Hints(move_time=13)),  # of no family
+        (DRIVING.format("rgb"), Hints(family="driving", move_time=13, told_by="yaml")),
+        (DRIVING.format("segm"), Hints(family="driving-semantic", move_time=13, told_by="yaml")),
+        (DRIVING.format("'segm'"), Hints(family="driving-semantic", move_time=13, told_by="yaml")),
+        *((text, Hints()) for text in ("", "move_time: soon", "azimuth: [1, 2", "\x00\xff", "a: " + "-" * 200_000)),
+        (" " * 200_000, Hints()),
+    ],
 )
-def test_yaml_that_says_nothing_is_no_error(text: str) -> None:
-    assert told_by_yaml(text) == Provenance()
+def test_angle_ranges_or_driving_views_of_a_yaml_tell_the_family_and_others_nothing(text: str, told: Hints) -> None:
+    assert told_by_yaml(text) == told
 
 
 def test_each_fact_comes_from_the_first_that_knows_it() -> None:
-    named = Provenance(family="kubric180", move_time=0, told_by="file name")
-    assert combined(Provenance(), named, Provenance(family="kubric90", move_time=13, told_by="yaml")) == named
-    option = Provenance(family="kubric90", told_by="option")
-    assert combined(option, named) == Provenance(family="kubric90", move_time=0, told_by="option")
+    named = Hints(family="kubric180", move_time=0, told_by="file name")
+    assert Hints().over(named, Hints(family="kubric90", move_time=13, told_by="yaml")) == named
+    option = Hints(family="kubric90", told_by="option")
+    assert option.over(named) == Hints(family="kubric90", move_time=0, told_by="option")
+
+
+CARD = Card(name="small", config=TINY, family=FAMILIES["kubric90"], move_time=2, uncertainty_scale=1.75)
+
+
+def test_the_uncertainty_scale_comes_with_the_weights_and_converting_keeps_or_replaces_it(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "small.safetensors"
+    save_weights(random_networks(TINY, seed=0), file, CARD)
+    assert load_weights(file).card.uncertainty_scale == 1.75
+    assert load_synthesizer(file, device="cpu").traits.uncertainty_scale == 1.75
+    kept = convert_weights(file, tmp_path / "kept.safetensors", dtype="float16")
+    given = convert_weights(file, tmp_path / "given.safetensors", uncertainty_scale=3.0)
+    assert (kept.uncertainty_scale, given.uncertainty_scale) == (1.75, 3.0)
+    assert_same_weights(load_weights(tmp_path / "given.safetensors").networks, load_weights(file).networks)
+    for scale in (0.0, float("nan")):
+        with pytest.raises(OptionError):
+            convert_weights(file, tmp_path / "bad.safetensors", uncertainty_scale=scale)
+    assert not (tmp_path / "bad.safetensors").exists()
+
+
+def test_views_carry_the_scale_of_their_weights() -> None:
+    plain = tiny_synthesizer()
+    measured = Synthesizer(plain.networks, replace(tiny_traits(), uncertainty_scale=2.5))
+    trajectory, options = plain.traits.plan_view(SphericalDelta(azimuth_deg=20.0)), RenderOptions(samples=2, steps=1)
+    (view,) = measured.render(measured.encode(random_clip()), [trajectory], options)
+    (other,) = plain.render(plain.encode(random_clip()), [trajectory], options)
+    assert view.std is not None
+    assert view.uncertainty is not None
+    assert torch.equal(view.samples, other.samples)
+    assert torch.equal(view.uncertainty, 2.5 * view.std)
+    assert other.uncertainty is None
+    assert replace(view, samples=view.samples[:1]).uncertainty is None

@@ -27,6 +27,7 @@ from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import Networks, empty_networks
 from gcd_model.weights.adapter import CAMERA
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.infer import LEFTOVERS
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state, write_published
@@ -35,7 +36,7 @@ NARROW_HEADS = msgspec.structs.replace(SMALL_GCD, unet=msgspec.structs.replace(S
 
 
 def card(config: ModelConfig, family: str = "kubric90") -> Card:
-    return Card(name="mine", config=config, family=family, move_time=min(7, config.frames - 1))
+    return Card(name="mine", config=config, family=FAMILIES[family], move_time=min(7, config.frames - 1))
 
 
 def written(path: Path, networks: Networks, family: str = "kubric90", overwrite: bool = False) -> Path:
@@ -100,7 +101,7 @@ def test_leftovers_of_the_file_it_came_from_are_carried_over(tmp_path: Path) -> 
 
 def test_the_base_model_converts_too_and_half_precision_spares_the_decoder(tmp_path: Path) -> None:
     report = convert(write_svd(tmp_path), tmp_path / "half.ckpt", layout="gcd-ckpt", dtype="float16")
-    assert (report.layout, report.family) == ("gcd-ckpt", "svd")
+    assert (report.layout, report.family) == ("gcd-ckpt", FAMILIES["svd"])
     precisions = {network.name: network.dtypes for network in report.networks}
     assert precisions["unet"] == ("float16",)
     assert precisions["decoder"] == ("float32",)

@@ -8,7 +8,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics
-from gcd_model.live.depth_net import pixel_rays
 from gcd_model.live.ego_motion import EgoMotion, Motion
 
 LENS = Intrinsics.from_hfov(80.0, 192, 128)
@@ -28,7 +27,7 @@ def pose(right: float = 0.0, ahead: float = 0.0, yaw_deg: float = 0.0) -> Tensor
 
 def filmed(world_from_camera: Tensor) -> tuple[Tensor, Tensor]:
     """A wall, a floor and a side wall, each painted with smooth noise: picture [3, H, W] and exact depth [H, W]."""
-    x, y = pixel_rays(LENS).double()
+    x, y = LENS.rays().double()
     rays = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ world_from_camera[:3, :3].T
     eye = world_from_camera[:3, 3]
     depth = torch.full((LENS.height, LENS.width), math.inf, dtype=torch.float64)
@@ -51,10 +50,16 @@ def texture(point: Tensor, normal: Tensor, seed: int) -> Tensor:
     return torch.nn.functional.grid_sample(noise, place[None], padding_mode="reflection", align_corners=False)[0, 0]
 
 
+def step(ego: EgoMotion, picture: Tensor, depth: Tensor, static: Tensor, odometry: Tensor | None = None) -> Motion:
+    motion = ego.follow(picture, LENS, odometry)
+    ego.settle(depth, static)
+    return motion
+
+
 def drive(poses: list[Tensor], odometry: list[Tensor | None] | None = None) -> list[Motion]:
     ego = EgoMotion()
     given = odometry or [None] * len(poses)
-    return [ego.step(*filmed(each), STATIC, LENS, known) for each, known in zip(poses, given, strict=True)]
+    return [step(ego, *filmed(each), STATIC, known) for each, known in zip(poses, given, strict=True)]
 
 
 @pytest.mark.parametrize(("right", "ahead", "yaw_deg"), [(0.0, 0.25, 0.0), (0.15, 0.0, 0.0), (0.0, 0.1, 1.5)])
@@ -78,7 +83,7 @@ def test_a_camera_that_stands_does_not_drift_in_noise() -> None:
     for _ in range(8):
         noisy = picture + 0.02 * torch.randn(picture.shape, generator=random)
         wrong = depth * torch.exp(0.04 * torch.randn(depth.shape, generator=random))
-        motion = ego.step(noisy.clamp(-1, 1), wrong, STATIC, LENS)
+        motion = step(ego, noisy.clamp(-1, 1), wrong, STATIC)
         assert torch.equal(motion.world_from_camera, HERE)
         assert not motion.lost
 
@@ -91,14 +96,14 @@ def test_things_in_motion_do_not_move_a_camera_that_stands() -> None:
     for n in range(6):
         passing = picture.clone()
         passing[:, 40:100, 60:150] = picture[:, 40:100, 60:150].roll(3 * n, dims=2)
-        assert torch.equal(ego.step(passing, depth, static, LENS).world_from_camera, HERE)
+        assert torch.equal(step(ego, passing, depth, static).world_from_camera, HERE)
 
 
 def test_depth_of_another_scale_scales_the_motion() -> None:
     ego = EgoMotion()
     for n in range(5):
         picture, depth = filmed(pose(ahead=0.2 * n))
-        motion = ego.step(picture, depth * 1.1, STATIC, LENS)
+        motion = step(ego, picture, depth * 1.1, STATIC)
     assert float(motion.world_from_camera[2, 3]) == pytest.approx(0.88, rel=0.02)
 
 
@@ -136,9 +141,7 @@ def test_without_odometry_in_between_the_pictures_carry_on() -> None:
     assert_close(motions[-1].world_from_camera, poses[-1], atol=0.02, rtol=0)
 
 
-@pytest.mark.parametrize(
-    "jump", [pose(ahead=30.0), pose(yaw_deg=120.0), torch.full((4, 4), math.nan), torch.diag(torch.full((4,), 2.0))]
-)
+@pytest.mark.parametrize("jump", [pose(ahead=30.0), pose(yaw_deg=120.0), torch.full((4, 4), math.nan)])
 def test_odometry_that_is_no_motion_is_refused(jump: Tensor) -> None:
     motions = drive([HERE] * 2, [HERE, jump.double()])
     assert motions[1].lost
@@ -149,7 +152,7 @@ def test_a_black_frame_is_lost_and_the_world_begins_anew() -> None:
     ego = EgoMotion()
     frames = [filmed(pose(ahead=0.2 * n)) for n in range(5)]
     black = (torch.full_like(frames[0][0], -1.0), frames[0][1])
-    motions = [ego.step(*frame, STATIC, LENS) for frame in (*frames[:2], black, *frames[2:])]
+    motions = [step(ego, *frame, STATIC) for frame in (*frames[:2], black, *frames[2:])]
     assert [motion.lost is not None for motion in motions] == [False, False, True, True, False, False]
     assert torch.equal(motions[3].world_from_camera, HERE)
     assert_close(motions[5].world_from_camera, pose(ahead=0.4), atol=0.02, rtol=0)
@@ -159,15 +162,5 @@ def test_without_any_depth_the_motion_is_unknown() -> None:
     ego = EgoMotion()
     picture, depth = filmed(HERE)
     holes = torch.where(torch.arange(LENS.width) % 2 == 0, 0.0, math.nan).expand_as(depth)
-    ego.step(picture, holes, STATIC, LENS)
-    assert ego.step(picture, holes, STATIC, LENS).lost
-
-
-def test_reset_begins_a_world() -> None:
-    ego = EgoMotion()
-    for n in range(3):
-        ego.step(*filmed(pose(ahead=0.2 * n)), STATIC, LENS)
-    ego.reset()
-    motion = ego.step(*filmed(pose(ahead=3.0)), STATIC, LENS)
-    assert torch.equal(motion.world_from_camera, HERE)
-    assert not motion.lost
+    step(ego, picture, holes, STATIC)
+    assert step(ego, picture, holes, STATIC).lost

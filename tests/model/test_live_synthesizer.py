@@ -39,6 +39,7 @@ from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.networks import LiveNetworks, random_networks
 from gcd_model.weights.card import packed, unpacked
+from gcd_model.weights.families import LIVE
 from gcd_model.weights.load import load_weights
 
 
@@ -77,10 +78,8 @@ def test_features_joined_frame_by_frame_are_those_encoded_at_once(live: LiveSynt
         for t in range(FRAMES)
     ]
     joined = parts[0].followed_by(*parts[1:])
-    assert whole.geometry is not None
-    assert joined.geometry is not None
     for name in ("metres", "stated"):
-        assert torch.equal(getattr(whole.geometry, name), getattr(joined.geometry, name))
+        assert torch.equal(getattr(whole, name), getattr(joined, name))
     assert joined.frames == FRAMES
     options = RenderOptions(seed=3)
     same(live.render(whole, [path()], options)[0], live.render(joined, [path()], options)[0])
@@ -90,9 +89,9 @@ def test_features_joined_frame_by_frame_are_those_encoded_at_once(live: LiveSynt
 def test_the_lens_is_the_clips_then_the_mounts_then_the_forward_cameras(live: LiveSynthesizer) -> None:
     bare = room(1, lens=None)
     for clip, wanted in ((room(1), 70.0), (replace(bare, mount=CameraMount(hfov_deg=60.0)), 60.0), (bare, 85.0)):
-        geometry = live.encode(clip).geometry
-        assert geometry is not None
-        assert geometry.lens.hfov_deg == pytest.approx(wanted)
+        lens = live.encode(clip).lens
+        assert lens is not None
+        assert lens.hfov_deg == pytest.approx(wanted)
 
 
 # Bad input at the door.
@@ -288,7 +287,7 @@ def test_weights_survive_their_file(tmp_path: Path) -> None:
     for name, tensor in networks.state_dict().items():
         assert torch.equal(loaded.networks.state_dict()[name], tensor.half().float())
     report = inspect_weights(tmp_path / "mine.safetensors")
-    assert (report.family, report.config, report.trained) == ("live", LIVE_TINY, True)
+    assert (report.family, report.config, report.trained) == (LIVE, LIVE_TINY, True)
     assert [each.name for each in report.networks] == ["depth", "paint", "familiarity"]
     assert report.parameters == sum(each.numel() for each in networks.state_dict().values())
     converted = convert_weights(tmp_path / "mine.safetensors", tmp_path / "wide.safetensors", dtype="float32")
@@ -312,6 +311,11 @@ HOSTILE: dict[str, object] = {
     "no widths": {"depth": {"widths": [0, 0, 0]}},
     "frames": {"frames": -3},
     "size": {"height": 33},
+    "area": {"height": 8192, "width": 8192},
+    "steps": {"steps": 1000},
+    "sigma": {"sigma_max": 1e300},
+    "near": {"depth": {"nearest_m": 1e-300}},
+    "beyond the sky": {"depth": {"farthest_m": 1e30}},
     "memory": {"memory": 10**12},
     "classes": {"classes": []},
     "far": {"depth": {"farthest_m": 0.1}},

@@ -1,5 +1,8 @@
 """The live view frame by frame: state, reset, lenses, and what may be called seen."""
 
+from dataclasses import fields
+from typing import Any
+
 import msgspec
 import pytest
 import torch
@@ -7,14 +10,11 @@ from live_room import FRAMES, HEIGHT, LENS, WIDTH, one_thread, path, room  # noq
 from torch import Tensor
 from torch.testing import assert_close
 
-from gcd_model import Intrinsics, OptionError, PoseError, RenderOptions, load_synthesizer
-from gcd_model.errors import ShapeError
-from gcd_model.live.config import LIVE_TINY, SKY_M, LiveConfig
-from gcd_model.live.depth_net import Reference
-from gcd_model.live.eyes import Eyes
-from gcd_model.live.memory import SeenWorld
-from gcd_model.live.painter import LiveFrame, LiveView
-from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model import Intrinsics, RenderOptions, SeenFrame, load_synthesizer
+from gcd_model.live.config import LIVE_TINY, SKY_M, DepthConfig
+from gcd_model.live.depth_net import DepthNet, Reference, depth_inputs, read_depth, sweep_costs
+from gcd_model.live.eyes import LONGEST, Eyes, References, SeenWorld
+from gcd_model.live.synthesizer import LiveSynthesizer, Painter, ViewFrame
 from gcd_model.networks import LiveNetworks, random_networks
 
 HERE = torch.eye(4, dtype=torch.float64)
@@ -31,21 +31,27 @@ def aside(x: float) -> Tensor:
     return pose
 
 
-def steps(view: LiveView, frames: range, *, x: float = 0.5) -> list[LiveFrame]:
+class View:
+    """The live model's three parts in a row."""
+
+    def __init__(self, networks: LiveNetworks) -> None:
+        self.eyes, self.world, self.painter = Eyes(networks), SeenWorld(networks.config), Painter(networks, steps=1)
+
+    def step(self, frame: Tensor, pose: Tensor, **known: Any) -> tuple[SeenFrame, ViewFrame]:
+        seen = self.eyes.see(frame, **{"lens": LENS} | known)
+        return seen, self.painter.paint(self.world.place(seen, [pose]))[0]
+
+
+def steps(view: View, frames: range) -> list[ViewFrame]:
     clip = room()
     assert clip.depth is not None
     assert clip.odometry is not None
-    return [
-        view.step(clip.video[t], [aside(x)], lens=LENS, depth=clip.depth[t], odometry=clip.odometry[t]) for t in frames
-    ]
+    return [view.step(clip.video[t], aside(0.5), depth=clip.depth[t], odometry=clip.odometry[t])[1] for t in frames]
 
 
-def assert_same(a: LiveFrame, b: LiveFrame, tolerance: float = 0.0) -> None:
-    for mine, other in zip(a.views, b.views, strict=True):
-        assert torch.equal(mine.visibility, other.visibility)
-        assert torch.equal(mine.classes, other.classes)
-        for name in ("picture", "inverse_depth", "log_variance"):
-            assert_close(getattr(mine, name), getattr(other, name), rtol=tolerance, atol=tolerance)
+def assert_same(mine: ViewFrame, other: ViewFrame) -> None:
+    for field in fields(mine):
+        assert torch.equal(getattr(mine, field.name), getattr(other, field.name))
 
 
 def test_a_window_is_its_frames_when_they_stream(networks: LiveNetworks) -> None:
@@ -65,36 +71,20 @@ def test_a_window_is_its_frames_when_they_stream(networks: LiveNetworks) -> None
     assert_close(streamed(), window.video, rtol=0, atol=1e-5)
 
 
-def test_after_a_reset_nothing_is_known_of_what_was_before(networks: LiveNetworks) -> None:
-    used, fresh = LiveView(networks), LiveView(networks)
-    steps(used, range(4))
-    used.reset()
-    for again, first in zip(steps(used, range(3)), steps(fresh, range(3)), strict=True):
-        assert_same(again, first)
-
-
 def test_another_lens_is_another_camera_of_which_nothing_is_known_yet(networks: LiveNetworks) -> None:
-    used, wide = LiveView(networks), Intrinsics.from_hfov(100.0, 2 * WIDTH, 2 * HEIGHT)
+    used, wide = View(networks), Intrinsics.from_hfov(100.0, 2 * WIDTH, 2 * HEIGHT)
     steps(used, range(3))
     frame = torch.zeros(3, 2 * HEIGHT, 2 * WIDTH)
-    again, first = (view.step(frame, [aside(0.5)], lens=wide) for view in (used, LiveView(networks)))
+    (seen, again), (_, first) = (view.step(frame, aside(0.5), lens=wide) for view in (used, View(networks)))
     assert_same(again, first)
-    assert again.lost is None
-
-
-def test_looking_ahead_changes_no_state(networks: LiveNetworks) -> None:
-    looks, plain = LiveView(networks), LiveView(networks)
-    clip = room()
-    for t in range(3):
-        looks.eyes.look(clip.video[13 - t], LENS)
-        assert_same(*(steps(each, range(t, t + 1))[0] for each in (looks, plain)))
+    assert seen.lost is None
 
 
 def test_depth_looks_at_an_earlier_frame_where_there_is_one(networks: LiveNetworks) -> None:
     clip = room()
     assert clip.odometry is not None
-    view = LiveView(networks)
-    made = [view.step(clip.video[t], [HERE], lens=LENS, odometry=clip.odometry[t]).geometry for t in range(3)]
+    view = View(networks)
+    made = [view.step(clip.video[t], HERE, odometry=clip.odometry[t])[0].geometry for t in range(3)]
     alone = Eyes(networks).look(clip.video[2], LENS)
     move = torch.linalg.inv(clip.odometry[0]) @ clip.odometry[2]
     compared = view.eyes.look(
@@ -108,10 +98,10 @@ def test_depth_looks_at_an_earlier_frame_where_there_is_one(networks: LiveNetwor
 def test_a_view_from_the_source_shows_the_source_through_any_lens(hfov_deg: float) -> None:
     """Untrained, the paint network adds nothing to the splat."""
     torch.manual_seed(0)
-    view = LiveView(LiveNetworks(LIVE_TINY))
+    view = View(LiveNetworks(LIVE_TINY))
     lens = Intrinsics.from_hfov(hfov_deg, WIDTH, HEIGHT)
     frame = room().video[0]
-    (seen,) = view.step(frame, [HERE], lens=lens, depth=torch.full((HEIGHT, WIDTH), 4.0), odometry=HERE).views
+    _, seen = view.step(frame, HERE, lens=lens, depth=torch.full((HEIGHT, WIDTH), 4.0), odometry=HERE)
     inside = (slice(1, -1), slice(1, -1))
     assert bool((seen.visibility[inside] == 2).all())
     assert_close(seen.picture[:, *inside], frame[:, *inside], rtol=0, atol=1e-3)
@@ -127,11 +117,11 @@ def test_what_points_do_not_cover_is_never_marked_seen(networks: LiveNetworks) -
     bias.data[-3:] = torch.tensor([-1e6, 0.0, 1e6])
     clip = room()
     depth = torch.where(torch.arange(WIDTH) < WIDTH // 2, 3.0, 0.0).expand(HEIGHT, WIDTH).contiguous()
-    view = LiveView(voting)
-    world = SeenWorld(classes=len(LIVE_TINY.classes), capacity=20_000, oldest_frames=50)
+    view = View(voting)
+    world = SeenWorld(LIVE_TINY)
     for t in range(3):
         target = aside(0.3)
-        (made,) = view.step(clip.video[t], [target], lens=LENS, depth=depth, odometry=HERE).views
+        _, made = view.step(clip.video[t], target, depth=depth, odometry=HERE)
         seen = view.eyes.look(clip.video[t], LENS, depth=depth)
         world.look(clip.video[t], seen.metres, seen.labels, seen.static, LENS, HERE)
         covered = world.splat(target, LENS).coverage >= 0.5
@@ -143,10 +133,10 @@ def test_what_points_do_not_cover_is_never_marked_seen(networks: LiveNetworks) -
 @pytest.mark.parametrize("carries", [True, False])
 def test_what_was_painted_is_seen_again_only_where_the_weights_carry_it(carries: bool) -> None:
     config = msgspec.structs.replace(LIVE_TINY, carry_painted=carries, memory=0)
-    view = LiveView(random_networks(config, seed=2))
+    view = View(random_networks(config, seed=2))
     frame = room().video[0]
     half = torch.where(torch.arange(WIDTH) < WIDTH // 2, 3.0, 0.0).expand(HEIGHT, WIDTH)
-    first, second = (view.step(frame, [aside(0.3)], lens=LENS, depth=half, odometry=HERE).views[0] for _ in range(2))
+    first, second = (view.step(frame, aside(0.3), depth=half, odometry=HERE)[1] for _ in range(2))
     assert bool((first.visibility == 0).any())
     changed = float((first.picture - second.picture).abs().median())  # here and there a class, by the plane sweep
     assert (changed > 1e-3) == carries, changed
@@ -163,31 +153,70 @@ def test_holes_are_filled_by_nobody_but_the_sky(sky: float, metres: float) -> No
     assert bool((seen.metres == metres).all())
 
 
-def test_what_cannot_be_is_refused(networks: LiveNetworks) -> None:
-    view, frame = LiveView(networks), room().video[0]
-    with pytest.raises(ShapeError):
-        view.eyes.look(frame, Intrinsics.from_hfov(70.0, 96, 64))
-    with pytest.raises(ShapeError):
-        view.eyes.look(frame, LENS, depth=torch.ones(HEIGHT, WIDTH + 32))
-    with pytest.raises(ShapeError):
-        view.eyes.look(frame[:, :, :40], Intrinsics.from_hfov(70.0, 40, HEIGHT))
-    with pytest.raises(PoseError):
-        view.step(frame, [2 * HERE], lens=LENS)
-    with pytest.raises(OptionError):
-        LiveView(networks, steps=0)
+CONFIG = DepthConfig(bins=32, nearest_m=1.0, farthest_m=10.0)
 
 
-@pytest.mark.parametrize(
-    "stated",
-    [
-        {"height": 8192, "width": 8192},
-        {"steps": 1000},
-        {"sigma_max": 1e300},
-        {"depth": {"nearest_m": 1e-300}},
-        {"depth": {"farthest_m": 1e30}},
-    ],
-    ids=str,
-)
-def test_numbers_that_no_camera_and_no_sampler_has_are_refused(stated: dict[str, object]) -> None:
-    with pytest.raises((OptionError, msgspec.ValidationError)):
-        msgspec.convert(stated, LiveConfig)
+def reference(frames: int) -> Reference:
+    """The room's wall is 3 m away; its camera goes to the right."""
+    clip = room()
+    assert clip.odometry is not None
+    move = torch.linalg.inv(clip.odometry[0]) @ clip.odometry[frames]
+    return Reference(picture=clip.video[0], reference_from_camera=move)
+
+
+def test_the_true_depth_costs_least() -> None:
+    costs = sweep_costs(room().video[3], LENS, reference(3), CONFIG)[: CONFIG.bins - 1, 2:-2, 2:-4].mean(dim=(1, 2))
+    best = 1.0 * (10.0 / 1.0) ** ((int(costs.argmin()) + 0.5) / (CONFIG.bins - 1))
+    assert best == pytest.approx(3.0, rel=0.08)
+    assert costs.min() < 0.5 * costs.median()
+
+
+def test_a_network_that_trusts_the_sweep_reads_its_depth_off_it() -> None:
+    net = DepthNet(DepthConfig(widths=(8, 16), bins=32, nearest_m=1.0, farthest_m=10.0), 3).eval()
+    bias = net.head.out.bias
+    assert bias is not None
+    with torch.no_grad():
+        net.head.out.weight.zero_()
+        bias.zero_()
+        bias[-1] = 50.0
+        picture = room().video[3]
+        inputs = depth_inputs(picture[None], LENS.rays()[None], torch.zeros(1, LENS.height, LENS.width))
+        costs = sweep_costs(picture, LENS, reference(3), net.config)[None]
+        output = net(inputs, costs)
+        some = torch.randint(0, LENS.height * LENS.width, (1, 40))
+        sampled = net(inputs, costs, some)
+    metres = read_depth(output, net.config).metres[0, 4:-4, 4:-8]
+    assert ((metres / 3.0 - 1).abs() < 0.1).float().mean() > 0.8
+    whole = output.logits.flatten(2).gather(2, some[:, None].expand(-1, 32, -1))
+    assert_close(sampled.logits[..., 0], whole)
+
+
+def test_what_the_earlier_frame_did_not_see_costs_the_same_at_any_depth() -> None:
+    away = Reference(picture=room().video[0], reference_from_camera=aside(100.0))
+    made = sweep_costs(room().video[3], LENS, away, CONFIG)[: CONFIG.bins - 1]
+    assert bool((made == 1.0).all())
+
+
+def test_the_oldest_frame_from_which_the_scene_looks_alike_is_chosen() -> None:
+    kept, metres = References(), torch.full((4, 4), 2.0)
+    metres[0] = 1000.0
+    assert kept.chosen(HERE) is None
+    for i in range(10):
+        kept.add(torch.full((3, 4, 4), float(i)), aside(0.2 * i), metres)
+    chosen = kept.chosen(aside(2.0))
+    assert chosen is not None
+    assert float(chosen.reference_from_camera[0, 3]) == pytest.approx(0.6)  # at most LONGEST of 2 m
+    assert LONGEST * 2.0 >= 0.6
+    standing = References()
+    for i in range(10):
+        standing.add(torch.full((3, 4, 4), float(i)), HERE, metres)
+    still = standing.chosen(HERE)
+    assert still is not None
+    assert float(still.picture[0, 0, 0]) == 4.0  # the oldest of the six that are kept
+
+
+def test_one_depth_everywhere_is_a_median_and_nothing_but_sky_is_none() -> None:
+    for metres, moved, known in ((2.0, 0.5, True), (2.0, 0.7, False), (1000.0, 0.1, False), (0.0, 0.1, False)):
+        kept = References()
+        kept.add(torch.zeros(3, 4, 4), HERE, torch.full((4, 4), metres))
+        assert (kept.chosen(aside(moved)) is not None) == known

@@ -5,7 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from diffusers.models.autoencoders.autoencoder_kl_temporal_decoder import AutoencoderKLTemporalDecoder
-from naming import diffusers_state
+from published import diffusers_state
 from small_models import draw, randomise, relative_error
 from torch import Tensor, nn
 from torch.testing import assert_close

@@ -27,6 +27,7 @@ from gcd_model.loading import load_synthesizer
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import digest
 
 
@@ -37,18 +38,17 @@ class TorchGraphs:
         self.graphs = {graph.name: graph for graph in graphs(synthesizer.networks)}
         self.runs: list[str] = []
 
-    def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def run(self, name: str, *inputs: Tensor) -> Tensor:
         graph = self.graphs[name]
         self.runs.append(name)
         assert [each.shape for each in inputs] == [each.shape for each in graph.inputs.values()], name
-        made = graph.module(*inputs)
-        return made if isinstance(made, tuple) else (made,)
+        return graph.module(*inputs)
 
 
 def engined(synthesizer: Synthesizer) -> tuple[Synthesizer, TorchGraphs]:
     """The same model, clip by clip."""
-    found, config = TorchGraphs(synthesizer), synthesizer.traits.config
-    return Synthesizer(empty_networks(config), synthesizer.traits, OnnxEngine(found, config)), found
+    found, networks = TorchGraphs(synthesizer), empty_networks(synthesizer.traits.config)
+    return Synthesizer(networks, synthesizer.traits, OnnxEngine(found, networks)), found
 
 
 @pytest.mark.parametrize(("solver", "runs", "bound"), [("euler", 3 * 4 + 8, 1e-5), ("heun", 5 * 4 + 2 * 8, 1e-4)])
@@ -95,7 +95,7 @@ def test_tensors_go_in_by_order_and_whoever_looks_between_layers_looks_between_g
     sessions, seen = Sessions(one_graph(tmp_path)), []
     hook = torch.nn.modules.module.register_module_forward_pre_hook(lambda module, _: seen.append(module))
     try:
-        (made,) = sessions.run("decoder", torch.tensor([1.0, 2.0]), torch.tensor([[10.0, 0.0], [20.0, 0.0]])[:, 0])
+        made = sessions.run("decoder", torch.tensor([1.0, 2.0]), torch.tensor([[10.0, 0.0], [20.0, 0.0]])[:, 0])
     finally:
         hook.remove()
     assert made.tolist() == [11.0, 22.0]
@@ -142,7 +142,7 @@ def test_the_cpu_comes_last_and_tensorrt_keeps_what_it_built(tmp_path: Path) -> 
 
 
 def manifest(*files: FileRecord, height: int = TINY.height) -> Manifest:
-    card = Card(name="tiny", config=structs.replace(TINY, height=height), family="kubric90", move_time=2)
+    card = Card(name="tiny", config=structs.replace(TINY, height=height), family=FAMILIES["kubric90"], move_time=2)
     return Manifest(
         format=FORMAT,
         card=card.to_metadata(),

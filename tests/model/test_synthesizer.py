@@ -1,5 +1,6 @@
 """The door: what `encode` and `render` promise, on the smallest network that has every part, and on its variants."""
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,8 +12,14 @@ from small_models import TINY, draw, random_clip, relative_error, synthesize, ti
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model.clip import Augmentation, Clip, View
-from gcd_model.conditioning import SourceFeatures
+from gcd_model.clip import Augmentation, Clip
+from gcd_model.conditioning import (
+    CameraEmbedder,
+    SourceFeatures,
+    relative_pose_features,
+    spherical_features,
+    with_unconditional,
+)
 from gcd_model.config import ModelConfig, SamplingConfig
 from gcd_model.diffusion import RenderOptions, unit_noise
 from gcd_model.errors import Cancelled, ModelError, NonFiniteError, OptionError, ShapeError
@@ -79,14 +86,6 @@ def test_the_uncertainty_is_the_population_deviation_over_samples_averaged_over_
     assert_close(view.std, expected)
     assert view.std.max() > 0
     assert synthesize(synthesizer, random_clip(), path(synthesizer)).std is None
-
-
-def test_the_same_seed_gives_the_same_view_and_another_seed_another(synthesizer: Synthesizer) -> None:
-    def view(seed: int) -> View:
-        return synthesize(synthesizer, random_clip(), path(synthesizer), RenderOptions(seed=seed))
-
-    assert torch.equal(view(3).samples, view(3).samples)
-    assert not torch.allclose(view(3).latents, view(4).latents, atol=1e-3)
 
 
 def test_injected_noise_reproduces_the_draws_it_stands_for(synthesizer: Synthesizer) -> None:
@@ -269,8 +268,8 @@ def test_without_a_family_the_motion_number_must_be_given() -> None:
 
 def test_features_of_another_kind_are_not_joined() -> None:
     latents = torch.zeros(2, 4, 1, 1)
-    plain = SourceFeatures(tokens=None, latents=latents, extra=None, fps=12.0, augmentation=0.02)
-    for other in (replace(plain, tokens=torch.zeros(2, 5)), replace(plain, extra=latents), replace(plain, fps=6.0)):
+    plain = SourceFeatures(tokens=None, latents=latents, fps=12.0, augmentation=0.02)
+    for other in (replace(plain, tokens=torch.zeros(2, 5)), replace(plain, fps=6.0)):
         with pytest.raises(ShapeError):
             plain.followed_by(other)
 
@@ -278,16 +277,6 @@ def test_features_of_another_kind_are_not_joined() -> None:
 def with_unet(**changes: object) -> ModelConfig:
     """TINY with other fields in its U-Net."""
     return msgspec.structs.replace(TINY, unet=msgspec.structs.replace(TINY.unet, **changes))
-
-
-@pytest.mark.parametrize("channels", [0, 3])
-def test_a_checkpoint_with_extra_condition_channels_wants_exactly_those(channels: int) -> None:
-    synthesizer = tiny_synthesizer(with_unet(condition_channels=6))
-    extra = draw(3, channels, *LATENTS[2:]) if channels else None
-    with pytest.raises(ShapeError):
-        synthesizer.encode(random_clip(), extra=extra)
-    features = synthesizer.encode(random_clip(), extra=draw(3, 2, *LATENTS[2:]))
-    assert synthesizer.render(features, [path(synthesizer)])[0].samples.isfinite().all()
 
 
 def test_a_model_without_image_tower_has_no_tokens_and_still_renders() -> None:
@@ -358,3 +347,60 @@ def test_a_render_at_another_number_of_frames_levels_and_latent_channels_has_the
 def test_parts_that_do_not_fit_together_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises(OptionError):
         make()
+
+
+def test_angles_become_cosines_and_sines_of_one_two_and_four_times_in_radians_and_the_radius_stays() -> None:
+    azimuth, elevation = math.radians(30.0), math.radians(-10.0)
+    expected = [
+        function(multiple * angle)
+        for angle in (azimuth, elevation)
+        for multiple in (1, 2, 4)
+        for function in (math.cos, math.sin)
+    ]
+    features = spherical_features(torch.tensor([[30.0, -10.0, 1.5]], dtype=torch.float64))
+    assert_close(features, torch.tensor([[*expected, 1.5]]))
+    recorded = [0.866025, 0.5, 0.5, 0.866025, -0.5, 0.866025]  # worked out by hand for 30 degrees
+    assert_close(features[0, :6], torch.tensor(recorded), atol=1e-6, rtol=0)
+
+
+def test_relative_poses_become_their_top_three_rows_row_by_row() -> None:
+    poses = torch.arange(32, dtype=torch.float64).reshape(2, 4, 4)
+    expected = [list(range(12)), list(range(16, 28))]
+    assert relative_pose_features(poses).tolist() == expected
+    assert relative_pose_features(poses).dtype == torch.float32
+
+
+def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:
+    free = pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+    with pytest.raises(ShapeError):
+        CameraEmbedder("spherical", 5)(free)
+
+
+@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("rows", [draw(3, 5), draw(3, 4, 2, 3)], ids=["tokens", "latents"])
+def test_the_unconditional_branch_comes_first_and_sees_zeros_in_both_image_streams(rows: Tensor, views: int) -> None:
+    both = with_unconditional(rows, views, True).unflatten(0, (2, views, 3))
+    assert not both[0].any()
+    assert torch.equal(both[1], rows.expand_as(both[1]))
+    assert torch.equal(with_unconditional(rows, views, False), both[1].flatten(0, 1))
+
+
+def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_and_not_scaled() -> None:
+    synthesizer, clip = tiny_synthesizer(), random_clip()
+    noise = draw(*clip.video.shape, seed=7)
+    features = synthesizer.encode(clip, Augmentation(strength=0.3, noise=noise))
+    with torch.inference_mode():
+        posterior = synthesizer.networks.condition_encoder(clip.video + 0.3 * noise)
+    assert TINY.vae.scale == 0.18215
+    assert_close(features.latents, posterior.mean)
+    assert features.augmentation == 0.3
+
+
+def test_the_image_tower_sees_the_frames_clean() -> None:
+    synthesizer, clip = tiny_synthesizer(), random_clip()
+    clean = synthesizer.encode(clip, Augmentation(strength=0.0))
+    noisy = synthesizer.encode(clip, Augmentation(strength=0.5))
+    assert clean.tokens is not None
+    assert noisy.tokens is not None
+    assert torch.equal(clean.tokens, noisy.tokens)
+    assert not torch.allclose(clean.latents, noisy.latents)

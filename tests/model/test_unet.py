@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from itertools import compress
 from typing import Any
 
 import msgspec
@@ -10,8 +9,8 @@ import pytest
 import torch
 from diffusers.models.transformers.transformer_temporal import TransformerSpatioTemporalModel
 from diffusers.models.unets.unet_spatio_temporal_condition import UNetSpatioTemporalConditionModel
-from naming import diffusers_state, on_meta, released_unet
 from plain_unet import plain_unet
+from published import diffusers_state, released_unet
 from small_models import UNET, draw, give_published_epsilon, random_clip, randomise, relative_error, tiny_synthesizer
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -124,24 +123,6 @@ def test_gradients_through_derived_values_equal_the_published_ones() -> None:
     assert all(theirs[name].abs().max() < 1e-9 for name in dormant)  # the published network does not use them either
 
 
-@pytest.mark.parametrize("frame", [0, 2, FRAMES])
-def test_a_token_counts_for_its_own_frame_and_the_first_of_a_clip_for_all_its_frames_together(frame: int) -> None:
-    unet, rows = small_unet(), CLIPS * FRAMES
-    tokens = draw(rows, 48)
-    changed = tokens.clone()
-    changed[frame] += 1
-    with torch.no_grad():
-        before, after = (unet.crosses(each) for each in (tokens, changed))
-    assert before is not None
-    assert after is not None
-    attending = [stage.attention is not None for stage in unet.all_stages()]
-    assert sum(attending) == 16
-    for differ in (before != after).split(list(compress(unet.embedding_widths, attending)), dim=1):
-        within, between = (each.any(dim=1).tolist() for each in differ.chunk(2, dim=1))
-        assert within == [row == frame for row in range(rows)]
-        assert between == [row - row % FRAMES == frame for row in range(rows)]
-
-
 def test_a_fresh_u_net_starts_as_published_with_zero_output_and_even_shares() -> None:
     unet = VideoUNet(UNET, FRAMES)
     assert not batch().ours(unet).any()
@@ -224,7 +205,7 @@ def _meta(*shape: int) -> Tensor:
 def _plain_flops(unet: VideoUNet) -> int:
     with FlopCounterMode(display=False) as counter:
         plain_unet(
-            on_meta(released_unet(unet)),
+            {name: torch.empty_like(weight, device="meta") for name, weight in released_unet(unet).items()},
             _meta(FULL_FRAMES, 8, FULL_HEIGHT, FULL_WIDTH),
             noise_label=_meta(FULL_FRAMES),
             vector=_meta(FULL_FRAMES, 768 + 128),

@@ -10,7 +10,8 @@ from published import HEADS, SMALL_GCD, fixed_view, manifest, shared_vae
 from gcd_model.config import SVD_14, ModelConfig, UNetConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.networks import empty_networks
-from gcd_model.weights.infer import Hints, Shapes, infer_config, match_weights
+from gcd_model.weights.families import Hints
+from gcd_model.weights.infer import Shapes, infer_config, match_weights
 from gcd_model.weights.names import Levels, Naming, assembled, published_names, published_shape, taken_apart
 
 UNET = "model.diffusion_model"
@@ -178,6 +179,7 @@ SMALL = published_shapes(SMALL_GCD, "gcd")
     ("shapes", "hints"),
     [
         (SMALL | {STEM: (16, 8, 3, 3)}, SMALL_HEADS),  # no multiple of the groups
+        (SMALL | {STEM: (32, 11, 3, 3)}, SMALL_HEADS),  # more condition channels than latents have
         (SMALL | {CAMERA: (24, 9)}, SMALL_HEADS),  # no camera control known
         (SMALL, Hints(head_width=64)),  # heads are never guessed
         (SMALL, Hints(image_heads=16)),
@@ -190,10 +192,10 @@ def test_what_names_and_shapes_do_not_tell_is_refused(shapes: Shapes, hints: Hin
         infer_config(shapes, "gcd", hints)
 
 
-def test_camera_control_and_further_condition_channels_are_told_by_shapes() -> None:
+def test_camera_control_is_told_by_shapes() -> None:
     for features, control in ((13, "spherical"), (12, "relative_pose")):
-        config = infer_config(SMALL | {CAMERA: (24, features), STEM: (32, 11, 3, 3)}, "gcd", SMALL_HEADS)
-        assert (config.camera, config.extra_condition_channels) == (control, 3)
+        config = infer_config(SMALL | {CAMERA: (24, features)}, "gcd", SMALL_HEADS)
+        assert config.camera == control
 
 
 def test_a_made_up_block_number_costs_nothing() -> None:

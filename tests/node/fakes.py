@@ -109,12 +109,10 @@ class FakeSynthesizer:
         self.clips: list[Clip] = []
         self._act = act
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         self.clips.append(clip)
         strength = None if augmentation is None else augmentation.strength
-        return SourceFeatures(tokens=None, latents=clip.video, extra=extra, fps=clip.fps, augmentation=strength or 0.0)
+        return SourceFeatures(tokens=None, latents=clip.video, fps=clip.fps, augmentation=strength or 0.0)
 
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
@@ -317,6 +315,6 @@ TINY = struct_replace(
 def write_tiny(folder: Path) -> Path:
     """`tiny.safetensors` in a folder: real weights of a tiny driving model at random, which paint class colours and
     take no time."""
-    card = Card(name="tiny", config=TINY, family="driving-semantic", move_time=13, trained=False)
+    card = Card(name="tiny", config=TINY, family=FAMILIES["driving-semantic"], move_time=13, trained=False)
     save_weights(random_networks(TINY, seed=0), folder / "tiny.safetensors", card)
     return folder / "tiny.safetensors"

@@ -179,13 +179,11 @@ class Told:
         self.features: list[SourceFeatures] = []
         self.options: list[RenderOptions] = []
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         self.clips.append(clip)
         assert augmentation.noise.shape == clip.video.shape
         latents = clip.video.mean(dim=1, keepdim=True).expand(-1, 4, -1, -1)
-        return SourceFeatures(tokens=None, latents=latents, extra=None, fps=clip.fps, augmentation=0.02)
+        return SourceFeatures(tokens=None, latents=latents, fps=clip.fps, augmentation=0.02)
 
     def render(
         self,

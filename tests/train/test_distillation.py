@@ -55,7 +55,9 @@ def teacher(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of a tiny driving model; tests only read them."""
     config = smaller(FRAMES, HEIGHT, WIDTH)
     path = tmp_path_factory.mktemp("teacher") / "teacher.safetensors"
-    save_weights(random_networks(config, seed=0), path, Card(name="t", config=config, family="driving", move_time=3))
+    save_weights(
+        random_networks(config, seed=0), path, Card(name="t", config=config, family=FAMILIES["driving"], move_time=3)
+    )
     return path
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, evaluated
-from torch import Tensor
 
 from gcd_model import Clip, RenderOptions, Trajectory, View
 from gcd_model.clip import Augmentation
@@ -63,9 +62,8 @@ class FakeSynthesizer:
     def steps(self) -> list[int | None]:
         return [each.steps for each in self.options]
 
-    def encode(self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None) -> Clip:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> Clip:
         assert augmentation is None
-        assert extra is None
         self.clips.append(clip)
         return clip
 

@@ -167,11 +167,9 @@ class Mirror:
     paths: list[Trajectory] = field(default_factory=list)
     clips: list[Clip] = field(default_factory=list)
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         self.clips.append(clip)
-        return SourceFeatures(tokens=None, latents=clip.video, extra=None, fps=clip.fps, augmentation=0.0)
+        return SourceFeatures(tokens=None, latents=clip.video, fps=clip.fps, augmentation=0.0)
 
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None

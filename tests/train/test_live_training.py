@@ -25,7 +25,6 @@ from gcd_model.live.depth_net import (
     bin_width,
     depth_inputs,
     first_bin,
-    pixel_rays,
     plane_depth,
     read_depth,
 )
@@ -275,7 +274,7 @@ def test_where_the_gate_is_open_depth_is_that_of_the_declared_ground() -> None:
     net.head.out.bias.data.zero_()
     net.head.out.bias.data[-2] = 1e6
     lens = Intrinsics.from_hfov(85.0, TINY.width, TINY.height)
-    rays = pixel_rays(lens)
+    rays = lens.rays()
     ground = plane_depth(rays, torch.tensor([0.0, -0.985, -0.174]), 1.5)
     inputs = depth_inputs(torch.zeros(1, 3, TINY.height, TINY.width), rays[None], ground[None])
     with torch.no_grad():

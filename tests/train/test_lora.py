@@ -15,6 +15,7 @@ from gcd_model.config import SVD_14
 from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_model.weights.adapter import adapted, base_digest
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
 from gcd_train.cli.main import app
 from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe
@@ -87,7 +88,7 @@ def test_an_adapter_kept_apart_gives_the_same_on_its_base(lora: LoraRecipe) -> N
     networks = given()
     let_train(networks, msgspec.structs.replace(ADAPTED, lora=lora), SEED)
     updated(networks)
-    card = Card(name="adapted", config=published(), family="kubric90", move_time=1)
+    card = Card(name="adapted", config=published(), family=FAMILIES["kubric90"], move_time=1)
     apart = adapter_of(networks, lora, card, base_digest(given().state_dict()))
     assert ("unet.stem.weight" in apart.tensors, "camera.proj.weight" in apart.tensors) == (lora.stem, lora.camera)
     assert_close(output(adapted(given(), apart)), output(networks), rtol=1e-5, atol=1e-5)

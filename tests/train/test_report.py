@@ -16,6 +16,7 @@ from gcd_model.config import PLAIN_SMALL
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import save_weights
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
@@ -403,7 +404,7 @@ def evaluated(out: Path, *arguments: object) -> tuple[dict[str, float], str]:
 def test_weights_are_evaluated_from_the_command_line(tmp_path: Path) -> None:
     once = msgspec.structs.replace(PLAIN_SMALL.sampling, steps=1)
     config = msgspec.structs.replace(PLAIN_SMALL, frames=4, height=32, width=64, sampling=once)
-    card = Card(name="untrained", config=config, family="driving", move_time=3, trained=False)
+    card = Card(name="untrained", config=config, family=FAMILIES["driving"], move_time=3, trained=False)
     save_weights(random_networks(config, seed=0), tmp_path / "untrained.safetensors", card)
     held_out = PlaneClips.make(1, width=64).write(tmp_path / "a")
     given = ("--weights", tmp_path / "untrained.safetensors", "--no-baselines", "--views", "none")

@@ -50,7 +50,6 @@ def test_pretraining_sees_the_same_clips_and_trains_the_autoencoder_of_all() -> 
 def test_the_models_have_the_papers_form() -> None:
     recipe = load_recipe("package:study-gradual-pretrained")
     config = sampled_as_trained(model_config(recipe.model), recipe.unet)
-    assert config.extra_condition_channels == 0
     assert config.sampling.steps > 1
     assert config.unet.widths == PLAIN_SMALL.unet.widths
     assert 0 < recipe.unet.noise.fixed_share < 1

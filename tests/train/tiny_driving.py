@@ -7,6 +7,7 @@ import msgspec
 from gcd_model.config import PLAIN_SMALL, ModelConfig
 from gcd_model.networks import random_networks
 from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
 from gcd_model.weights.load import save_weights
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
@@ -24,7 +25,7 @@ def write_untrained(folder: Path) -> Path:
         sampling=msgspec.structs.replace(PLAIN_SMALL.sampling, steps=1),
     )
     path = folder / "untrained.safetensors"
-    card = Card(name="untrained", config=config, family="driving", move_time=FRAMES - 1, trained=False)
+    card = Card(name="untrained", config=config, family=FAMILIES["driving"], move_time=FRAMES - 1, trained=False)
     save_weights(random_networks(config, seed=0), path, card)
     return path
 

@@ -7,13 +7,12 @@ import copy
 import logging
 import math
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, TypeAlias, TypeVar
+from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -21,8 +20,8 @@ from torch import Tensor, nn
 
 from gcd_model.conditioning import Conditioning, ImageTransformerLayer
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise, watched
-from gcd_model.engines.graphs import CudaGraphs, Recent, RecordedCall, Recorder, StepMemory, Update, solved
-from gcd_model.engines.torch import NetworkName, TorchEngine
+from gcd_model.engines.graphs import CudaGraphs, RecordedCall, Recorder, StepMemory, Update, recent, solved
+from gcd_model.engines.torch import Engine, NetworkName
 from gcd_model.layers import Attention, Downsample, FeedForward, ResBlock, Upsample, VideoResBlock, prepare
 from gcd_model.networks import Networks
 from gcd_model.unet import Stage
@@ -51,28 +50,25 @@ class CudaOptions:
     float8: bool = False
     decoder: Literal["checked", "float32", "float16", "bfloat16"] = "checked"
 
-    @classmethod
-    def of_device(cls, device: torch.device) -> Self:
-        """Everything on a GPU, and nothing on a CPU, where none of it would gain."""
-        if device.type == "cuda":
-            return cls()
-        return cls(backend=None, channels_last=False, joined=False, decoder="float32")
 
-
-class CudaEngine(TorchEngine):
-    """Implements Engine. Not for several threads at once."""
+class CudaEngine(Engine):
+    """Not for several threads at once."""
 
     def __init__(
         self, networks: Networks, options: CudaOptions | None = None, recorder: Recorder | None = None
     ) -> None:
-        """Take the networks over: they are laid out and compiled in place; give a `twin` of those that others use.
+        """Take the networks over: they are laid out and compiled in place.
 
         recorder: what replays work; by default as `options` and the device say.
         """
-        options = CudaOptions.of_device(networks.unet.stem.weight.device) if options is None else options
+        options = options or CudaOptions()
         networks.requires_grad_(False)
         prepare(networks)
-        _settle_decoder(networks, options.decoder)
+        if options.decoder == "checked":
+            networks.decoder, psnr = checked_decoder(networks)
+            _LOG.info("decoder in %s: %.1f dB from float32", networks.decoder.stem.weight.dtype, psnr)
+        elif options.decoder != "float32":  # a copy: others may share its weights
+            networks.decoder = copy.deepcopy(networks.decoder).to(getattr(torch, options.decoder))
         if options.channels_last:
             channels_last(networks)
         if options.joined:
@@ -86,8 +82,8 @@ class CudaEngine(TorchEngine):
         on_gpu = options.graphs and self.like.device.type == "cuda"
         with self._on_device():
             self._recorder = recorder or (CudaGraphs() if on_gpu else Recorder())
-        self._memories: Recent[StepMemory] = Recent()
-        self._calls: Recent[RecordedCall] = Recent()
+        self._memories: dict[Hashable, StepMemory] = {}
+        self._calls: dict[Hashable, RecordedCall] = {}
 
     def forget(self) -> None:
         """Drop what was recorded, and with it the memory it holds."""
@@ -114,7 +110,7 @@ class CudaEngine(TorchEngine):
         with self._at_work():
             work = partial(super().compute, name)
             key = name, given.shape, given.dtype
-            return self._calls.get(key, lambda: RecordedCall(work, given, self._recorder))(given)
+            return recent(self._calls, key, lambda: RecordedCall(work, given, self._recorder))(given)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine. One view and sample after the other: so no number of them has code or graphs of its own, and none
@@ -135,20 +131,20 @@ class CudaEngine(TorchEngine):
         if options.progress is not None:
             self._beat = partial(options.progress, 0, len(widths))
         with self._at_work():
-            memory = self._memories.get(
+            memory = recent(
+                self._memories,
                 (start.shape, given.latents.shape, given.tokens is None),
                 lambda: StepMemory(self, self._update, start, given, schedule),
             )
-            memory.begin(start, given, schedule)
+            memory.load(start, given, schedule)
             if memory.record(set(widths), self._recorder):
-                memory.begin(start, given, schedule)
+                memory.load(start, given, schedule)
             for i in watched(len(widths), options):
-                memory.seek(i)
-                memory.advance(widths[i])
+                memory.step(i, widths[i])
                 if done is not None:
                     done.record()
                     done.synchronize()  # of the event alone: the device does not notice
-            return memory.result()
+            return memory.x.clone()
 
 
 def _tell(progress: Callable[[int, int], object], k: int, views: int, done: int, steps: int) -> None:
@@ -166,19 +162,11 @@ def of_view(given: Conditioning, k: int, views: int) -> Conditioning:
     return Conditioning(**{field.name: rows(getattr(given, field.name)) for field in fields(given)})
 
 
-def _settle_decoder(networks: Networks, precision: str) -> None:
-    if precision in ("float16", "bfloat16"):
-        networks.decoder = copy.deepcopy(networks.decoder).to(getattr(torch, precision))  # others may share its weights
-    elif precision == "checked":
-        networks.decoder, psnr = checked_decoder(networks)
-        _LOG.info("decoder in %s: %.1f dB from float32", networks.decoder.stem.weight.dtype, psnr)
-
-
 def _compiled(networks: Networks, options: CudaOptions, beat: Callable[[], object]) -> Update:
     if options.backend is None:
         return solved
     if options.backend == "inductor":
-        keep_compiled(cache_folder())
+        keep_compiled()
     backend = _heard(options.backend, beat, tuned=options.tuned)
     compile_regions(networks, backend)
     return torch.compile(solved, backend=backend, fullgraph=True, dynamic=False)
@@ -187,21 +175,11 @@ def _compiled(networks: Networks, options: CudaOptions, beat: Callable[[], objec
 # --- compiling networks region by region -----------------------------------------------------------------------------
 
 
-Model = TypeVar("Model", bound=nn.Module)
 Backend: TypeAlias = Callable[[Any, Any], Any]
 
 _REGIONS = (Stage, VideoResBlock, ResBlock, PixelAttention, ImageTransformerLayer, Downsample, Upsample)
 _SHAPES = 256  # of one kind of region: the U-Net has about 20, with and without the unconditional branch
 _ALL_SHAPES = 4096  # of all kinds together, as torch counts them by the code that every module's call begins with
-
-
-def twin(model: Model) -> Model:
-    """The same network with the same weights in memory, to be compiled without touching the first.
-
-    To move or to convert one of the two would do so to both.
-    """
-    memo: dict[int, object] = {id(each): each for each in chain(model.parameters(), model.buffers())}
-    return copy.deepcopy(model, memo).eval()
 
 
 def regions(model: nn.Module) -> Iterator[nn.Module]:
@@ -215,7 +193,12 @@ def regions(model: nn.Module) -> Iterator[nn.Module]:
 
 def compile_regions(model: nn.Module, backend: str | Backend) -> int:
     """Compile every region, in place, when it is first called; how many there are. backend: of torch.compile."""
-    _allow_shapes()
+    from torch._dynamo import config  # takes seconds
+
+    # all blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise
+    name = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before torch 2.7
+    for each, least in ((name, _SHAPES), (f"accumulated_{name}", _ALL_SHAPES)):
+        setattr(config, each, max(least, getattr(config, each)))
     found = list(regions(model))
     for region in found:
         region.compile(backend=backend, fullgraph=True, dynamic=False)
@@ -235,15 +218,6 @@ def _heard(name: str, beat: Callable[[], object], *, tuned: bool = False) -> Bac
         return compiler(graph, inputs, **how)
 
     return compiled
-
-
-def _allow_shapes() -> None:
-    """All blocks of a kind share one piece of code, which torch compiles for eight shapes unless told otherwise."""
-    from torch._dynamo import config  # takes seconds
-
-    name = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before torch 2.7
-    for each, least in ((name, _SHAPES), (f"accumulated_{name}", _ALL_SHAPES)):
-        setattr(config, each, max(least, getattr(config, each)))
 
 
 def channels_last(model: nn.Module) -> None:
@@ -329,18 +303,14 @@ def join_attention(model: nn.Module) -> None:
             module.joint = joint
 
 
-def cache_folder() -> Path:
-    """Where compiled code lies unless TORCHINDUCTOR_CACHE_DIR says otherwise; GCD_CACHE_DIR names another."""
-    own = os.environ.get("GCD_CACHE_DIR")
-    root = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gcd-node"
-    return root / "compiled" / torch.__version__
-
-
-def keep_compiled(folder: Path) -> None:
-    """Have all that is compiled in this process kept in a folder, so that the next one finds it.
+def keep_compiled() -> None:
+    """Have all that is compiled kept for later processes: in GCD_CACHE_DIR, else the user's cache folder.
 
     What TORCHINDUCTOR_CACHE_DIR and TRITON_CACHE_DIR say already stands.
     """
+    own = os.environ.get("GCD_CACHE_DIR")
+    root = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gcd-node"
+    folder = root / "compiled" / torch.__version__
     folder.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
     os.environ.setdefault("TRITON_CACHE_DIR", str(folder / "triton"))
@@ -362,7 +332,12 @@ def checked_decoder(networks: Networks) -> tuple[TemporalDecoder, float]:
     """The decoder in float16, which has three bits more, or else in bfloat16, which no activation is too large for, if
     its pictures of a test clip are good enough for that; and their PSNR, infinite for float32."""
     config, full = networks.config, networks.decoder
-    frames = drifting_clip(min(config.frames, _FRAMES), config.height, config.width)
+    height, width = config.height, config.width  # a smooth random picture with a fine pattern, a pixel on each frame
+    coarse = unit_noise((1, 3, max(2, height // _COARSE), max(2, width // _COARSE)), _SEED)
+    picture = F.interpolate(coarse, size=(height, width), mode="bilinear")[0] + 0.2 * unit_noise(
+        (3, height, width), _SEED, 1
+    )
+    frames = torch.stack([picture.roll(t, dims=-1) for t in range(min(config.frames, _FRAMES))]).clamp(-1, 1)
     encoder = networks.condition_encoder
     latents = torch.cat([encoder(each[None].to(encoder.stem.weight)).mean for each in frames]).float()
     truth = to_pixels(full(latents.to(full.stem.weight), len(latents)))
@@ -371,14 +346,6 @@ def checked_decoder(networks: Networks) -> tuple[TemporalDecoder, float]:
         if (psnr := psnr_db(to_pixels(half(latents.to(precision), len(latents))), truth)) > WANTED_DB:
             return half, psnr
     return full, math.inf
-
-
-def drifting_clip(frames: int, height: int, width: int) -> Tensor:
-    """A smooth random picture with a fine pattern that moves by a pixel a frame: [frames, 3, height, width]."""
-    coarse = unit_noise((1, 3, max(2, height // _COARSE), max(2, width // _COARSE)), _SEED)
-    smooth = F.interpolate(coarse, size=(height, width), mode="bilinear")[0]
-    fine = 0.2 * unit_noise((3, height, width), _SEED, 1)
-    return torch.stack([(smooth + fine).roll(t, dims=-1) for t in range(frames)]).clamp(-1, 1)
 
 
 def psnr_db(ours: Tensor, truth: Tensor) -> float:

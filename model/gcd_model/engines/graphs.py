@@ -1,9 +1,8 @@
 """Work on a GPU recorded once and replayed with one call: no Python and no allocation between its kernels."""
 
-from collections import OrderedDict
 from collections.abc import Callable, Generator, Hashable
 from contextlib import contextmanager
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -87,25 +86,14 @@ def _warm(work: Replay, side: torch.cuda.Stream) -> None:
     main.wait_stream(side)
 
 
-class Recent(Generic[Kept]):
-    """The things last used, by key: what is made for one shape of batch is kept for a few of them."""
-
-    def __init__(self, limit: int = _SHAPES) -> None:
-        self._limit = limit
-        self._kept: OrderedDict[Hashable, Kept] = OrderedDict()
-
-    def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """The one of this key, made where there is none; the one that was not used for longest makes room."""
-        if key not in self._kept:
-            while len(self._kept) >= self._limit:
-                self._kept.popitem(last=False)
-            self._kept[key] = make()
-        self._kept.move_to_end(key)
-        return self._kept[key]
-
-    def clear(self) -> None:
-        """Keep nothing."""
-        self._kept.clear()
+def recent(kept: dict[Hashable, Kept], key: Hashable, make: Callable[[], Kept], limit: int = _SHAPES) -> Kept:
+    """What is kept of this key, made where there is none; beyond the limit the one not used for longest goes."""
+    if key not in kept:
+        while len(kept) >= limit:
+            del kept[next(iter(kept))]
+        kept[key] = make()
+    kept[key] = kept.pop(key)  # the last one is the one last used
+    return kept[key]
 
 
 class RecordedCall:
@@ -144,21 +132,21 @@ def solved(x: Tensor, before: Tensor, raw: Tensor, inputs: StepInputs) -> tuple[
 
 
 class StepMemory:
-    """All that a step reads and writes, for batches of one shape, and the steps recorded on it."""
+    """All that a step reads and writes, for batches of one shape, and the steps recorded on it. x: the latents."""
 
     def __init__(
         self, backbone: Backbone, update: Update, start: Tensor, given: Conditioning, schedule: Schedule
     ) -> None:
         self._backbone, self._update = backbone, update
-        self._x, self._before = start.clone(), start.clone()
+        self.x, self._before = start.clone(), start.clone()
         self._denoiser = GuidedDenoiser(backbone, given, schedule, start)
         self._inputs = StepInputs._make(each if each is None else each.clone() for each in self._denoiser.inputs(0))
         self._replays: dict[int, Replay] = {}
 
-    def begin(self, start: Tensor, given: Conditioning, schedule: Schedule) -> None:
-        """Load a batch."""
+    def load(self, start: Tensor, given: Conditioning, schedule: Schedule) -> None:
+        """A batch takes the place of the one before."""
         self._denoiser = GuidedDenoiser(self._backbone, given, schedule, start)
-        self._x.copy_(start)
+        self.x.copy_(start)
         self._before.copy_(start)
 
     def record(self, branches: set[int], recorder: Recorder) -> bool:
@@ -166,26 +154,22 @@ class StepMemory:
         Whether anything was."""
         missing = branches - self._replays.keys()
         for each in missing:
-            self.seek(0)
+            self._seek(0)
             self._replays[each] = recorder.record(lambda each=each: self._advance(each))
         return bool(missing)
 
-    def seek(self, step: int) -> None:
-        """Bring what this step needs."""
+    def step(self, number: int, branches: int) -> None:
+        """Do a step of the schedule."""
+        self._seek(number)
+        self._replays[branches]()
+
+    def _seek(self, step: int) -> None:
         for memory, value in zip(self._inputs, self._denoiser.inputs(step), strict=True):
             if memory is not None and value is not None:
                 memory.copy_(value)
 
-    def advance(self, branches: int) -> None:
-        """Do the step."""
-        self._replays[branches]()
-
-    def result(self) -> Tensor:
-        """Latents, a copy."""
-        return self._x.clone()
-
     def _advance(self, branches: int) -> None:
-        raw = evaluated(self._backbone, self._x, self._inputs, branches)
-        after, clean = self._update(self._x, self._before, raw, self._inputs)
-        self._x.copy_(after)
+        raw = evaluated(self._backbone, self.x, self._inputs, branches)
+        after, clean = self._update(self.x, self._before, raw, self._inputs)
+        self.x.copy_(after)
         self._before.copy_(clean)

@@ -12,13 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gcd_model.conditioning import Conditioning, camera_features, clip_pixels
-from gcd_model.config import ModelConfig
+from gcd_model.conditioning import Conditioning, camera_features
 from gcd_model.engines.onnx_export import MANIFEST, read_manifest
-from gcd_model.engines.torch import Engine
+from gcd_model.engines.torch import Engine, NetworkName
 from gcd_model.errors import CheckpointError, DeviceMemoryError, ModelError, OptionError
 from gcd_model.geometry import Trajectory
-from gcd_model.networks import empty_networks
+from gcd_model.networks import Networks, empty_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.unet import UNetPlan
@@ -52,7 +51,8 @@ def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence
     chosen = provider_options(device, providers, folder / "tensorrt", half=manifest.precision == "float16")
     files = {name: folder / record[0].name for name, record in manifest.graphs.items()}
     traits = Traits.of(card, sha256_12=manifest.sha256_12, precision=manifest.precision, device="cpu")
-    return Synthesizer(empty_networks(card.diffusion), traits, OnnxEngine(Sessions(files, chosen), card.diffusion))
+    networks = empty_networks(card.diffusion)
+    return Synthesizer(networks, traits, OnnxEngine(Sessions(files, chosen), networks))
 
 
 def provider_options(device: str, names: Sequence[str], cache: Path, *, half: bool) -> list[Provider]:
@@ -75,21 +75,15 @@ def provider_options(device: str, names: Sequence[str], cache: Path, *, half: bo
 
 
 class OnnxEngine(Engine):
-    """The networks of an export, clip by clip."""
+    """The networks of an export, clip by clip. networks: without storage; the weights are in the graphs."""
 
-    def __init__(self, graphs: "Sessions", config: ModelConfig) -> None:
-        self._graphs, self._config = graphs, config
-        self._frames = config.frames
+    def __init__(self, graphs: "Sessions", networks: Networks) -> None:
+        super().__init__(networks)
+        self._graphs, self._config = graphs, networks.config
 
     @property
     def like(self) -> Tensor:
         return torch.zeros(())  # float32 on the CPU; onnxruntime copies to its own device
-
-    def tokens(self, frames: Tensor) -> Tensor | None:
-        tower = self._config.image_encoder
-        if tower is None:
-            return None
-        return self._frame_by_frame("image_encoder", clip_pixels(frames.to(self.like), tower.image_size))
 
     def condition_mean(self, frames: Tensor) -> Tensor:
         """See Engine. Raises OptionError for another size than the export's."""
@@ -100,7 +94,7 @@ class OnnxEngine(Engine):
                 f"this export takes frames of {height}x{width} alone, got {size}; "
                 "export it again with --height and --width"
             )
-        return self._frame_by_frame("condition_encoder", frames.to(self.like))
+        return super().condition_mean(frames)
 
     def camera(self, path: Trajectory) -> Tensor | None:
         """See Engine; the features themselves, as the linear map that follows is part of a graph."""
@@ -108,10 +102,10 @@ class OnnxEngine(Engine):
         return None if control == "none" else camera_features(control, path)
 
     def decode(self, latents: Tensor) -> Tensor:
-        return self._graphs.run("decoder", latents)[0]
+        return self._graphs.run("decoder", latents)
 
-    def _frame_by_frame(self, name: str, frames: Tensor) -> Tensor:
-        return torch.cat([self._graphs.run(name, frame)[0] for frame in frames.split(1)])
+    def compute(self, name: NetworkName, given: Tensor) -> Tensor:
+        return torch.cat([self._graphs.run(name, frame) for frame in given.split(1)])
 
     def plan(self, labels: Tensor, given: Conditioning) -> UNetPlan:
         rows = [given.vector] if given.camera is None else [given.vector, given.camera]
@@ -125,8 +119,8 @@ class OnnxEngine(Engine):
 
     def _clip_by_clip(self, name: str, *rows: Tensor, label: Tensor | None = None) -> Tensor:
         first = () if label is None else (label,)
-        clips = zip(*(each.split(self._frames) for each in rows), strict=True)
-        return torch.cat([self._graphs.run(name, *first, *clip)[0] for clip in clips])
+        clips = zip(*(each.split(self._config.frames) for each in rows), strict=True)
+        return torch.cat([self._graphs.run(name, *first, *clip) for clip in clips])
 
 
 class _Session(nn.Module):
@@ -137,10 +131,9 @@ class _Session(nn.Module):
         self.session = session
         self.names = [each.name for each in session.get_inputs()]
 
-    def forward(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """One run on the CPU's tensors."""
+    def forward(self, inputs: Sequence[Tensor]) -> Tensor:
         arrays = {name: each.detach().cpu().contiguous().numpy() for name, each in zip(self.names, inputs, strict=True)}
-        return tuple(torch.from_numpy(array) for array in self.session.run(None, arrays))
+        return torch.from_numpy(self.session.run(None, arrays)[0])
 
 
 class Sessions:
@@ -159,35 +152,32 @@ class Sessions:
                 f"onnxruntime has no {absent[0]} here, only {', '.join(available)}; "
                 "install a build that has it, or leave the provider out"
             )
-        self._sessions = {name: _Session(_session(onnxruntime, path, providers)) for name, path in files.items()}
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = torch.get_num_threads(), 1
+        options.log_severity_level = 3
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave others cores
+        self._sessions: dict[str, _Session] = {}
+        for name, path in files.items():
+            try:
+                session = onnxruntime.InferenceSession(str(path), options, providers=list(providers))
+            except Exception as error:
+                raise _ours(error, name) from error
+            refused = [provider for provider, _ in providers if provider not in session.get_providers()]
+            if refused:
+                raise OptionError(
+                    f"onnxruntime has {refused[0]} but could not start it for {path.name}; its libraries are not "
+                    "installed, or do not fit this machine"
+                )
+            self._sessions[name] = _Session(session)
 
-    def run(self, name: str, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """One run. inputs: in the graph's order. Raises: DeviceMemoryError, ModelError."""
+    def run(self, name: str, *inputs: Tensor) -> Tensor:
+        """A graph's output. inputs: in the graph's order. Raises: DeviceMemoryError, ModelError."""
         try:
             return self._sessions[name](inputs)
         except Exception as error:
             if not type(error).__module__.startswith("onnxruntime"):
                 raise
             raise _ours(error, name) from error
-
-
-def _session(runtime: Any, path: Path, providers: Sequence[Provider]) -> Any:
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave others the cores
-    try:
-        session = runtime.InferenceSession(str(path), options, providers=list(providers))
-    except Exception as error:
-        raise _ours(error, path.stem) from error
-    refused = [name for name, _ in providers if name not in session.get_providers()]
-    if refused:
-        raise OptionError(
-            f"onnxruntime has {refused[0]} but could not start it for {path.name}; its libraries are not installed, "
-            "or do not fit this machine"
-        )
-    return session
 
 
 def _ours(error: Exception, graph: str) -> ModelError:

@@ -10,11 +10,11 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from itertools import chain, compress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import torch
@@ -49,12 +49,13 @@ Report = Callable[[str, int, int], None]
 
 
 class _Function(nn.Module):
+    """What is computed of a module and tensors."""
+
     def __init__(self, module: nn.Module, compute: Callable[..., Tensor | None]) -> None:
         super().__init__()
         self.module, self.compute = module, compute
 
     def forward(self, *inputs: Tensor) -> Tensor | None:
-        """What is computed of a module and tensors."""
         return self.compute(self.module, *inputs)
 
 
@@ -72,8 +73,7 @@ def _embeddings(networks: Networks, label: Tensor, vector: Tensor, camera: Tenso
     return networks.unet.plan(label, vector, features, None).embeddings[0]
 
 
-@dataclass(frozen=True, slots=True)
-class Graph:
+class Graph(NamedTuple):
     """One graph to export. inputs: by name, of the sizes it will always have; their values do not matter."""
 
     name: str
@@ -81,48 +81,30 @@ class Graph:
     inputs: dict[str, Tensor]
     output: str
 
-    def __post_init__(self) -> None:
-        prepare(self.module)
-
 
 def graphs(networks: Networks) -> Iterator[Graph]:
     """Every graph of a checkpoint, at the size its config states."""
-    config, tower = networks.config, networks.image_encoder
-    frames, height, width, factor = config.frames, config.height, config.width, config.vae.down_factor
+    config, tower, unet = networks.config, networks.image_encoder, networks.unet
+    frames, factor = config.frames, config.vae.down_factor
+    latents = torch.zeros(frames, config.vae.latent_channels, config.height // factor, config.width // factor)
     if tower is not None:
         pixels = torch.zeros(1, 3, tower.config.image_size, tower.config.image_size)
         yield Graph("image_encoder", tower, {"pixels": pixels}, "token")
-        crosses = _Function(networks.unet, VideoUNet.crosses)
+        crosses = _Function(unet, VideoUNet.crosses)
         yield Graph("crosses", crosses, {"tokens": torch.zeros(frames, tower.config.output_width)}, "crosses")
-    yield Graph(
-        "condition_encoder",
-        _Function(networks.condition_encoder, _mean),
-        {"frames": torch.zeros(1, 3, height, width)},
-        "latents",
-    )
+    mean = _Function(networks.condition_encoder, _mean)
+    yield Graph("condition_encoder", mean, {"frames": torch.zeros(1, 3, config.height, config.width)}, "latents")
     inputs = {"label": torch.zeros(1), "vector": torch.zeros(frames, config.unet.vector_width)}
     if networks.camera is not None:
         inputs["camera"] = torch.zeros(frames, CAMERA_FEATURES[config.camera])
     yield Graph("embeddings", _Function(networks, _embeddings), inputs, "embeddings")
-    yield step_graph(networks)
-    latents = torch.zeros(frames, config.vae.latent_channels, height // factor, width // factor)
+    widths = unet.embedding_widths
+    inputs = {"latents": latents, "condition": latents.clone(), "embeddings": torch.zeros(frames, sum(widths))}
+    if tower is not None:
+        attending = [stage.attention is not None for stage in unet.all_stages()]
+        inputs["crosses"] = torch.zeros(frames, sum(compress(widths, attending)))
+    yield Graph("step", unet, inputs, "prediction")
     yield Graph("decoder", _Function(networks.decoder, _pictures), {"latents": latents}, "pictures")
-
-
-def step_graph(networks: Networks) -> Graph:
-    """The U-Net alone, which is most of what there is to export."""
-    config, unet = networks.config, networks.unet
-    frames, factor = config.frames, config.vae.down_factor
-    size = (config.height // factor, config.width // factor)
-    inputs = {
-        "latents": torch.zeros(frames, unet.config.latent_channels, *size),
-        "condition": torch.zeros(frames, unet.config.condition_channels, *size),
-        "embeddings": torch.zeros(frames, sum(unet.embedding_widths)),
-    }
-    attending = [stage.attention is not None for stage in unet.all_stages()]
-    if networks.image_encoder is not None:
-        inputs["crosses"] = torch.zeros(frames, sum(compress(unet.embedding_widths, attending)))
-    return Graph("step", unet, inputs, "prediction")
 
 
 class FileRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -219,7 +201,13 @@ def export_onnx(
             missing. CheckpointError: it cannot be written.
     """
     require_onnx()
-    networks = _at_size(loaded, height, width)
+    networks = loaded.diffusion
+    config, factor = networks.config, networks.config.size_factor
+    height, width = height or config.height, width or config.width
+    if height % factor or width % factor:
+        raise OptionError(f"height and width must be multiples of {factor} for {loaded.name}, got {height}x{width}")
+    networks.config = msgspec.structs.replace(config, height=height, width=width)
+    networks.requires_grad_(False).float()
     records: dict[str, tuple[FileRecord, ...]] = {}
     with whole(Path(out), replaces=overwrite and _is_export_of_ours(Path(out))) as folder:
         folder.mkdir()
@@ -248,17 +236,6 @@ def require_onnx() -> None:
         raise OptionError("ONNX needs the extra `onnx`: pip install 'gcd-node[onnx]'")
 
 
-def _at_size(loaded: LoadedWeights, height: int | None, width: int | None) -> Networks:
-    """The networks in float32, with the size they are exported for as their config's."""
-    networks = loaded.diffusion
-    config, factor = networks.config, networks.config.size_factor
-    height, width = height or config.height, width or config.width
-    if height % factor or width % factor:
-        raise OptionError(f"height and width must be multiples of {factor} for {loaded.name}, got {height}x{width}")
-    networks.config = msgspec.structs.replace(config, height=height, width=width)
-    return networks.requires_grad_(False).float()
-
-
 def write_graph(
     graph: Graph, folder: Path, precision: ExportPrecision = "float32", *, apart_above: int = APART_ABOVE
 ) -> tuple[FileRecord, ...]:
@@ -266,6 +243,7 @@ def write_graph(
     import onnx_ir
     from onnxscript import optimizer
 
+    prepare(graph.module)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it speaks of packages we do not need
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from itertools import repeat
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -16,29 +16,38 @@ from gcd_model.layers import Attention, FeedForward, ResBlock, Upsample
 from gcd_model.networks import Networks
 from gcd_model.unet import UNetPlan, VideoUNet
 
+NetworkName = Literal["image_encoder", "condition_encoder", "decoder"]
 
-class Engine(Backbone, Protocol):
-    """Computes networks; what they are given and what becomes of it is the synthesizer's.
+
+class Engine(Backbone):
+    """Computes networks as torch runs them; what they are given and what becomes of it is the synthesizer's.
 
     Tensors may come from any device and are float32 unless `like` says otherwise; results lie where `like` does.
     """
 
+    def __init__(self, networks: Networks) -> None:
+        self._networks = networks
+
     @property
     def like(self) -> Tensor:
         """A tensor of the device and precision that conditioning is wanted in."""
-        ...
+        return self._networks.unet.stem.weight
 
     def tokens(self, frames: Tensor) -> Tensor | None:
         """Image tokens of frames [N, 3, H, W] in [-1, 1]: [N, D]; None without an image tower."""
-        ...
+        tower = self._networks.config.image_encoder
+        if tower is None:
+            return None
+        return self.compute("image_encoder", clip_pixels(frames.to(self.like.device), tower.image_size).to(self.like))
 
     def condition_mean(self, frames: Tensor) -> Tensor:
         """Unscaled latents of frames [N, 3, H, W] in [-1, 1]: [N, C, h, w]."""
-        ...
+        return self.compute("condition_encoder", frames.to(self.like))
 
     def camera(self, path: Trajectory) -> Tensor | None:
         """What the U-Net is told of a camera path, [T, W]; None for a model without camera control."""
-        ...
+        embedder = self._networks.camera
+        return None if embedder is None else embedder(path)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """From noise [K, T, C, h, w] to clean latents; reports to `options.progress`, stops for `options.cancel`.
@@ -50,36 +59,6 @@ class Engine(Backbone, Protocol):
 
     def decode(self, latents: Tensor) -> Tensor:
         """Unscaled latents of one clip [T, C, h, w] -> pictures float32 [T, 3, H, W], about [-1, 1]."""
-        ...
-
-
-NetworkName = Literal["image_encoder", "condition_encoder", "decoder"]
-
-
-class TorchEngine(Engine):
-    """The networks as torch runs them, the U-Net in its own precision."""
-
-    def __init__(self, networks: Networks) -> None:
-        self._networks = networks
-
-    @property
-    def like(self) -> Tensor:
-        return self._networks.unet.stem.weight
-
-    def tokens(self, frames: Tensor) -> Tensor | None:
-        tower = self._networks.config.image_encoder
-        if tower is None:
-            return None
-        return self.compute("image_encoder", clip_pixels(frames.to(self.like.device), tower.image_size).to(self.like))
-
-    def condition_mean(self, frames: Tensor) -> Tensor:
-        return self.compute("condition_encoder", frames.to(self.like))
-
-    def camera(self, path: Trajectory) -> Tensor | None:
-        embedder = self._networks.camera
-        return None if embedder is None else embedder(path)
-
-    def decode(self, latents: Tensor) -> Tensor:
         return self.compute("decoder", latents.to(self._networks.decoder.stem.weight)).float()
 
     def compute(self, name: NetworkName, given: Tensor) -> Tensor:

@@ -1,7 +1,14 @@
 """Poses, spherical cameras, camera paths and the pinhole: plain geometry, no network."""
 
-from gcd_model.geometry.pinhole import Intrinsics, center_crop_box
-from gcd_model.geometry.pose import CameraMount, invert_rigid, look_at, relative_pose, require_rigid
+from gcd_model.geometry.pose import (
+    CameraMount,
+    Intrinsics,
+    center_crop_box,
+    invert_rigid,
+    look_at,
+    relative_pose,
+    require_rigid,
+)
 from gcd_model.geometry.spherical import (
     LOOK_AT,
     DeltaFit,

@@ -131,11 +131,7 @@ def driving_trajectory(*, frames: int, move_time: int, mount: CameraMount | None
     done = path_progress(frames, move_time, "sine")[:, None]
     position = torch.lerp(_point(DRIVING_SOURCE_POSITION), _point(DRIVING_GOAL_POSITION), done)  # [T, 3]
     target = torch.lerp(_point(DRIVING_SOURCE_TARGET), _point(DRIVING_GOAL_TARGET), done)
-    if mount is None:
-        vehicle_from_source = look_at(_point(DRIVING_SOURCE_POSITION), _point(DRIVING_SOURCE_TARGET))
-    else:
-        vehicle_from_source = mount.vehicle_from_camera
-    return pose_trajectory(relative_pose(vehicle_from_source, look_at(position, target)))
+    return pose_trajectory(relative_pose((mount or CameraMount()).vehicle_from_camera, look_at(position, target)))
 
 
 def pose_trajectory(source_from_target: Tensor) -> Trajectory:
@@ -172,17 +168,14 @@ def fitted_trajectory(source_from_target: Tensor, source: Spherical) -> tuple[Tr
     return _trajectory_on_sphere(source, torch.stack([_numbers(fit.delta) for fit in fits])), fits
 
 
-def motion_bucket(
-    delta: SphericalDelta, *, max_azimuth_deg: float, max_elevation_deg: float, low: float = 0.0, high: float = 255.0
-) -> int:
+def motion_bucket(delta: SphericalDelta, *, max_azimuth_deg: float, max_elevation_deg: float) -> int:
     """The number that tells the network how far the camera moves.
 
-        round(low + (high - low) * |(d_azimuth, d_elevation)| / |(max_azimuth, max_elevation)|)
+        round(255 * |(d_azimuth, d_elevation)| / |(max_azimuth, max_elevation)|), not clamped beyond 255
 
     Args:
         delta: the whole change; the radius does not count.
         max_azimuth_deg, max_elevation_deg: the largest change the checkpoint was trained for.
-        low, high: the numbers for no change and for both angles at their largest. Not clamped beyond.
     Raises:
         OptionError: both limits are 0.
     Source: Generative Camera Dolly, Kubric-4D, as released.
@@ -190,8 +183,7 @@ def motion_bucket(
     largest_deg = math.hypot(max_azimuth_deg, max_elevation_deg)
     if not largest_deg > 0.0:
         raise OptionError("the motion number needs a largest angle above 0; give the motion number itself instead")
-    share = math.hypot(delta.azimuth_deg, delta.elevation_deg) / largest_deg
-    return round(low + (high - low) * share)
+    return round(255.0 * (math.hypot(delta.azimuth_deg, delta.elevation_deg) / largest_deg))
 
 
 def _trajectory_on_sphere(source: Spherical, deltas: Tensor) -> Trajectory:

@@ -143,7 +143,12 @@ class Trunk(nn.Module):
 
         beside: [N, B, H / s, W / s], pictures at a size that patches divide, too.
         """
-        x = self.down[0](self._stem(pictures, beside), embedding)
+        own = pictures.shape[1] * self.patch**2
+        x = convolved(self.stem.weight[:, :own], self.stem.bias, pictures, self.patch)
+        if beside is not None:
+            patch = beside.shape[-1] * self.patch // pictures.shape[-1]
+            x = x + convolved(self.stem.weight[:, own:], None, beside, patch)
+        x = self.down[0](x, embedding)
         kept: list[Tensor] = []
         for shrink, block in zip(self.shrink, list(self.down)[1:-1], strict=True):
             kept.append(x)
@@ -156,16 +161,6 @@ class Trunk(nn.Module):
         for joining, after, fine in zip(blocks[::2], blocks[1::2], reversed(kept), strict=True):
             x = torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), fine], dim=1)
             x = after(joining(x, embedding), embedding)
-        return x
-
-    def _stem(self, pictures: Tensor, beside: Tensor | None) -> Tensor:
-        """[N, widths[0], H / patch, W / patch]."""
-        own = pictures.shape[1] * self.patch**2
-        x = convolved(self.stem.weight[:, :own], self.stem.bias, pictures, self.patch)
-        if beside is not None:
-            x = x + convolved(
-                self.stem.weight[:, own:], None, beside, beside.shape[-1] * self.patch // pictures.shape[-1]
-            )
         return x
 
 

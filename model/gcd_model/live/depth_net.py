@@ -8,6 +8,7 @@ how far the plane sweep is trusted: bins that explain the earlier frame badly lo
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -79,22 +80,18 @@ class DepthNet(nn.Module):
     def __init__(self, config: DepthConfig, classes: int) -> None:
         super().__init__()
         self.config, self.classes = config, classes
-        beside = sweep_channels(config) * self._sweep_patch**2
+        beside = (config.bins + 1) * (config.patch // SWEEP_SCALE) ** 2
         self.trunk = Trunk(INPUTS, config.widths, config.patch, mixers=config.mixers, beside=beside)
         outputs = 2 * config.bins - 1 + classes + 3
         self.head = FineHead(
             INPUTS, config.widths[0], config.fine_width, outputs, config.patch, half_width=config.half_width
         )
 
-    @property
-    def _sweep_patch(self) -> int:
-        return self.config.patch // SWEEP_SCALE
-
     def features(self, inputs: Tensor, sweep: Tensor | None = None) -> Tensor:
         """What the heads look at: [N, widths[0], H / patch, W / patch]. Args: see `forward`."""
         n, _, height, width = inputs.shape
         if sweep is None:
-            sweep = inputs.new_zeros(n, sweep_channels(self.config), height // SWEEP_SCALE, width // SWEEP_SCALE)
+            sweep = inputs.new_zeros(n, self.config.bins + 1, height // SWEEP_SCALE, width // SWEEP_SCALE)
         return self.trunk(inputs, beside=sweep.to(inputs))
 
     def forward(self, inputs: Tensor, sweep: Tensor | None = None, pixels: Tensor | None = None) -> DepthOutput:
@@ -162,17 +159,10 @@ def depth_inputs(pictures: Tensor, rays: Tensor, ground_m: Tensor) -> Tensor:
     return torch.cat([pictures, rays, ground[:, None], known[:, None].to(pictures)], dim=1)
 
 
-def pixel_rays(lens: Intrinsics, device: torch.device | None = None) -> Tensor:
-    """x / z and y / z through each pixel's centre: float32 [2, H, W]."""
-    x = (torch.arange(lens.width, dtype=torch.float32, device=device) + 0.5 - lens.cx) / lens.fx
-    y = (torch.arange(lens.height, dtype=torch.float32, device=device) + 0.5 - lens.cy) / lens.fy
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"))
-
-
 def plane_depth(rays: Tensor, up: Tensor, height_m: Tensor | float) -> Tensor:
     """Depth of a plane below each camera: float32 [..., H, W], 0 where no ray meets it.
 
-    rays: [..., 2, H, W], see `pixel_rays`. up: [..., 3], the plane's normal in camera axes, towards the camera.
+    rays: [..., 2, H, W], see `Intrinsics.rays`. up: [..., 3], the plane's normal in camera axes, towards the camera.
     height_m: [...], of the camera over the plane.
     """
     x, y = rays.unbind(dim=-3)
@@ -210,11 +200,11 @@ def read_depth(output: DepthOutput, config: DepthConfig) -> DepthReading:
     spread = ((places - place[:, None]).square() * weight).sum(dim=1).sqrt()
     sky = probability[:, -1] > best
     confidence = torch.maximum(best, probability[:, -1])
-    metres = torch.where(sky, SKY_M, place.exp())
+    metres, log = torch.where(sky, SKY_M, place.exp()), output.classes.log_softmax(dim=1)
     return DepthReading(
         metres=torch.where(sky, SKY_M, _smoothed(metres, confidence)),
         spread=spread,
-        entropy=_entropy(output.classes),
+        entropy=-(log.exp() * log).sum(dim=1).mean(dim=(1, 2)) / math.log(log.shape[1]),
     )
 
 
@@ -236,12 +226,6 @@ def _smoothed(metres: Tensor, confidence: Tensor) -> Tensor:
     return 1 / inverse
 
 
-def _entropy(logits: Tensor) -> Tensor:
-    """Mean over pixels of the entropy of choices [N, C, H, W], in parts of log C: [N]."""
-    log = logits.log_softmax(dim=1)
-    return -(log.exp() * log).sum(dim=1).mean(dim=(1, 2)) / math.log(logits.shape[1])
-
-
 # --- what the camera's own motion tells of depth: how well each depth explains an earlier frame ----------------------
 
 # For every pixel and every bin of depth the earlier picture is looked up where that point would have been; at the right
@@ -249,26 +233,18 @@ def _entropy(logits: Tensor) -> Tensor:
 # Source: the cost volume of Watson et al. 2021 (ManyDepth), with colours instead of features.
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Reference:
-    """An earlier frame of the same camera.
-
-    picture: [3, H, W] in [-1, 1]. reference_from_camera: float64 [4, 4], metres.
-    """
+class Reference(NamedTuple):
+    """An earlier frame of the same camera. picture: [3, H, W] in [-1, 1]. reference_from_camera: float64 [4, 4],
+    metres."""
 
     picture: Tensor
     reference_from_camera: Tensor
 
 
-def sweep_channels(config: DepthConfig) -> int:
-    """A cost for every bin, the sky's among them, and whether there is a reference at all."""
-    return config.bins + 1
-
-
 def sweep_costs(picture: Tensor, lens: Intrinsics, reference: Reference | None, config: DepthConfig) -> Tensor:
     """`plane_sweep` of one picture [3, H, W], with an earlier one or none: [bins + 1, H/2, W/2]."""
     if reference is None:
-        return picture.new_zeros(sweep_channels(config), lens.height // SWEEP_SCALE, lens.width // SWEEP_SCALE)
+        return picture.new_zeros(config.bins + 1, lens.height // SWEEP_SCALE, lens.width // SWEEP_SCALE)
     earlier = reference.picture.to(picture)
     lenses = torch.tensor([[lens.fx, lens.fy, lens.cx, lens.cy]], device=picture.device)
     return plane_sweep(picture[None], lenses, earlier[None], reference.reference_from_camera[None], config)[0]
@@ -295,7 +271,9 @@ def plane_sweep(
     y = ((torch.arange(height, device=here.device) + 0.5) * SWEEP_SCALE - cy[:, None]) / fy[:, None]
     u, v = x[:, None].expand(n, height, width), y[:, :, None].expand(n, height, width)
     turned = into @ turn @ torch.stack([u, v, torch.ones_like(u)], dim=1).flatten(2)  # [N, 3, h*w], of points 1 m ahead
-    shifts = (into @ step[..., None]) * _inverse_depths(config).to(here.device)  # [N, 3, bins]
+    steps = (torch.arange(config.bins - 1) + 0.5) / (config.bins - 1)
+    inverse = torch.cat([(config.nearest_m / config.farthest_m) ** steps / config.nearest_m, torch.zeros(1)])  # 1 / m
+    shifts = (into @ step[..., None]) * inverse.to(here.device)  # [N, 3, bins], the sky's last
     across, down, z = (turned[:, :, None] + shifts[..., None]).unbind(dim=1)  # [N, bins, h*w] each
     inside = (z > _BEHIND_M) & (across.abs() <= z) & (down.abs() <= z)
     place = torch.stack([across, down], dim=-1) / z.clamp(min=_BEHIND_M)[..., None]  # [N, bins, h*w, 2]
@@ -303,12 +281,6 @@ def plane_sweep(
     difference = (looked_up - here.flatten(2)[:, :, None]).abs().mean(dim=1) * _CONTRAST  # [N, bins, h*w]
     costs = torch.where(inside, difference, _UNSEEN)
     return torch.cat([costs, torch.ones_like(costs[:, :1])], dim=1).view(n, -1, height, width)
-
-
-def _inverse_depths(config: DepthConfig) -> Tensor:
-    """Of the bins' centres, 1 / m; 0 for the sky: [bins]."""
-    steps = (torch.arange(config.bins - 1) + 0.5) / (config.bins - 1)
-    return torch.cat([(config.nearest_m / config.farthest_m) ** steps / config.nearest_m, torch.zeros(1)])
 
 
 # --- how unlike its training a picture looks: classes it is unsure of, features it never had -------------------------

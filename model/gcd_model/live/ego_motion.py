@@ -7,8 +7,8 @@ drifts less than a sum of steps. Every sighting's depth improves that place. Ope
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,25 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.errors import PoseError
-from gcd_model.geometry import Intrinsics
-from gcd_model.geometry.pose import require_rigid
-from gcd_model.live.track_pose import (
-    BEHIND_M,
-    OUTLIER,
-    Tracks,
-    inverse,
-    likeliest_pose,
-    no_tracks,
-    projected,
-    unprojected,
-)
+from gcd_model.geometry import Intrinsics, require_rigid
+from gcd_model.live.config import SKY_M
 
 Array = NDArray[Any]
 
 _LONGEST_STEP_M, _LARGEST_TURN_DEG = 5.0, 45.0
 """Between two frames; beyond, the odometry jumps or the points mislead."""
-_FARTHEST_M = 1000.0
-"""Where the sky is put; it shows how the camera turns."""
 _CORNERS, _CORNER_QUALITY, _CORNER_GAP_PX, _BORDER_PX = 250, 0.003, 4, 2
 _WINDOW_PX, _LEVELS = 7, 3
 """Of the optical flow. A larger window mixes near and far: 11 pixels double the error."""
@@ -55,7 +43,30 @@ _OTHER_SURFACE = 0.15
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Motion:
+class Tracks:
+    """N points of the world that are followed.
+
+    place: float32 [N, 2], where the last frame shows them, pixels as OpenCV counts them. point: [N, 3].
+    eye: [N, 3], from where they were seen, on average. share: [N], standard error of its depth, in parts of it.
+    """
+
+    place: Array
+    point: Array
+    eye: Array
+    share: Array
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def rows(self, index: Array) -> "Tracks":
+        """Some of them: numbers, or bool [N]."""
+        return Tracks(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+
+NO_TRACKS = Tracks(place=np.zeros((0, 2), np.float32), point=np.zeros((0, 3)), eye=np.zeros((0, 3)), share=np.zeros(0))
+
+
+class Motion(NamedTuple):
     """Where the camera of a frame is.
 
     world_from_camera: float64 [4, 4]; the world is the camera of the first frame, or of the last one that was lost.
@@ -67,55 +78,30 @@ class Motion:
     lost: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Frame:
+class _Frame(NamedTuple):
     """grey: u8 [H, W]. depth: [H, W] metres. share: [H, W], its standard error in parts of it. usable: u8 [H, W], 1
     where something static has a depth."""
 
     grey: Array
+    lens: Intrinsics
+    odometry: Array | None
     depth: Array
     share: Array
     usable: Array
-    lens: Intrinsics
-    odometry: Tensor | None
-
-    def with_depth(self, depth: Tensor, static: Tensor, spread: Tensor | None) -> "_Frame":
-        depth, static = depth.cpu(), static.cpu()
-        usable = (static & depth.isfinite() & (depth > 0)).to(torch.uint8)
-        inner = torch.zeros_like(usable)
-        inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
-        inner[inside] = usable[inside]
-        share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread.cpu() * _SPREADS).clamp(min=_SUREST)
-        return replace(self, depth=depth.double().numpy(), share=share.double().numpy(), usable=inner.numpy())
 
 
-class _LostError(Exception):
-    """Says why the motion is unknown."""
+class _LostError(Exception): ...
 
 
 class EgoMotion:
-    """Follows one source camera; reset() where another lens or another camera takes over."""
+    """Follows one source camera; the first frame is where the world begins."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the last frame: the next one is where the world begins."""
         self._last: _Frame | None = None
-        self._new: _Frame | None = None
         self._begin_world()
 
     def _begin_world(self) -> None:
-        self._pose, self._step = np.eye(4), np.eye(4)
-        self._tracks = no_tracks()
-
-    def step(
-        self, picture: Tensor, depth: Tensor, static: Tensor, lens: Intrinsics, odometry: Tensor | None = None
-    ) -> Motion:
-        """`follow` and `settle` at once, where depth is known beforehand."""
-        motion = self.follow(picture, lens, odometry)
-        self.settle(depth, static)
-        return motion
+        self._pose, self._step, self._tracks = np.eye(4), np.eye(4), NO_TRACKS
 
     def follow(self, picture: Tensor, lens: Intrinsics, odometry: Tensor | None = None) -> Motion:
         """The motion from the last frame that was settled to this one.
@@ -125,23 +111,16 @@ class EgoMotion:
             odometry: float64 [4, 4], world_from_camera in a world of its own; only differences count. Two frames in a
                 row must have it, else the pictures decide.
         """
-        refused = None
-        if odometry is not None:
-            try:
-                odometry = require_rigid(odometry, "odometry").double()
-            except PoseError as error:
-                odometry, refused = None, str(error)
-        last, self._new = self._last, _frame(picture, lens, odometry)
+        grey = torch.tensordot(torch.tensor([0.299, 0.587, 0.114]), picture.cpu().float(), dims=1) * 127.5 + 127.5
+        stated = None if odometry is None else odometry.cpu().numpy()
+        self._new, lost = (grey.round().clamp(0, 255).to(torch.uint8).numpy(), lens, stated), None
         try:
-            if refused:
-                raise _LostError(refused)
-            if last is None:
-                return Motion(world_from_camera=torch.eye(4, dtype=torch.float64))
-            self._advance(last, self._new)
+            if self._last is not None:
+                self._advance(self._last, *self._new)
         except _LostError as error:
             self._begin_world()
-            return Motion(world_from_camera=torch.eye(4, dtype=torch.float64), lost=str(error))
-        return Motion(world_from_camera=torch.from_numpy(self._pose.copy()))
+            lost = str(error)
+        return Motion(torch.from_numpy(self._pose.copy()), lost)
 
     def settle(self, depth: Tensor, static: Tensor, spread: Tensor | None = None) -> None:
         """What the frame shows that was just followed: the next one's motion hangs on it.
@@ -150,39 +129,29 @@ class EgoMotion:
             depth: [H, W] metres, 1000 for the sky; 0 or not finite: a hole. static: bool [H, W], what does not move.
             spread: [H, W], standard deviation of log-depth; None for depth from elsewhere.
         """
-        if self._new is None:
-            return
-        self._last = frame = self._new.with_depth(depth, static, spread)
+        depth = depth.cpu()
+        inner = torch.zeros(depth.shape, dtype=torch.uint8)
+        inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
+        inner[inside] = (static.cpu() & depth.isfinite() & (depth > 0))[inside].to(torch.uint8)
+        share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread.cpu() * _SPREADS).clamp(min=_SUREST)
+        self._last = frame = _Frame(
+            *self._new, depth=depth.double().numpy(), share=share.double().numpy(), usable=inner.numpy()
+        )
         if len(self._tracks):
             column, row = np.rint(self._tracks.place).astype(int).T
-            here = self._pose
-            self._tracks = _placed_better(self._tracks, frame, here).rows(frame.usable[row, column] > 0)
+            self._tracks = _placed_better(self._tracks, frame, self._pose).rows(frame.usable[row, column] > 0)
 
-    def _advance(self, last: _Frame, frame: _Frame) -> None:
+    def _advance(self, last: _Frame, grey: Array, lens: Intrinsics, odometry: Array | None) -> None:
         """The pose, the last step and the tracks of this frame. Raises _LostError."""
-        if last.odometry is not None and frame.odometry is not None:
-            step = inverse(last.odometry.numpy()) @ frame.odometry.numpy()
+        if last.odometry is not None and odometry is not None:
+            step = inverse(last.odometry) @ odometry
             _require_plausible(step, "the odometry")
-            pose, tracks = self._pose @ step, no_tracks()
+            pose, tracks = self._pose @ step, NO_TRACKS
         else:
-            pose, tracks = _followed(last, frame, self._tracks, self._pose, self._pose @ self._step)
+            pose, tracks = _followed(last, grey, lens, self._tracks, self._pose, self._pose @ self._step)
             step = inverse(self._pose) @ pose
             _require_plausible(step, "the picture")
         self._pose, self._step, self._tracks = pose, step, tracks
-
-
-def _frame(picture: Tensor, lens: Intrinsics, odometry: Tensor | None) -> _Frame:
-    weights = torch.tensor([0.299, 0.587, 0.114])
-    grey = torch.tensordot(weights, picture.cpu().float(), dims=1) * 127.5 + 127.5
-    nothing = np.zeros(grey.shape, np.uint8)
-    return _Frame(
-        grey=grey.round().clamp(0, 255).to(torch.uint8).numpy(),
-        depth=nothing.astype(np.float64),
-        share=nothing.astype(np.float64),
-        usable=nothing,
-        lens=lens,
-        odometry=odometry,
-    )
 
 
 def require_motion(before: Tensor | None, after: Tensor) -> Tensor:
@@ -209,25 +178,25 @@ def _require_plausible(step: Array, what: str) -> None:
         )
 
 
-def _followed(last: _Frame, frame: _Frame, tracks: Tracks, pose: Array, guess: Array) -> tuple[Array, Tracks]:
+def _followed(
+    last: _Frame, grey: Array, lens: Intrinsics, tracks: Tracks, pose: Array, guess: Array
+) -> tuple[Array, Tracks]:
     """world_from_camera of the frame, and the tracks that agree with it; of the frame itself no depth is asked.
 
     pose: of the last frame. guess: of this one, had the camera gone on as before.
     """
-    pictures = _contrasted(last.grey, frame.grey)
+    pictures = _contrasted(last.grey, grey)
     tracks = _with_new_corners(tracks, last, pictures[0], pose)
-    seen = _seen_again(tracks, pictures, frame.lens, pose, guess) if len(tracks) else tracks
+    seen = _seen_again(tracks, pictures, lens, pose, guess) if len(tracks) else tracks
     if len(seen) < _FEWEST:
         raise _LostError(f"only {len(seen)} of {len(tracks)} static corners are seen again; {_FEWEST} are needed")
-    here, errors = likeliest_pose(seen, frame.lens, pose, guess)
+    here, errors = likeliest_pose(seen, lens, pose, guess)
     agree = errors < OUTLIER
     needed = max(_FEWEST, math.ceil(_SMALLEST_SHARE * len(seen)))
     if agree.sum() < needed:
         raise _LostError(f"only {agree.sum()} of {len(seen)} static corners agree on a motion; {needed} are needed")
     seen = seen.rows(agree)
-    shift = np.linalg.norm(
-        projected(seen.point, here, frame.lens)[1] - projected(seen.point, pose, frame.lens)[1], axis=1
-    )
+    shift = np.linalg.norm(projected(seen.point, here, lens)[1] - projected(seen.point, pose, lens)[1], axis=1)
     if np.quantile(shift, _STANDS_SHARE) < _STANDS_PX:
         here = pose
     return here, seen
@@ -294,7 +263,7 @@ def _placed_better(tracks: Tracks, frame: _Frame, pose: Array) -> Tracks:
     column, row = np.rint(tracks.place).astype(int).T
     depth = frame.depth[row, column]
     expected = (tracks.point - pose[:3, 3]) @ pose[:3, 2]
-    same = (depth > 0) & (depth < _FARTHEST_M) & (np.abs(depth - expected) < _OTHER_SURFACE * expected)
+    same = (depth > 0) & (depth < SKY_M) & (np.abs(depth - expected) < _OTHER_SURFACE * expected)
     sighting = unprojected(tracks.place, np.where(same, depth, 1.0), frame.lens, pose)
     old, new = tracks.share**2, frame.share[row, column] ** 2
     gain = np.where(same, old / (old + new), 0.0)
@@ -305,3 +274,126 @@ def _placed_better(tracks: Tracks, frame: _Frame, pose: Array) -> Tracks:
         eye=tracks.eye + gain[:, None] * (pose[:3, 3] - tracks.eye),
         share=np.sqrt(joined),
     )
+
+
+# --- where a camera is that sees points whose places are known, some of them wrongly ---------------------------------
+
+_MOST = 0.75
+"""Share of the tracks that agree with a pose from which on no other is tried."""
+_RANSAC_PX, _RANSAC_ROUNDS = 2.0, 150
+_FLOW_PX = 0.25
+"""Standard error of a followed place."""
+_DOUBTED, OUTLIER, _HOPELESS = 1.5, 4.0, 12.0
+"""In standard errors: from here on a track counts less, not at all, and not even while the pose is still rough."""
+_ROUGH_STEPS, _FINE_STEPS, _SETTLED = 4, 4, 1e-5
+"""Of the least squares; settled once the camera moves by no more than this, metres and radians."""
+BEHIND_M = 0.05
+
+
+def likeliest_pose(tracks: Tracks, lens: Intrinsics, pose: Array, guess: Array) -> tuple[Array, Array]:
+    """The pose with which most tracks agree, and by how many standard errors each differs: [N].
+
+    Going on as before is tried first, then standing, then what RANSAC finds.
+    """
+    best, agreed = (guess, np.full(len(tracks), np.inf)), -1
+    for start in (lambda: guess, lambda: pose, lambda: _consensus(tracks, lens, guess)):
+        refined = _refined(tracks, lens, start())
+        count = int((refined[1] < OUTLIER).sum())
+        if count > agreed:
+            best, agreed = refined, count
+        if agreed > _MOST * len(tracks):
+            break
+    return best
+
+
+def _consensus(tracks: Tracks, lens: Intrinsics, guess: Array) -> Array:
+    """The pose that RANSAC finds; the guess where it finds none."""
+    import cv2
+
+    cv2.setRNGSeed(0)
+    found, turn, step, _ = cv2.solvePnPRansac(
+        tracks.point,
+        tracks.place.astype(np.float64),
+        np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]]),
+        None,
+        iterationsCount=_RANSAC_ROUNDS,
+        reprojectionError=_RANSAC_PX,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    usable = found and np.isfinite(turn).all() and np.isfinite(step).all()
+    return inverse(rigid(turn[:, 0], step[:, 0])) if usable else guess
+
+
+def _refined(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
+    """Robust least squares over all tracks: the pose, and by how many standard errors each track differs from it."""
+    for number in range(_ROUGH_STEPS + _FINE_STEPS):
+        limit = _HOPELESS if number < _ROUGH_STEPS else OUTLIER
+        residual, slope = _reprojection(tracks, lens, pose)
+        distance = np.linalg.norm(residual, axis=1)
+        weight = np.minimum(1.0, _DOUBTED / np.maximum(distance, 1e-9)) * (distance < limit)
+        weighted = (slope * weight[:, None, None]).reshape(-1, 6)
+        normal = weighted.T @ slope.reshape(-1, 6) + 1e-6 * np.eye(6)
+        change = np.linalg.solve(normal, weighted.T @ residual.reshape(-1))
+        pose = pose @ inverse(rigid(change[3:], change[:3]))
+        if number >= _ROUGH_STEPS and np.abs(change).max() < _SETTLED:
+            break
+    distance = np.linalg.norm(_reprojection(tracks, lens, pose)[0], axis=1)
+    behind = projected(tracks.point, pose, lens)[0][:, 2] <= BEHIND_M
+    return pose, np.where(behind, np.inf, distance)
+
+
+def _reprojection(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
+    """Residuals [N, 2] and their slopes by a step and a turn of the camera [N, 2, 6], in standard errors.
+
+    A wrong depth moves a point along the ray on which it was seen: in that direction of the picture it counts less.
+    """
+    local, place = projected(tracks.point, pose, lens)
+    x, y, z = local.T
+    z = np.maximum(z, BEHIND_M)
+    slope = np.zeros((len(z), 2, 6))  # by the step [0:3], which is the slope by the point, and by the turn [3:6]
+    slope[:, 0, 0], slope[:, 0, 2] = lens.fx / z, -lens.fx * x / z**2
+    slope[:, 1, 1], slope[:, 1, 2] = lens.fy / z, -lens.fy * y / z**2
+    right, down, ahead = np.moveaxis(slope[:, :, :3], 2, 0)  # each [N, 2]
+    x, y, z = x[:, None], y[:, None], z[:, None]
+    slope[:, :, 3], slope[:, :, 4], slope[:, :, 5] = y * ahead - z * down, z * right - x * ahead, x * down - y * right
+    ray = (tracks.point - tracks.eye) @ pose[:3, :3]
+    blur = (slope[:, :, :3] @ ray[:, :, None])[:, :, 0] * tracks.share[:, None]
+    size = np.linalg.norm(blur, axis=1)[:, None]
+    along = blur / np.maximum(size, 1e-9)
+    excess = (1 - _FLOW_PX / np.hypot(_FLOW_PX, size)) * along
+    residual = tracks.place - place
+    residual = residual - excess * (along * residual).sum(1, keepdims=True)
+    slope = slope - excess[:, :, None] * (along[:, None] @ slope)
+    return residual / _FLOW_PX, slope / _FLOW_PX
+
+
+def unprojected(place: Array, depth: Array, lens: Intrinsics, pose: Array) -> Array:
+    """Points of the world, [N, 3], from their places in a picture, [N, 2], and their depths, [N]."""
+    x, y = (place[:, 0] + 0.5 - lens.cx) / lens.fx, (place[:, 1] + 0.5 - lens.cy) / lens.fy
+    return np.stack([x * depth, y * depth, depth], axis=1) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def projected(point: Array, pose: Array, lens: Intrinsics) -> tuple[Array, Array]:
+    """In the camera's axes [N, 3], and in its picture [N, 2] as OpenCV counts pixels."""
+    local = (point - pose[:3, 3]) @ pose[:3, :3]
+    z = np.maximum(local[:, 2], BEHIND_M)
+    return local, np.stack(
+        [local[:, 0] / z * lens.fx + lens.cx - 0.5, local[:, 1] / z * lens.fy + lens.cy - 0.5], axis=1
+    )
+
+
+def rigid(rotation: Array, translation: Array) -> Array:
+    """rotation: [3], its axis times its angle."""
+    import cv2
+
+    a_from_b = np.eye(4)
+    a_from_b[:3, :3], a_from_b[:3, 3] = cv2.Rodrigues(rotation)[0], translation
+    return a_from_b
+
+
+def inverse(a_from_b: Array) -> Array:
+    """Of a rigid transform, [4, 4]."""
+    b_from_a = np.eye(4)
+    b_from_a[:3, :3] = a_from_b[:3, :3].T
+    b_from_a[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
+    return b_from_a

@@ -1,20 +1,21 @@
-"""What a source frame shows: depth, classes, what moves, and where the camera is.
+"""What a source frame shows, where the camera is, and what is remembered of earlier frames.
 
-frame + an earlier one -> depth network, ego-motion -> SeenFrame
+frame + an earlier one -> depth network, ego-motion -> SeenFrame -> SeenWorld -> PlacedFrame
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gcd_model.errors import ShapeError
 from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.blocks import likeliest
-from gcd_model.live.config import SIZE_FACTOR, SKY_M
-from gcd_model.live.depth_net import Reference, depth_inputs, pixel_rays, plane_depth, read_depth, sweep_costs
+from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.depth_net import Reference, depth_inputs, plane_depth, read_depth, sweep_costs
 from gcd_model.live.ego_motion import EgoMotion
+from gcd_model.live.splat import Splat, Surfels, inverse_depth, relative_slopes, splat, true_at, unproject
 from gcd_model.networks import LiveNetworks
 
 _FRAMES = 6
@@ -73,10 +74,6 @@ class References:
         self._frames: deque[tuple[Tensor, Tensor]] = deque(maxlen=_FRAMES)
         self._median_m = 0.0
 
-    def reset(self) -> None:
-        """Forget them."""
-        self._frames.clear()
-
     def add(self, picture: Tensor, world_from_camera: Tensor, metres: Tensor) -> None:
         """picture: [3, H, W]. metres: [H, W]; 0 for holes."""
         self._frames.append((picture, world_from_camera))
@@ -88,7 +85,7 @@ class References:
         for picture, pose in self._frames:
             move = invert_rigid(pose) @ world_from_camera
             if float(move[:3, 3].norm()) <= LONGEST * self._median_m:
-                return Reference(picture=picture, reference_from_camera=move)
+                return Reference(picture, move)
         return None
 
 
@@ -98,15 +95,12 @@ class Eyes:
     def __init__(self, networks: LiveNetworks) -> None:
         self._networks, self._config = networks.eval(), networks.config
         self._device = next(networks.parameters()).device
-        self._ego, self._references = EgoMotion(), References()
         self._lens: Intrinsics | None = None
-        self._begins = True
+        self.reset()
 
     def reset(self) -> None:
         """Forget all frames: the next one begins."""
-        self._ego.reset()
-        self._references.reset()
-        self._begins = True
+        self._ego, self._references, self._begins = EgoMotion(), References(), True
 
     @torch.inference_mode()
     def look(
@@ -120,22 +114,22 @@ class Eyes:
     ) -> FrameGeometry:
         """Depth, classes and motion of one frame; leaves the state alone.
 
-        Args: see `step`. reference: an earlier frame, see `sweep_costs`.
+        Args: see `see`. reference: an earlier frame to compare it with.
         """
-        picture = self._checked(frame, lens)
-        rays = pixel_rays(lens, self._device)
+        picture, rays = frame.to(self._device, torch.float32), lens.rays(self._device)
         ground = torch.zeros_like(rays[0])
         if floor is not None:
             ground = plane_depth(rays, floor.up.to(self._device), floor.height_m)
         inputs = depth_inputs(picture[None], rays[None], ground[None])
         output = self._networks.depth(inputs, sweep_costs(picture, lens, reference, self._config.depth)[None])
         reading = read_depth(output, self._config.depth)
-        labels = likeliest(output.classes[0])
-        metres = reading.metres[0] if depth is None else _taken(depth, reading.metres[0], lens)
-        static = output.moves[0] < 0
-        ood = float(self._networks.familiarity.score(output.summary, reading.entropy)[0])
-        spread = reading.spread[0] if depth is None else None
-        return FrameGeometry(metres=metres, labels=labels, static=static, ood=ood, spread=spread)
+        return FrameGeometry(
+            metres=reading.metres[0] if depth is None else _taken(depth, reading.metres[0]),
+            labels=likeliest(output.classes[0]),
+            static=output.moves[0] < 0,
+            ood=float(self._networks.familiarity.score(output.summary, reading.entropy)[0]),
+            spread=reading.spread[0] if depth is None else None,
+        )
 
     @torch.inference_mode()
     def see(
@@ -146,7 +140,6 @@ class Eyes:
         depth: Tensor | None = None,
         odometry: Tensor | None = None,
         floor: Floor | None = None,
-        geometry: FrameGeometry | None = None,
     ) -> SeenFrame:
         """Take in one frame: its depth, its classes, and how the camera moved.
 
@@ -156,23 +149,19 @@ class Eyes:
             depth: [H, W] metres, 0 or not finite where unknown, instead of the depth network's.
             odometry: world_from_source [4, 4] of any world that stays the same from frame to frame; None: from the
                 pictures.
-            floor: where the declared mount has the ground. geometry: what the frame shows, if that is known.
-        Raises:
-            ShapeError: frame, depth and lens differ in size, or the size is no multiple of 32.
+            floor: where the declared mount has the ground.
         """
-        picture = self._checked(frame, lens)
+        picture = frame.to(self._device, torch.float32)
         if lens != self._lens:  # another camera, or another size of its pictures
             self.reset()
             self._lens = lens
-        motion = self._ego.follow(picture, lens, odometry)
-        if motion.lost is not None:
-            self._references.reset()
-        pose = motion.world_from_camera
-        if geometry is None:
-            geometry = self.look(frame, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
+        pose, lost = self._ego.follow(picture, lens, odometry)
+        if lost is not None:
+            self._references = References()
+        geometry = self.look(picture, lens, depth=depth, floor=floor, reference=self._references.chosen(pose))
         self._ego.settle(geometry.metres, geometry.static, geometry.spread)
         self._references.add(picture, pose, geometry.metres)
-        begins, self._begins = self._begins or motion.lost is not None, False
+        begins, self._begins = self._begins or lost is not None, False
         return SeenFrame(
             picture=picture,
             geometry=geometry,
@@ -180,22 +169,129 @@ class Eyes:
             floor=floor,
             world_from_source=pose,
             begins=begins,
-            lost=motion.lost,
+            lost=lost,
         )
 
-    def _checked(self, frame: Tensor, lens: Intrinsics) -> Tensor:
-        if frame.shape != (3, lens.height, lens.width) or lens.height % SIZE_FACTOR or lens.width % SIZE_FACTOR:
-            raise ShapeError(
-                f"a frame must be [3, H, W] of its lens's size ({lens.height} x {lens.width}), in multiples of "
-                f"{SIZE_FACTOR}, got {list(frame.shape)}"
-            )
-        return frame.to(self._device, torch.float32)
 
-
-def _taken(depth: Tensor, learned: Tensor, lens: Intrinsics) -> Tensor:
-    """Depth from elsewhere: bad numbers are holes, a hole in what the network calls sky is sky. Raises ShapeError."""
-    if depth.shape != (lens.height, lens.width):
-        raise ShapeError(f"depth must be [{lens.height}, {lens.width}] as its frame, got {list(depth.shape)}")
-    metres = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).float()
-    metres = metres.to(learned.device)
+def _taken(depth: Tensor, learned: Tensor) -> Tensor:
+    """Depth from elsewhere: bad numbers are holes, a hole in what the network calls sky is sky."""
+    metres = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).float().to(learned.device)
     return torch.where((metres == 0) & (learned >= SKY_M), SKY_M, metres)
+
+
+_NEAREST_M = 0.1
+"""What lies nearer to the source camera than this, or behind it, is outside its picture."""
+_SAME_SURFACE = 0.05
+"""Relative depth by which a surfel may lie behind what this frame sees and still be that surface, seen again."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class PlacedFrame:
+    """A seen frame and its views before anything is painted. targets: world_from_target [4, 4]. lens: of the views.
+    splats: all that was seen, as each target shows it."""
+
+    seen: SeenFrame
+    targets: tuple[Tensor, ...]
+    lens: Intrinsics
+    splats: tuple[Splat, ...]
+
+
+class SeenWorld:
+    """Frame by frame: `look`, then `splat` from as many targets as there are. Poses refer to one world throughout.
+
+    A frame's own surfels are remembered after it was drawn, so that all are splatted in one depth test.
+    """
+
+    def __init__(self, config: LiveConfig, device: torch.device | str = "cpu") -> None:
+        self._config, self._device = config, device
+        self._now = 0.0  # stamp of the newest frame's points
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: another scene, or a camera that jumped."""
+        self._fresh = self._static = self._memory = Surfels.empty(self._device)
+
+    @torch.inference_mode()
+    def look(
+        self,
+        picture: Tensor,
+        metres: Tensor,
+        labels: Tensor,
+        static: Tensor,
+        lens: Intrinsics,
+        world_from_source: Tensor,
+    ) -> None:
+        """Take in a frame.
+
+        Args:
+            picture: [3, H, W] in [-1, 1]. metres: [H, W], 0 for a hole. labels: uint8 [H, W]. static: bool [H, W], what
+                may be remembered. world_from_source: [4, 4].
+        """
+        self._now += 1.0
+        config, known = self._config, metres > 0
+        kept = remembered(self._memory, self._static, config.memory, config.memory_frames)
+        self._memory = unrefuted(kept, metres, lens, world_from_source, known)
+        self._fresh = unproject(metres, picture, labels, lens, world_from_source, self._now)
+        self._static = self._fresh.rows(static.flatten()[known.flatten()])
+
+    @torch.inference_mode()
+    def place(self, frame: SeenFrame, poses: Sequence[Tensor], target_lens: Intrinsics | None = None) -> PlacedFrame:
+        """Take in a frame, and splat all of it from every target.
+
+        poses: source_from_target [4, 4] of each view, metres. target_lens: of the views; None: the source's.
+        """
+        if frame.begins:
+            self.reset()
+        seen, pose, lens = frame.geometry, frame.world_from_source, target_lens or frame.lens
+        self.look(frame.picture, seen.metres, seen.labels, seen.static, frame.lens, pose)
+        targets = tuple(pose @ each for each in poses)
+        points = self._fresh.joined(self._memory)
+        splats = tuple(splat(points, each, lens, len(self._config.classes), self._now) for each in targets)
+        return PlacedFrame(seen=frame, targets=targets, lens=lens, splats=splats)
+
+    def splat(self, world_from_target: Tensor, lens: Intrinsics) -> Splat:
+        """All of it as a target camera sees it, in one depth test."""
+        points = self._fresh.joined(self._memory)
+        return splat(points, world_from_target, lens, len(self._config.classes), self._now)
+
+
+def remembered(memory: Surfels, fresh: Surfels, capacity: int, oldest_frames: int) -> Surfels:
+    """Both; what is beyond the capacity, or older than so many frames (0: no limit), goes, oldest first."""
+    every = memory.joined(fresh)
+    if not capacity or not len(every):
+        return memory
+    young = every.stamp >= every.stamp.max() - (oldest_frames or float("inf"))
+    every = every if bool(young.all()) else every.rows(young)
+    if len(every) <= capacity:
+        return every
+    oldest = every.stamp.kthvalue(len(every) - capacity + 1).values
+    newer, at = every.stamp > oldest, true_at(every.stamp == oldest)
+    room = capacity - int(newer.sum())  # of the oldest frame that still has some an even share is kept
+    newer[at[torch.arange(room, device=at.device) * len(at) // max(room, 1)]] = True
+    return every.rows(newer)
+
+
+def unrefuted(memory: Surfels, depth: Tensor, lens: Intrinsics, world_from_camera: Tensor, known: Tensor) -> Surfels:
+    """Without what a frame sees again or sees through; what is hidden from it, or out of its sight, stays.
+
+    What it sees is the plane of a pixel, not its middle alone: on a street the depth changes by half within a pixel.
+
+    Args:
+        depth: [H, W] metres, 0 or not finite where nothing is as far as the camera can see, as in the sky.
+        world_from_camera: [4, 4] of the source camera, which took the depth.
+        known: bool [H, W], false where the depth is a hole: it proves nothing.
+    """
+    if not len(memory):
+        return memory
+    position = memory.position
+    camera_from_world = invert_rigid(world_from_camera.to("cpu", torch.float64)).to(position)
+    x, y, z = torch.addmm(camera_from_world[:3, 3:], camera_from_world[:3, :3], position.T)
+    u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
+    inside = (z > _NEAREST_M) & (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)
+    column, row = (torch.where(inside, each, 0.0).floor() for each in (u, v))
+    pixel = (row * lens.width + column).long()
+    inverse = inverse_depth(depth)
+    here, right, down = (each.flatten().index_select(0, pixel) for each in (inverse, *relative_slopes(inverse)))
+    plane = here * (1 + right * (u - column - 0.5) + down * (v - row - 0.5))
+    refuted = inside & (z * plane <= 1 + _SAME_SURFACE) & known.flatten().index_select(0, pixel)
+    return memory.rows(~refuted)

@@ -192,13 +192,14 @@ class PaintNet(nn.Module):
             drawn = _smooth(self.detail(inputs.detach(), features.detach()).float())
             added = (crisp(mean.detach(), classes.detach()) - mean.detach() + drawn) * unseen
         known = (seen.log_depth != 0) & (seen.coverage > 0)
+        covered, now = (seen.coverage > 0.5).float(), (seen.now_share > 0.5).float()
         return Painted(
             mean=mean,
             detail=added,
             classes=classes,
             log_depth=log_depth[:, 0] + torch.where(known, seen.log_depth, _MEAN_DEPTH_LOG),
             log_variance=log_variance[:, 0] + _LOG_VARIANCE,
-            seen=state + _first_guess(seen),
+            seen=state + 4.0 * torch.stack([1 - covered, covered * (1 - now), covered * now], dim=1),  # as splatted
         )
 
     def denoised(self, seen: Seen, base: Tensor, x: Tensor, sigma: Tensor) -> Tensor:
@@ -210,13 +211,6 @@ class PaintNet(nn.Module):
         raw = self.head(inputs, self.trunk(inputs, self.embedded(seen, sigma)))[:, :3].float()
         scaled = c_skip[:, None, None, None] * away + c_out[:, None, None, None] * raw / SIGMA_DATA
         return base + scaled
-
-
-def _first_guess(seen: Seen) -> Tensor:
-    """Logits of never, before, now, as the splat has them: [N, 3, H, W]."""
-    covered = (seen.coverage > 0.5).float()
-    now = (seen.now_share > 0.5).float()
-    return 4.0 * torch.stack([1 - covered, covered * (1 - now), covered * now], dim=1)
 
 
 def crisp(mean: Tensor, classes: Tensor) -> Tensor:

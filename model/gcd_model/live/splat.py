@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gcd_model.errors import ShapeError
 from gcd_model.geometry import Intrinsics, invert_rigid
 
 _NEAREST_M = 0.1
@@ -138,21 +137,13 @@ def unproject(
         depth: [H, W] metres along the optical axis; 0, negative or not finite: none.
         colour: [3, H, W] in [-1, 1]. label: uint8 [H, W].
         world_from_camera: [4, 4]. keep: bool [H, W], the pixels to take; None: all.
-    Raises:
-        ShapeError: the pictures and the lens differ in size.
     """
-    size = (lens.height, lens.width)
-    if depth.shape != size or colour.shape != (3, *size) or label.shape != size:
-        raise ShapeError(
-            f"depth, colour and label must be {lens.height} x {lens.width} as the lens is, "
-            f"got {list(depth.shape)}, {list(colour.shape)}, {list(label.shape)}"
-        )
     inverse = inverse_depth(depth)
     taken = inverse > 0 if keep is None else (inverse > 0) & keep
     index = true_at(taken.flatten())
     z, slope_right, slope_down, red, green, blue, x, y = (
         each.flatten().index_select(0, index)
-        for each in (1 / inverse, *relative_slopes(inverse), *colour.float(), *_rays(lens, depth.device))
+        for each in (1 / inverse, *relative_slopes(inverse), *colour.float(), *lens.rays(depth.device))
     )
     # p = z ray; one pixel on, the ray turns by 1 / f and z changes by -z (step of 1/z) / (1/z)
     right, down = -z * slope_right, -z * slope_down
@@ -200,14 +191,6 @@ def _slope(inverse: Tensor) -> Tensor:
     return torch.where(same & relative.isfinite(), relative, 0.0).clamp(-_STEEPEST, _STEEPEST)
 
 
-def _rays(lens: Intrinsics, device: torch.device) -> tuple[Tensor, Tensor]:
-    """x / z and y / z through the pixel centres, [H, W] each."""
-    right = (torch.arange(lens.width, device=device) + 0.5 - lens.cx) / lens.fx
-    down = (torch.arange(lens.height, device=device) + 0.5 - lens.cy) / lens.fy
-    x, y = torch.meshgrid(right, down, indexing="xy")
-    return x, y
-
-
 @torch.no_grad()
 def splat(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics, classes: int, now: float) -> Splat:
     """The surfels in the picture of a target camera: in every pixel its nearest surface, newest surfels first.
@@ -222,10 +205,13 @@ def splat(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics, classes
     size = (lens.height + 2 * _MARGIN, lens.width + 2 * _MARGIN)
     pixels = size[0] * size[1]
     pixel, owner, weight, z = _in_front(_fragments(footprints, size[1]), pixels)
-    label, standing, facts = _shown(surfels, number, now)
+    stamp, painted = surfels.stamp.index_select(0, number), surfels.painted.index_select(0, number)
+    fresh = (stamp == now) & ~painted
+    standing = torch.where(painted, _PAINTED_WEIGHT, torch.where(fresh, 1.0, _OLD_WEIGHT))
+    colour, label = surfels.colour.index_select(0, number).T.contiguous(), surfels.label.index_select(0, number).long()
     share = weight * standing.index_select(0, owner)
     sums = weight.new_zeros(7, pixels)
-    for total, fact in zip(sums, facts, strict=False):
+    for total, fact in zip(sums, (*colour, now - stamp, fresh.float()), strict=False):
         total.scatter_add_(0, pixel, fact.index_select(0, owner).mul_(share))
     sums[5].scatter_add_(0, pixel, share / z)
     sums[6].scatter_add_(0, pixel, share)
@@ -243,19 +229,6 @@ def splat(surfels: Surfels, world_from_camera: Tensor, lens: Intrinsics, classes
         age=mean[3],
         now_share=mean[4],
     )
-
-
-def _shown(surfels: Surfels, number: Tensor, now: float) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """What surfels by number tell a pixel: label (int64), how much it counts, and five facts, [M] each.
-
-    The facts: red, green, blue, age, whether seen now.
-    """
-    stamp, painted = surfels.stamp.index_select(0, number), surfels.painted.index_select(0, number)
-    fresh = (stamp == now) & ~painted
-    standing = torch.where(painted, _PAINTED_WEIGHT, torch.where(fresh, 1.0, _OLD_WEIGHT))
-    colour = surfels.colour.index_select(0, number).T.contiguous()
-    facts = (*colour, now - stamp, fresh.float())
-    return surfels.label.index_select(0, number).long(), standing, facts
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

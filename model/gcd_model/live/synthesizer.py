@@ -1,28 +1,152 @@
-"""The live model behind the door of all models: clips of T frames in, views of T frames out."""
+"""The live model behind the door of all models: clips of T frames in, views of T frames out.
+
+Painted where nothing was seen, and every pixel says which.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, View
-from gcd_model.conditioning import SourceFeatures, SourceGeometry
-from gcd_model.diffusion import RenderOptions
-from gcd_model.errors import Cancelled, NonFiniteError, ShapeError
-from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
-from gcd_model.live.eyes import Eyes, Floor, SeenFrame
-from gcd_model.live.memory import PlacedFrame, seen_world
-from gcd_model.live.painter import COVERED, PAINTED, SEEN_NOW, Painter, ViewFrame
-from gcd_model.live.splat import splat, unproject
+from gcd_model.conditioning import SourceFeatures
+from gcd_model.diffusion import RenderOptions, watched
+from gcd_model.errors import NonFiniteError, ShapeError
+from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, invert_rigid
+from gcd_model.live.blocks import likeliest
+from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.depth_net import plane_depth
+from gcd_model.live.eyes import Eyes, Floor, PlacedFrame, SeenFrame, SeenWorld
+from gcd_model.live.paint_net import Painted, Seen, camera_features, filled, seen_of
+from gcd_model.live.splat import Surfels, splat, unproject
 from gcd_model.networks import LiveNetworks
 from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
 from gcd_model.weights.card import Card
 from gcd_model.weights.families import LIVE
 from gcd_model.weights.save import write_safetensors
+
+PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2
+"""Visibility of a pixel."""
+COVERED = 0.5
+"""A pixel that points cover by less than this share counts as painted, whatever the network says."""
+_MOVABLE = ("car", "truck", "cyclist", "person", "own_car", "robot", "object")
+
+
+def movable_classes(config: LiveConfig) -> Tensor:
+    """Classes of which nothing that was painted is carried to the next frame: nobody knows where it goes. bool [K]."""
+    return torch.tensor([entry.name in _MOVABLE for entry in config.classes])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewFrame:
+    """One frame of one view.
+
+    picture: [3, H, W] in [-1, 1]. classes: uint8 [H, W]. visibility: uint8 [H, W], 2 seen now, 1 seen before, 0
+    painted. inverse_depth: [H, W], 1 / m, 0 for the sky. log_variance: [H, W], of the truth about the mean, for colours
+    in [0, 1].
+    """
+
+    picture: Tensor
+    classes: Tensor
+    visibility: Tensor
+    inverse_depth: Tensor
+    log_variance: Tensor
+
+
+class Painter:
+    """Paints views of placed frames, one frame after the other; the state is what was painted."""
+
+    def __init__(self, networks: LiveNetworks, *, steps: int, seed: int = 0) -> None:
+        """steps: of the paint sampler; one paints the mean, several draw with `seed`."""
+        self._networks, self._config, self._steps, self._seed = networks.eval(), networks.config, steps, seed
+        self._device = next(networks.parameters()).device
+        self._movable = movable_classes(networks.config).to(self._device)
+        self._painted: dict[int, Surfels] = {}  # by view
+
+    @torch.inference_mode()
+    def paint(self, frame: PlacedFrame) -> tuple[ViewFrame, ...]:
+        """One frame of every view."""
+        views = range(len(frame.targets))
+        self._painted = {i: each for i, each in self._painted.items() if i in views and not frame.seen.begins}
+        known = [self._known(i, frame) for i in views]
+        return tuple(self._view(i, known[i], frame.targets[i], frame.lens) for i in views)
+
+    def _known(self, index: int, frame: PlacedFrame) -> Seen:
+        """What is known of a view: its splat, what was painted a frame ago, its rays and its floor."""
+        target, source, lens = frame.targets[index], frame.seen.world_from_source, frame.lens
+        painted, carried = self._painted.get(index), None
+        if painted is not None and len(painted):
+            carried = splat(painted, target, lens, len(self._config.classes), 0.0)
+        rays = lens.rays(self._device)
+        ground = torch.zeros_like(rays[0])
+        if frame.seen.floor is not None:
+            ground = _floor_of(frame.seen.floor, invert_rigid(target) @ source, rays)
+        camera = camera_features((invert_rigid(source) @ target)[None])[0]
+        return seen_of(frame.splats[index], carried, rays, ground, camera.to(self._device))
+
+    def _view(self, index: int, seen: Seen, target: Tensor, lens: Intrinsics) -> ViewFrame:
+        """Paint, read off, and remember what was painted."""
+        base = filled(seen)
+        painted = self._networks.paint.first_step(seen, base, self._config.sigma_max)
+        labels = likeliest(painted.classes[0])
+        covered = seen.coverage[0] >= COVERED
+        share = seen.now_share[0]  # what no point of this frame, or none of an earlier one, shows cannot be seen so
+        never = torch.full_like(share, -torch.inf)
+        chances = torch.stack(
+            [
+                painted.seen[0, PAINTED],
+                torch.where(share < 0.999, painted.seen[0, SEEN_BEFORE], never),
+                torch.where(share > 0, painted.seen[0, SEEN_NOW], never),
+            ]
+        )
+        visibility = torch.where(covered, likeliest(chances), PAINTED).to(torch.uint8)
+        metres = painted.log_depth[0].exp()
+        picture = self._drawn(painted, seen, base)[0].clamp(-1, 1)
+        if self._config.carry_painted:
+            keep = (visibility == PAINTED) & ~self._movable[labels.long()]
+            self._painted[index] = unproject(metres, picture, labels, lens, target, 0.0, painted=True, keep=keep)
+        shift = torch.tensor(self._config.spread_shift, device=self._device)[visibility.long()]
+        return ViewFrame(
+            picture=picture,
+            classes=labels,
+            visibility=visibility,
+            inverse_depth=torch.where(metres < SKY_M / 2, 1 / metres.clamp(min=1e-3), 0.0),
+            log_variance=painted.log_variance[0] + shift - 2 * torch.log(torch.tensor(2.0)),
+        )
+
+    def _drawn(self, painted: Painted, seen: Seen, base: Tensor) -> Tensor:
+        """The picture: the mean with its detail, or a draw of several steps where nothing was seen."""
+        if self._steps == 1:
+            return painted.picture
+        levels = torch.logspace(
+            float(torch.log10(torch.tensor(self._config.sigma_start))),
+            float(torch.log10(torch.tensor(self._config.sigma_min))),
+            self._steps - 1,
+        )
+        noise = torch.randn(base.shape, generator=torch.Generator().manual_seed(self._seed)).to(base)
+        x = painted.mean + levels[0] * noise
+        for i, sigma in enumerate(levels):
+            at = sigma.expand(len(base)).to(base)
+            clean = self._networks.paint.denoised(seen, base, x, at)
+            after = levels[i + 1] if i + 1 < len(levels) else torch.zeros(())
+            x = clean + (x - clean) * (after / sigma)
+        unseen = (1 - seen.coverage)[:, None]
+        return painted.mean + unseen * (x - painted.mean)
+
+
+def _floor_of(floor: Floor, target_from_source: Tensor, rays: Tensor) -> Tensor:
+    """Depth of the floor in a target camera: [H, W]; 0 where it is below the floor, too. rays: of `lens.rays`."""
+    turn, move = target_from_source[:3, :3].float(), target_from_source[:3, 3].float()
+    up = turn @ floor.up
+    height = floor.height_m - float(up @ move)
+    return plane_depth(rays, up.to(rays.device), height) if height > 0 else torch.zeros_like(rays[0])
+
+
+# --- the door ------------------------------------------------------------------------------------------------------
 
 _SEED_STEP, _SEEDS = 0x9E3779B97F4A7C15, 1 << 63  # neighbouring seeds of samples would meet those of other windows
 
@@ -36,58 +160,38 @@ class LiveSynthesizer:
 
     def __init__(self, networks: LiveNetworks, traits: Traits, *, carries: bool = False) -> None:
         """carries: every call goes on where the one before ended, instead of knowing nothing."""
-        self._networks, self._traits, self._carries = networks.requires_grad_(False), traits, carries
-        self._eyes, self._world = Eyes(networks), seen_world(networks.config, next(networks.parameters()).device)
+        self.networks, self.traits, self._carries = networks.requires_grad_(False), traits, carries
+        self._eyes, self._world = Eyes(networks), SeenWorld(networks.config, next(networks.parameters()).device)
         self._painters: list[Painter] = []
         self._drawn_with: tuple[int, int] | None = None
 
-    @property
-    def traits(self) -> Traits:
-        """Family, sizes and identity of the weights."""
-        return self._traits
-
-    @property
-    def networks(self) -> LiveNetworks:
-        """The networks themselves, for measuring."""
-        return self._networks
-
     def streaming(self) -> "LiveSynthesizer":
         """See FrameSynthesizer. A clip rendered frame by frame is the clip rendered as a whole."""
-        return LiveSynthesizer(self._networks, self._traits.streaming(), carries=True)
+        return LiveSynthesizer(self.networks, self.traits.streaming(), carries=True)
 
     def reset(self) -> None:
-        """See FrameSynthesizer."""
         self._eyes.reset()
 
     @out_of_memory_is_our_error
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         """See ViewSynthesizer. Nothing is worked out here: depth looks at earlier frames; any number may be given.
 
         The lens is the clip's, else of its mount's field of view, else of CameraMount()'s, 85 degrees. The ground is
         known where the clip states a mount. Augmentation is for diffusion models and means nothing here.
-        Raises:
-            OptionError: height or width is no multiple of 32. ShapeError: there are extra condition channels.
+        Raises: OptionError: height or width is no multiple of 32.
         """
-        self._traits.check_size(*clip.video.shape[-2:])
-        if extra is not None:
-            raise ShapeError(f"{self._traits.name} wants no extra condition channels, got {extra.shape[1]}")
-        stated = clip.depth is not None
+        self.traits.check_size(*clip.video.shape[-2:])
         return SourceFeatures(
             tokens=None,
             latents=clip.video.new_zeros(clip.frames, 0, 1, 1),
-            extra=None,
             fps=clip.fps,
             augmentation=0.0,
-            video=clip.video,
             mount=clip.mount,
-            geometry=SourceGeometry(
-                metres=clip.video.new_zeros(clip.video[:, 0].shape) if clip.depth is None else clip.depth,
-                stated=torch.full((clip.frames,), stated),
-                odometry=clip.odometry,
-                lens=lens_of(clip),
-            ),
+            lens=lens_of(clip),
+            video=clip.video,
+            metres=clip.video.new_zeros(clip.video[:, 0].shape) if clip.depth is None else clip.depth,
+            stated=torch.full((clip.frames,), clip.depth is not None),
+            odometry=clip.odometry,
         )
 
     @out_of_memory_is_our_error
@@ -98,18 +202,16 @@ class LiveSynthesizer:
 
         Of the options, solver, guidance, motion number and initial noise mean something to diffusion models only.
         """
-        self._require(features.frames, trajectories)
+        self.traits.check_lengths(features.frames, trajectories)
         return self._painted(self._placed(self._seen(features), trajectories), trajectories, options)
 
     @out_of_memory_is_our_error
     def see(self, features: SourceFeatures) -> tuple[SeenFrame, ...]:
-        """See FrameSynthesizer."""
         return tuple(self._seen(features))
 
     @out_of_memory_is_our_error
     def place(self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory]) -> tuple[PlacedFrame, ...]:
-        """See FrameSynthesizer."""
-        self._require(len(seen), trajectories)
+        self.traits.check_lengths(len(seen), trajectories)
         return tuple(self._placed(seen, trajectories))
 
     @out_of_memory_is_our_error
@@ -122,80 +224,80 @@ class LiveSynthesizer:
         """
         return self._painted(placed, trajectories, options)
 
-    def _require(self, length: int, trajectories: Sequence[Trajectory]) -> None:
-        frames = self._traits.config.frames
-        if not trajectories:
-            raise ShapeError("at least one trajectory is wanted, got none")
-        for each in (length, *(path.frames for path in trajectories)):
-            if each != frames:
-                raise ShapeError(f"{self._traits.name} works on {frames} frames, got {each}")
-
     def _seen(self, features: SourceFeatures) -> Iterator[SeenFrame]:
         """Frame by frame, each when it is asked for: what was seen is large."""
-        video, geometry = features.video, features.geometry
-        if video is None or geometry is None:
+        video, metres, stated, lens = features.video, features.metres, features.stated, features.lens
+        if video is None or metres is None or stated is None or lens is None:
             raise ShapeError(
-                f"{self._traits.name} needs points of the source, which these features lack; encode it here"
+                f"{self.traits.name} needs points of the source, which these features lack; encode it here"
             )
         if not self._carries:
             self._eyes.reset()
-        floor, odometry = _floor(features.mount), geometry.odometry
+        floor, mount, odometry = None, features.mount, features.odometry
+        if mount is not None:
+            floor = Floor(up=mount.vehicle_from_camera[2, :3].float(), height_m=mount.height_m)
         for t, frame in enumerate(video):
-            depth = geometry.metres[t] if bool(geometry.stated[t]) else None
+            depth = metres[t] if bool(stated[t]) else None
             pose = None if odometry is None else odometry[t]
-            yield self._eyes.see(frame, lens=geometry.lens, depth=depth, odometry=pose, floor=floor)
+            yield self._eyes.see(frame, lens=lens, depth=depth, odometry=pose, floor=floor)
 
     def _placed(self, seen: Iterable[SeenFrame], trajectories: Sequence[Trajectory]) -> Iterator[PlacedFrame]:
         for t, frame in enumerate(seen):
-            yield self._world.place(frame, [path.source_from_target[t] for path in trajectories])
+            yield self._world.place(frame, [path.source_from_target[t].cpu() for path in trajectories])
 
     def _painted(
         self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None
     ) -> list[View]:
         """`cancel` is asked between two frames."""
-        options = RenderOptions() if options is None else options
-        steps, frames = options.steps or self._traits.config.sampling.steps, self._traits.config.frames
+        options, frames = RenderOptions() if options is None else options, self.traits.config.frames
+        steps = options.steps or self.traits.config.sampling.steps
         draws = options.samples if steps > 1 else 1
         if not self._carries or self._drawn_with != (steps, draws):
-            self._painters = [Painter(self._networks, steps=steps, seed=seed) for seed in _seeds(options.seed, draws)]
+            seeds = [(options.seed + s * _SEED_STEP) % _SEEDS for s in range(draws)]
+            self._painters = [Painter(self.networks, steps=steps, seed=seed) for seed in seeds]
             self._drawn_with = (steps, draws)
         made: list[list[tuple[ViewFrame, ...]]] = []  # by frame, then by draw
         scores: list[float] = []
         lost: list[str] = []
-        for t, frame in enumerate(placed):
-            if options.cancel is not None and options.cancel.is_set():
-                raise Cancelled(f"stopped before frame {t} of {frames}, as was asked")
+        placed = iter(placed)
+        for _ in watched(frames, options):
+            frame = next(placed)
             made.append([painter.paint(frame) for painter in self._painters])
             scores.append(frame.seen.geometry.ood)
             lost += [] if frame.seen.lost is None else [frame.seen.lost]
-            if options.progress is not None:
-                options.progress(t + 1, frames)
-        views = [self._joined(made, v, path, options) for v, path in enumerate(trajectories)]
-        views = [replace(view, ood=sum(scores) / frames, lost=tuple(lost)) for view in views]
-        if not all(map(_is_finite, views)):
+        ood = sum(scores) / frames
+        views = [
+            self._joined([[views[v] for views in frame] for frame in zip(*made, strict=True)], path, options, ood, lost)
+            for v, path in enumerate(trajectories)
+        ]
+        if not math.isfinite(ood) or not all(map(_is_finite, views)):
             raise NonFiniteError(
-                f"{self._traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
+                f"{self.traits.name} produced NaN or Inf; look at the weights with `gcd-node weights inspect`"
             )
         return views
 
     def _joined(
-        self, made: list[list[tuple[ViewFrame, ...]]], number: int, path: Trajectory, options: RenderOptions
+        self, draws: list[list[ViewFrame]], path: Trajectory, options: RenderOptions, ood: float, lost: list[str]
     ) -> View:
-        """One view of all draws; what is no draw, such as depth, is the first one's."""
-        draws = [[views[number] for views in frame] for frame in zip(*made, strict=True)]
+        """One view of all draws, frame by frame each; what is no draw, such as depth, is the first one's."""
         draws += draws[:1] * (options.samples - len(draws))
+
+        def joined(name: str) -> Tensor:
+            return torch.stack([getattr(each, name) for each in draws[0]])
+
         pixels = torch.stack([torch.stack([(each.picture + 1) / 2 for each in frames]) for frames in draws])
-        first = draws[0]
         return View(
             samples=(whole_levels(pixels) if options.whole_levels else pixels).cpu(),
             latents=torch.zeros(*pixels.shape[:2], 0, 1, 1),
             trajectory=path,
-            motion_bucket=self._traits.motion_bucket(path) if options.motion_bucket is None else options.motion_bucket,
+            motion_bucket=self.traits.motion_bucket(path) if options.motion_bucket is None else options.motion_bucket,
             classes=torch.stack([torch.stack([each.classes for each in frames]) for frames in draws]).cpu(),
-            uncertainty_scale=self._traits.uncertainty_scale,
-            visibility=torch.stack([each.visibility for each in first]).cpu(),
-            inverse_depth=torch.stack([each.inverse_depth for each in first]).float().cpu(),
-            log_variance=torch.stack([each.log_variance for each in first]).float().cpu(),
+            uncertainty_scale=self.traits.uncertainty_scale,
+            visibility=joined("visibility").cpu(),
+            inverse_depth=joined("inverse_depth").float().cpu(),
+            log_variance=joined("log_variance").float().cpu(),
+            ood=ood,
+            lost=tuple(lost),
         )
 
 
@@ -230,20 +332,9 @@ def visibility_of(clip: Clip, path: Trajectory) -> Tensor:
     return torch.stack([torch.where(each.coverage >= COVERED, SEEN_NOW, PAINTED).to(torch.uint8) for each in splats])
 
 
-def _floor(mount: CameraMount | None) -> Floor | None:
-    """The ground that a camera on a vehicle knows."""
-    if mount is None:
-        return None
-    return Floor(up=mount.vehicle_from_camera[2, :3].float(), height_m=mount.height_m)
-
-
-def _seeds(seed: int, draws: int) -> list[int]:
-    return [(seed + s * _SEED_STEP) % _SEEDS for s in range(draws)]
-
-
 def _is_finite(view: View) -> bool:
     pictures = (view.samples, view.inverse_depth, view.log_variance)
-    return math.isfinite(view.ood or 0.0) and all(bool(each.isfinite().all()) for each in pictures if each is not None)
+    return all(bool(each.isfinite().all()) for each in pictures if each is not None)
 
 
 def save_live(
@@ -254,5 +345,5 @@ def save_live(
     Raises: OptionError if `path` exists and `overwrite` is not set; CheckpointError if it cannot be written.
     """
     halves: dict[str, Tensor] = {name: weight.half() for name, weight in networks.state_dict().items()}
-    card = Card(name=name, config=networks.config, family=LIVE.name, move_time=0, trained=trained)
+    card = Card(name=name, config=networks.config, family=LIVE, move_time=0, trained=trained)
     write_safetensors(Path(path), halves, card.to_metadata(), overwrite=overwrite)

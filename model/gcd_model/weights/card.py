@@ -12,6 +12,7 @@ from gcd_model.config import ModelConfig
 from gcd_model.errors import CheckpointError, FileError, OptionError
 from gcd_model.live.config import LiveConfig
 from gcd_model.small_files import decode_json
+from gcd_model.weights.families import Family, family_named
 
 FORMAT = "1"
 CONFIG_KEY, ADAPTER_KEY = "gcd.config", "gcd.adapter"
@@ -59,14 +60,17 @@ def precision(name: str) -> torch.dtype:
 class Card:
     """What our files say about themselves besides the weights.
 
-    family: a name of FAMILIES or None. move_time: frame in which the goal pose is reached.
-    trained: False for random weights. origin: digest of the file this one was converted from, or "".
-    uncertainty_scale: see `Traits`; a positive number, or None.
+    family: None if nobody could tell; then no limits are checked.
+    move_time: frame in which the goal pose is reached; 0 for a direct checkpoint.
+    trained: False for random weights, whose pictures are noise.
+    origin: digest of the file this one was converted from, or "".
+    uncertainty_scale: the deviation over samples times this covers the truth as often as it says, as was measured on
+        held-out clips; a positive number, None where nobody did.
     """
 
     name: str
     config: ModelConfig | LiveConfig
-    family: str | None
+    family: Family | None
     move_time: int
     trained: bool = True
     origin: str = ""
@@ -78,6 +82,11 @@ class Card:
             raise OptionError(f"the uncertainty scale must be a positive number, got {scale:g}; measure it again")
         if not 0 <= self.move_time < self.config.frames:
             raise OptionError(f"move_time must be one of the {self.config.frames} frames, got {self.move_time}")
+
+    @property
+    def live(self) -> bool:
+        """Whether it is the live model, which needs to know the lens and takes a mount, depth and odometry."""
+        return isinstance(self.config, LiveConfig)
 
     @property
     def diffusion(self) -> ModelConfig:
@@ -93,7 +102,7 @@ class Card:
             "gcd.format": FORMAT,
             CONFIG_KEY: msgspec.json.encode(self.config).decode(),
             "gcd.name": self.name,
-            "gcd.family": self.family or "",
+            "gcd.family": "" if self.family is None else self.family.name,
             "gcd.move_time": str(self.move_time),
             "gcd.trained": "true" if self.trained else "false",
             "gcd.origin": self.origin,
@@ -108,11 +117,11 @@ class Card:
                 f"its format is {metadata['gcd.format']!r}, this version reads {FORMAT!r}; install a newer gcd-node"
             )
         try:
-            config = metadata[CONFIG_KEY]
+            config, family = metadata[CONFIG_KEY], metadata.get("gcd.family")
             return cls(
                 name=metadata.get("gcd.name", ""),
                 config=decode_json(config, LiveConfig if decode_json(config, _Kind).kind == "live" else ModelConfig),
-                family=metadata.get("gcd.family") or None,
+                family=family_named(family) if family else None,
                 move_time=int(metadata["gcd.move_time"]),
                 trained=metadata.get("gcd.trained", "true") != "false",
                 origin=metadata.get("gcd.origin", ""),

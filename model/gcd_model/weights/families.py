@@ -5,7 +5,7 @@ A family is how a checkpoint was trained.
 
 import re
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import msgspec
 
@@ -34,17 +34,12 @@ class ViewLimits:
         """Intervals of the three differences; narrower when it is known where the source stands."""
         elevation, radius = (-self.elevation_deg, self.elevation_deg), (-self.radius_m, self.radius_m)
         if source is not None:
-            elevation = _within(elevation, self.absolute_elevation_deg, source.elevation_deg)
-            radius = _within(radius, self.absolute_radius_m, source.radius_m)
-        return {
-            "azimuth_deg": (-self.azimuth_deg, self.azimuth_deg),
-            "elevation_deg": elevation,
-            "radius_m": radius,
-        }
-
-
-def _within(relative: tuple[float, float], absolute: tuple[float, float], at: float) -> tuple[float, float]:
-    return max(relative[0], absolute[0] - at), min(relative[1], absolute[1] - at)
+            (low, high), at = self.absolute_elevation_deg, source.elevation_deg
+            elevation = max(elevation[0], low - at), min(elevation[1], high - at)
+            (low, high), at = self.absolute_radius_m, source.radius_m
+            radius = max(radius[0], low - at), min(radius[1], high - at)
+        azimuth = (-self.azimuth_deg, self.azimuth_deg)
+        return {"azimuth_deg": azimuth, "elevation_deg": elevation, "radius_m": radius}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -119,9 +114,9 @@ LIVE = replace(MANIPULATION, name="live", height=128, width=192)
 LIVE_LENS_DEG = (40.0, 120.0)
 """Horizontal fields of view of the live model's training."""
 
-_ALL = (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, MANIPULATION, SVD, LIVE)
-
-FAMILIES: dict[str, Family] = {family.name: family for family in _ALL}
+FAMILIES: dict[str, Family] = {
+    family.name: family for family in (KUBRIC90, KUBRIC180, DRIVING, DRIVING_SEMANTIC, MANIPULATION, SVD, LIVE)
+}
 
 
 def family_named(name: str) -> Family:
@@ -138,16 +133,36 @@ _LONGEST_LINE = 1000
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Provenance:
-    """What is told about a checkpoint besides its weights; None where nothing is.
+class Hints:
+    """What is told of a checkpoint besides its names and shapes; None where nobody says.
 
-    move_time: frame in which the goal pose is reached. frames: T. told_by: who named the family.
+    told_by: who named the family. move_time: frame in which the goal pose is reached. frames: T.
+    head_width: channels of an attention head of the U-Net; or heads: their number, one for all levels or one each.
+    image_heads: attention heads of the image tower. latent_scale: see `VAEConfig.scale`.
+    Raises OptionError for numbers that cannot be, and a family nobody knows.
     """
 
-    family: FamilyName | None = None
+    family: str | None = None
+    told_by: str | None = None
     move_time: int | None = None
     frames: int | None = None
-    told_by: str | None = None
+    head_width: int | None = None
+    heads: int | tuple[int, ...] | None = None
+    image_heads: int | None = None
+    latent_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.family is not None:
+            family_named(self.family)
+        for name, least in (("head_width", 1), ("image_heads", 1), ("frames", 2)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise OptionError(f"{name} must be at least {least}, got {value}")
+
+    def over(self, *others: Self) -> Self:
+        """Each fact from the first that knows it, this one before the others."""
+        every = [{name: getattr(each, name) for name in self.__slots__} for each in (self, *others)]
+        return replace(self, **{n: next((each[n] for each in every if each[n] is not None), None) for n in every[0]})
 
 
 _GCD = re.compile(r"(?:kubric_(gradual|direct)_(max90|max180)|pardom_(gradual|direct)_(rgb|semantic))(?!\d)")
@@ -157,21 +172,26 @@ _GCD_FAMILIES: dict[str, FamilyName] = {
     "rgb": "driving",
     "semantic": "driving-semantic",
 }
+_ANGLE_FAMILIES: dict[tuple[float | None, float | None], FamilyName] = {
+    (90.0, 30.0): "kubric90",
+    (90.0, None): "kubric90",
+    (180.0, 60.0): "kubric180",
+    (180.0, None): "kubric180",
+}
 _SVD = re.compile(r"svd(_xt)?|stable-video-diffusion-img2vid(-xt)?")
 
 
-def told_by_name(stem: str) -> Provenance:
+def told_by_name(stem: str) -> Hints:
     """Family of a published file name without suffix, also with something added; the base models' names only whole."""
     if found := _GCD.search(stem.lower()):
         pace, kind = filter(None, found.groups())
-        move_time = 13 if pace == "gradual" else 0
-        return Provenance(family=_GCD_FAMILIES[kind], move_time=move_time, told_by="file name")
+        return Hints(family=_GCD_FAMILIES[kind], move_time=13 if pace == "gradual" else 0, told_by="file name")
     if found := _SVD.fullmatch(stem.lower()):
-        return Provenance(family="svd", frames=25 if any(found.groups()) else None, told_by="file name")
-    return Provenance()
+        return Hints(family="svd", frames=25 if any(found.groups()) else None, told_by="file name")
+    return Hints()
 
 
-def told_by_yaml(text: str) -> Provenance:
+def told_by_yaml(text: str) -> Hints:
     """Family by the numbers of a training configuration: angle ranges, move time, the driving views.
 
     Only `key: value` lines with numbers are looked at, lists on one line or one item a line; nothing is executed.
@@ -180,18 +200,12 @@ def told_by_yaml(text: str) -> Provenance:
     text = "\n".join(line for line in lines if 0 < len(line) <= _LONGEST_LINE)
     move_time = re.search(r"^[ \t-]*move_time\s*:\s*(\d{1,4})\s*(#.*)?$", text, re.MULTILINE)
     angles = _largest_difference(text, "azimuth"), _largest_difference(text, "elevation")
-    families: dict[tuple[float | None, float | None], FamilyName] = {
-        (90.0, 30.0): "kubric90",
-        (90.0, None): "kubric90",
-        (180.0, 60.0): "kubric180",
-        (180.0, None): "kubric180",
-    }
-    family = families.get(angles) or _family_of_views(text)
-    return Provenance(
-        family=family,
-        move_time=None if move_time is None else int(move_time[1]),
-        told_by=None if family is None else "yaml",
-    )
+    family = _ANGLE_FAMILIES.get(angles)
+    if family is None and re.search(r"pardom|parallel_?domain|ego_forward|topdown", text, re.IGNORECASE):
+        semantic = re.search(r"^[ \t-]*\w*modality\w*\s*:[\['\"\s]*segm", text, re.MULTILINE | re.IGNORECASE)
+        family = "driving" if semantic is None else "driving-semantic"  # both look from above the road
+    told_by = None if family is None else "yaml"
+    return Hints(family=family, move_time=None if move_time is None else int(move_time[1]), told_by=told_by)
 
 
 def _largest_difference(text: str, angle: str) -> float | None:
@@ -208,23 +222,7 @@ def _largest_difference(text: str, angle: str) -> float | None:
     return None
 
 
-def _family_of_views(text: str) -> FamilyName | None:
-    """The driving checkpoints look from above the road; their target is colour or classes."""
-    if re.search(r"pardom|parallel_?domain|ego_forward|topdown", text, re.IGNORECASE) is None:
-        return None
-    semantic = re.search(r"^[ \t-]*\w*modality\w*\s*:[\['\"\s]*segm", text, re.MULTILINE | re.IGNORECASE)
-    return "driving" if semantic is None else "driving-semantic"
-
-
-def combined(*told: Provenance) -> Provenance:
-    """Each fact from the first that knows it; who names the family first is named."""
-    named = next((each for each in told if each.family is not None), Provenance())
-    move_time = next((each.move_time for each in told if each.move_time is not None), None)
-    frames = next((each.frames for each in told if each.frames is not None), None)
-    return Provenance(family=named.family, move_time=move_time, frames=frames, told_by=named.told_by)
-
-
-def require_family(told: Provenance, config: ModelConfig | LiveConfig) -> None:
+def require_family(told: Hints, config: ModelConfig | LiveConfig) -> None:
     """Whether the family can be: steered weights need a steered family, fixed ones a fixed one, the live model its own.
 
     Relative poses may stand in for angles and radius. Raises: CheckpointError on a contradiction.
@@ -244,7 +242,7 @@ def require_family(told: Provenance, config: ModelConfig | LiveConfig) -> None:
         )
 
 
-def at_trained_size(config: ModelConfig, told: Provenance) -> ModelConfig:
+def at_trained_size(config: ModelConfig, told: Hints) -> ModelConfig:
     """The config of published weights with the size and guidance of their family."""
     if told.family is None:
         return config

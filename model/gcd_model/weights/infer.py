@@ -19,6 +19,7 @@ from gcd_model.config import (
     VAEConfig,
 )
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.weights.families import Hints
 from gcd_model.weights.names import Levels, Naming, published_names, published_shape
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -30,27 +31,6 @@ _PUBLISHED_GROUPS = 32  # of every group norm
 def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
     """Names and shapes."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Hints:
-    """What neither names nor shapes tell; None where nobody says.
-
-    head_width: channels of an attention head of the U-Net; or heads: their number, one for all levels or one each.
-    image_heads: attention heads of the image tower. frames: T. latent_scale: see `VAEConfig.scale`.
-    """
-
-    head_width: int | None = None
-    heads: int | tuple[int, ...] | None = None
-    image_heads: int | None = None
-    frames: int | None = None
-    latent_scale: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, least in (("head_width", 1), ("image_heads", 1), ("frames", 2)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise OptionError(f"{name} must be at least {least}, got {value}")
 
 
 RELEASED = Hints(head_width=SVD_14.unet.head_width, image_heads=16)
@@ -90,15 +70,39 @@ def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
             tells the number of heads.
     """
     probe = _Probe(shapes, naming, levels_of(shapes, naming))
+    places = [f"unet.down.{level}.stages.0" for level in range(len(probe.levels.attention))]
+    width, latent_channels = probe.size("unet.stem.weight", 0), probe.size("unet.conv_out.weight", 0)
+    widths = tuple(probe.size(f"{place}.res.spatial.conv2.weight", 0) for place in places)
+    attention = tuple(probe.optional(f"{place}.attention.proj_in.weight", 0) is not None for place in places)
+    pixels, levels = probe.size("target_encoder.stem.weight", 0), range(probe.levels.vae_levels)
+    vae_widths = tuple(probe.size(f"target_encoder.levels.{level}.blocks.0.conv2.weight", 0) for level in levels)
     try:
-        unet = _unet(probe, hints)
-        return ModelConfig(
-            frames=hints.frames or SVD_14.frames,
-            camera=_camera_control(probe, unet.camera_width),
-            unet=unet,
-            vae=_vae(probe, hints),
-            image_encoder=_image_encoder(probe, unet.context_width, hints),
+        unet = UNetConfig(
+            latent_channels=latent_channels,
+            condition_channels=probe.size("unet.stem.weight", 1) - latent_channels,
+            width=width,
+            multipliers=_multipliers("the U-Net", width, widths),
+            attention=attention,
+            blocks_per_level=probe.levels.unet_blocks,
+            embedding_width=probe.size("unet.embed_noise.0.weight", 0),
+            head_width=_head_width(attention, widths, hints),
+            context_width=probe.optional("unet.middle.0.attention.spatial.token.value.weight", 1),
+            vector_width=probe.size("unet.embed_vector.0.weight", 1),
+            camera_width=probe.optional("unet.embed_camera.0.weight", 1) or 0,
+            norm_groups=_PUBLISHED_GROUPS,
         )
+        vae = VAEConfig(
+            latent_channels=probe.size("target_encoder.conv_out.weight", 0) // 2,
+            width=pixels,
+            multipliers=_multipliers("the VAE", pixels, vae_widths),
+            blocks_per_level=probe.levels.vae_blocks,
+            norm_groups=_PUBLISHED_GROUPS,
+            scale=VAEConfig().scale if hints.latent_scale is None else hints.latent_scale,
+            shared=naming == "diffusers",
+        )
+        camera, tower = _camera_control(probe, unet.camera_width), _image_encoder(probe, unet.context_width, hints)
+        frames = hints.frames or SVD_14.frames
+        return ModelConfig(frames=frames, camera=camera, unet=unet, vae=vae, image_encoder=tower)
     except OptionError as error:
         raise CheckpointError(f"the weights fit no architecture known here: {error}") from error
 
@@ -135,27 +139,6 @@ def _multipliers(what: str, width: int, widths: tuple[int, ...]) -> tuple[int, .
     return tuple(level // width for level in widths)
 
 
-def _unet(probe: _Probe, hints: Hints) -> UNetConfig:
-    places = [f"unet.down.{level}.stages.0" for level in range(len(probe.levels.attention))]
-    width, latent_channels = probe.size("unet.stem.weight", 0), probe.size("unet.conv_out.weight", 0)
-    widths = tuple(probe.size(f"{place}.res.spatial.conv2.weight", 0) for place in places)
-    attention = tuple(probe.optional(f"{place}.attention.proj_in.weight", 0) is not None for place in places)
-    return UNetConfig(
-        latent_channels=latent_channels,
-        condition_channels=probe.size("unet.stem.weight", 1) - latent_channels,
-        width=width,
-        multipliers=_multipliers("the U-Net", width, widths),
-        attention=attention,
-        blocks_per_level=probe.levels.unet_blocks,
-        embedding_width=probe.size("unet.embed_noise.0.weight", 0),
-        head_width=_head_width(attention, widths, hints),
-        context_width=probe.optional("unet.middle.0.attention.spatial.token.value.weight", 1),
-        vector_width=probe.size("unet.embed_vector.0.weight", 1),
-        camera_width=probe.optional("unet.embed_camera.0.weight", 1) or 0,
-        norm_groups=_PUBLISHED_GROUPS,
-    )
-
-
 def _head_width(attends: tuple[bool, ...], widths: tuple[int, ...], hints: Hints) -> int:
     """The given head width, or the published one of published widths."""
     if hints.head_width is not None:
@@ -186,20 +169,6 @@ def _camera_control(probe: _Probe, camera_width: int) -> CameraControl:
             return control
     raise CheckpointError(
         f"the camera embedder takes {features} numbers; known are 13 (angles and radius) and 12 (relative pose)"
-    )
-
-
-def _vae(probe: _Probe, hints: Hints) -> VAEConfig:
-    width, levels = probe.size("target_encoder.stem.weight", 0), range(probe.levels.vae_levels)
-    widths = tuple(probe.size(f"target_encoder.levels.{level}.blocks.0.conv2.weight", 0) for level in levels)
-    return VAEConfig(
-        latent_channels=probe.size("target_encoder.conv_out.weight", 0) // 2,
-        width=width,
-        multipliers=_multipliers("the VAE", width, widths),
-        blocks_per_level=probe.levels.vae_blocks,
-        norm_groups=_PUBLISHED_GROUPS,
-        scale=VAEConfig().scale if hints.latent_scale is None else hints.latent_scale,
-        shared=probe.naming == "diffusers",
     )
 
 

@@ -6,7 +6,7 @@ Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffu
 
 import hashlib
 import logging
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -33,16 +33,12 @@ from gcd_model.weights.card import (
 )
 from gcd_model.weights.families import (
     FAMILIES,
-    FamilyName,
-    Provenance,
+    Hints,
     at_trained_size,
-    combined,
     family_named,
     require_family,
-    told_by_name,
-    told_by_yaml,
 )
-from gcd_model.weights.infer import Hints, infer_config, match_weights, shapes_of
+from gcd_model.weights.infer import infer_config, match_weights, shapes_of
 from gcd_model.weights.names import Levels, Naming, assembled, published_names
 from gcd_model.weights.read import WeightsFile, read_file, read_weights
 from gcd_model.weights.save import CARRIED, write_published, write_safetensors
@@ -52,12 +48,7 @@ _log = logging.getLogger(__name__)
 _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
 _USABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
-_NAMINGS: dict[Layout, Naming] = {
-    "gcd-ckpt": "gcd",
-    "sgm-safetensors": "gcd",
-    "diffusers": "diffusers",
-    "gcd-node": "own",
-}
+_NAMINGS: dict[Layout, Naming] = {"diffusers": "diffusers", "gcd-node": "own"}  # others have Stability's names
 
 
 class Told(TypedDict, total=False):
@@ -101,9 +92,7 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
 
 
 def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
-    """A base and what was trained on it, as one. Raises CheckpointError as `adapted`; OptionError for its family."""
-    if adapter.card.family is not None:
-        family_named(adapter.card.family)
+    """A base and what was trained on it, as one. Raises CheckpointError as `adapted`;"""
     weights = {f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}
     return replace(
         base,
@@ -120,8 +109,8 @@ def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
 def read_adapter(path: str | Path) -> Adapter:
     """Map an adapter's file. Raises CheckpointError if it is missing, damaged or no adapter."""
     with _about(path):
-        contents = read_file(Path(path))
-        return Adapter.of_file({} if contents.is_pickle else contents.metadata, contents.tensors)
+        file = read_file(Path(path))
+        return Adapter.of_file({} if file.is_pickle else file.metadata, file.tensors)
 
 
 def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpack[Told]) -> WeightsReport:
@@ -133,39 +122,34 @@ def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpa
     """
     with _about(path):
         examined = _examined(Path(path), told)
-        file, contents = examined.file, examined.file.contents
+        file, networks = examined.file, dict[str, list[tuple[int, torch.dtype]]]()
+        for name, tensor in examined.networks.state_dict().items():
+            stored = file.tensors[examined.sources[name][0]].dtype
+            networks.setdefault(name.partition(".")[0], []).append((tensor.numel(), stored))
         return WeightsReport(
             **{each.name: getattr(examined.card, each.name) for each in fields(examined.card)},
             path=str(path),
             layout=file.layout,
             told_by=examined.told_by,
-            networks=_network_reports(examined),
+            networks=tuple(
+                NetworkReport(
+                    name=network,
+                    parameters=sum(count for count, _ in tensors),
+                    tensors=len(tensors),
+                    dtypes=tuple(sorted({str(dtype).removeprefix("torch.") for _, dtype in tensors})),
+                    size=sum(count * dtype.itemsize for count, dtype in tensors),
+                )
+                for network, tensors in networks.items()
+            ),
             leftovers=tuple(
-                Leftover(kind=kind, tensors=len(names), size=sum(contents.tensors[name].nbytes for name in names))
+                Leftover(kind=kind, tensors=len(names), size=sum(file.tensors[name].nbytes for name in names))
                 for kind, names in examined.leftovers.items()
             ),
-            optimizer_size=contents.optimizer_size,
-            other_entries=contents.other_entries,
+            optimizer_size=file.optimizer_size,
+            other_entries=file.other_entries,
             size=sum(part.stat().st_size for part in file.files),
             digest=digest(file.files, full=full_digest),
         )
-
-
-def _network_reports(examined: "_Examined") -> tuple[NetworkReport, ...]:
-    """Counts, precisions and stored bytes of every network."""
-    networks: dict[str, list[tuple[int, torch.dtype]]] = {}
-    for name, tensor in examined.networks.state_dict().items():
-        networks.setdefault(name.partition(".")[0], []).append((tensor.numel(), examined.dtype(name)))
-    return tuple(
-        NetworkReport(
-            name=network,
-            parameters=sum(count for count, _ in tensors),
-            tensors=len(tensors),
-            dtypes=tuple(sorted({str(dtype).removeprefix("torch.") for _, dtype in tensors})),
-            size=sum(count * dtype.itemsize for count, dtype in tensors),
-        )
-        for network, tensors in networks.items()
-    )
 
 
 def convert_weights(
@@ -272,47 +256,50 @@ class _Examined:
 
     def state(self) -> dict[str, Tensor]:
         """Our parameters, made of mapped tensors."""
-        held, axes = self.file.contents.tensors, {n: each.ndim for n, each in self.networks.state_dict().items()}
+        held, axes = self.file.tensors, {n: each.ndim for n, each in self.networks.state_dict().items()}
         return {name: assembled(names, [held[n] for n in names], axes[name]) for name, names in self.sources.items()}
-
-    def dtype(self, name: str) -> torch.dtype:
-        """Precision our parameter of that name is stored in."""
-        return self.file.contents.tensors[self.sources[name][0]].dtype
 
     @property
     def carried(self) -> dict[str, Tensor]:
         """Leftovers that its next owner may want."""
-        return {name: self.file.contents.tensors[name] for kind in CARRIED for name in self.leftovers.get(kind, ())}
+        return {name: self.file.tensors[name] for kind in CARRIED for name in self.leftovers.get(kind, ())}
 
 
 def _examined(path: Path, told: Told) -> _Examined:
     """Raises CheckpointError: the file does not fit, name by name. OptionError: what is told is impossible."""
-    hints = Hints(**{key: told.get(key) for key in ("head_width", "image_heads", "frames")})
-    option, metadata = Provenance(family=_family_name(told.get("family")), told_by="option"), Provenance()
+    options = Hints(**told, told_by=None if told.get("family") is None else "option")
     file = read_weights(path)
-    naming, shapes = _NAMINGS[file.layout], shapes_of(file.contents.tensors)
-    stated = Card.from_metadata(file.contents.metadata) if CONFIG_KEY in file.contents.metadata else None
-    if stated is not None:
-        metadata = Provenance(family=_family_name(stated.family), move_time=stated.move_time, told_by="metadata")
-    known = combined(option, metadata, told_by_name(file.name), told_by_yaml(file.yaml))
+    naming, shapes = _NAMINGS.get(file.layout, "gcd"), shapes_of(file.tensors)
+    stated = Card.from_metadata(file.metadata) if CONFIG_KEY in file.metadata else None
     if stated is None:
-        every = {each.name: getattr(hints, each.name) or getattr(file.hints, each.name) for each in fields(Hints)}
-        hints = Hints(**every | {"frames": every["frames"] or known.frames})
-        config = at_trained_size(infer_config(shapes, naming, hints), known)
+        known = options.over(file.hints)
+        config = at_trained_size(infer_config(shapes, naming, known), known)
     else:
-        config = _with_frames(stated.config, hints)
+        own = Hints(move_time=stated.move_time)
+        if stated.family is not None:
+            own = replace(own, family=stated.family.name, told_by="metadata")
+        known, config = options.over(own, file.hints), _with_frames(stated.config, options)
     require_family(known, config)
-    networks = _empty(config)
+    try:
+        networks = empty_networks(config)
+    except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
+        raise CheckpointError(f"describes networks that cannot be built ({error}); it is damaged") from error
     expected = shapes_of(networks.state_dict())
     levels = Levels.of(config) if isinstance(config, ModelConfig) else Levels()
     sources = {name: published_names(name, naming, levels) or (name,) for name in expected}
     leftovers = match_weights(sources, expected, shapes)
-    _require_usable({name: file.contents.tensors[name].dtype for names in sources.values() for name in names})
+    unusable = [name for names in sources.values() for name in names if file.tensors[name].dtype not in _USABLE]
+    if unusable:  # quantised weights have the right names and shapes and mean nothing without their scales
+        stored = sorted({str(file.tensors[name].dtype).removeprefix("torch.") for name in unusable})
+        raise CheckpointError(
+            f"{len(unusable)} weights are stored as {', '.join(stored)}, first: {', '.join(unusable[:5])}; wanted are "
+            "float32, float16 or bfloat16"
+        )
     last = config.frames - 1
     card = Card(
         name=file.name if stated is None or not stated.name else stated.name,
         config=config,
-        family=known.family,
+        family=None if known.family is None else family_named(known.family),
         move_time=last if known.move_time is None else min(known.move_time, last),
         trained=stated is None or stated.trained,
         uncertainty_scale=None if stated is None else stated.uncertainty_scale,
@@ -320,10 +307,6 @@ def _examined(path: Path, told: Told) -> _Examined:
     return _Examined(
         file=file, card=card, told_by=known.told_by, networks=networks, sources=sources, leftovers=leftovers
     )
-
-
-def _family_name(name: str | None) -> FamilyName | None:
-    return None if name is None else family_named(name).name
 
 
 def _with_frames(config: ModelConfig | LiveConfig, hints: Hints) -> ModelConfig | LiveConfig:
@@ -336,21 +319,3 @@ def _with_frames(config: ModelConfig | LiveConfig, hints: Hints) -> ModelConfig 
             if given is not None and given != value:
                 raise OptionError(f"{name} is {value} in this file, which states it itself, got {given}; leave it out")
     return config if hints.frames is None else msgspec.structs.replace(config, frames=hints.frames)
-
-
-def _empty(config: ModelConfig | LiveConfig) -> Networks | LiveNetworks:
-    """Networks without storage."""
-    try:
-        return empty_networks(config)
-    except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
-        raise CheckpointError(f"describes networks that cannot be built ({error}); it is damaged") from error
-
-
-def _require_usable(dtypes: Mapping[str, torch.dtype]) -> None:
-    """Quantised weights have the right names and shapes and mean nothing without their scales."""
-    bad = {name: str(dtype).removeprefix("torch.") for name, dtype in dtypes.items() if dtype not in _USABLE}
-    if bad:
-        raise CheckpointError(
-            f"{len(bad)} weights are stored as {', '.join(sorted(set(bad.values())))}, first: "
-            f"{', '.join(list(bad)[:5])}; wanted are float32, float16 or bfloat16"
-        )

@@ -5,9 +5,9 @@ Nothing in a file is ever executed, see `pickle.py`.
 
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 from safetensors import SafetensorError, safe_open
@@ -17,7 +17,7 @@ from torch.utils import _pytree as pytree
 from gcd_model.errors import CheckpointError, FileError
 from gcd_model.small_files import decode_json, read_small
 from gcd_model.weights.card import ADAPTER_KEY, CONFIG_KEY, NOTES, Layout, unpacked
-from gcd_model.weights.infer import Hints
+from gcd_model.weights.families import Hints, told_by_name, told_by_yaml
 from gcd_model.weights.names import GCD_UNET
 from gcd_model.weights.pickle import SAVE_AGAIN, Placeholder, read_pickle
 
@@ -27,86 +27,75 @@ _HEAD = 512
 _FETCH_AGAIN = "fetch it again and compare its size with the publisher's"
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """What a single file holds: mapped tensors by published name, and what comes with them.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WeightsFile:
+    """A checkpoint as it lies on the disk: mapped tensors by published name, and what comes with them.
 
+    name: of the file, without suffix, or of the folder. files: all that hold weights. hints: of what lies beside them.
     metadata: our notes of a pickle, or a safetensors file's own. optimizer_size: bytes. other_entries: names of further
     top-level entries of a pickle.
     """
 
+    name: str
+    files: tuple[Path, ...]
     tensors: Mapping[str, Tensor]
     metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    hints: Hints = field(default_factory=Hints)
     is_pickle: bool = False
     optimizer_size: int = 0
     other_entries: tuple[str, ...] = ()
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class WeightsFile:
-    """A checkpoint as it lies on the disk.
-
-    name: of the file, without suffix, or of the folder. files: all that hold weights. yaml: text of the
-    configuration beside it, or "".
-    """
-
-    name: str
-    layout: Layout
-    files: tuple[Path, ...]
-    contents: Contents
-    hints: Hints = field(default_factory=Hints)
-    yaml: str = ""
+    @property
+    def layout(self) -> Layout:
+        """By content. Raises CheckpointError if it is none that is known here."""
+        names = self.tensors
+        if not self.is_pickle and ADAPTER_KEY in self.metadata:
+            raise CheckpointError(
+                "is an adapter, which is nothing without its base: give the base, and this as the adapter; or join "
+                "them with `gcd-train lora merge`"
+            )
+        if not self.is_pickle and CONFIG_KEY in self.metadata:
+            return "gcd-node"
+        if any(name.startswith(f"{GCD_UNET}.") for name in names):
+            return "gcd-ckpt" if self.is_pickle else "sgm-safetensors"
+        if any(name.startswith("unet/") for name in names):
+            return "diffusers"
+        if any(name.startswith(("down_blocks.", "vision_model.", "encoder.down_blocks.")) for name in names):
+            raise CheckpointError(
+                "is one part of a diffusers model; give the folder that holds unet, vae and image_encoder"
+            )
+        raise CheckpointError(
+            f"holds {len(names)} tensors of no layout known here, first: {', '.join(list(names)[:5]) or 'none'}; "
+            f"wanted are names of GCD or Stable Video Diffusion ({GCD_UNET}...), a diffusers folder or a file of "
+            "`gcd-node weights convert`"
+        )
 
 
 def read_weights(path: Path) -> WeightsFile:
-    """Map a file or folder and tell its layout by its content. Raises CheckpointError, OSError."""
+    """Map a file or folder. Raises CheckpointError, OSError."""
     if not path.exists():
         raise CheckpointError("there is no such file or folder; check the path")
     if path.is_dir():
         return _read_folder(path)
-    contents, yaml = read_file(path), path.with_suffix(".yaml")
-    text = ""
+    read, yaml, text = read_file(path), path.with_suffix(".yaml"), ""
     if yaml.is_file():  # the training configuration a published checkpoint comes with
         with yaml.open("rb") as file:
             text = file.read(_LARGEST_YAML).decode("utf-8", errors="replace")
-    return WeightsFile(name=path.stem, layout=_layout_of(contents), files=(path,), contents=contents, yaml=text)
-
-
-def _layout_of(contents: Contents) -> Layout:
-    """Layout of a single file."""
-    names = contents.tensors
-    if not contents.is_pickle and ADAPTER_KEY in contents.metadata:
-        raise CheckpointError(
-            "is an adapter, which is nothing without its base: give the base, and this as the adapter; or join them "
-            "with `gcd-train lora merge`"
-        )
-    if not contents.is_pickle and CONFIG_KEY in contents.metadata:
-        return "gcd-node"
-    if any(name.startswith(f"{GCD_UNET}.") for name in names):
-        return "gcd-ckpt" if contents.is_pickle else "sgm-safetensors"
-    if any(name.startswith(("down_blocks.", "vision_model.", "encoder.down_blocks.")) for name in names):
-        raise CheckpointError(
-            "is one part of a diffusers model; give the folder that holds unet, vae and image_encoder"
-        )
-    raise CheckpointError(
-        f"holds {len(names)} tensors of no layout known here, first: {', '.join(list(names)[:5]) or 'none'}; wanted "
-        f"are names of GCD or Stable Video Diffusion ({GCD_UNET}...), a diffusers folder or a file of "
-        "`gcd-node weights convert`"
-    )
+    return replace(read, hints=told_by_name(path.stem).over(told_by_yaml(text)))
 
 
 # --- a single file ---------------------------------------------------------------------------------------------------
 
 
-def read_file(path: Path) -> Contents:
+def read_file(path: Path) -> WeightsFile:
     """What a single file holds. Raises CheckpointError, OSError."""
     try:
         if _is_zip(path):
             with path.open("rb") as opened:
-                return _contents(read_pickle(path, opened))
+                return _sorted_out(path, read_pickle(path, opened))
         with safe_open(path, framework="pt", device="cpu") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no dict
-            return Contents(tensors, unpacked(file.metadata() or {}))
+            return _of_one(path, tensors, metadata=unpacked(file.metadata() or {}))
     except (CheckpointError, OSError):
         raise
     except SafetensorError as error:
@@ -115,6 +104,10 @@ def read_file(path: Path) -> Contents:
         raise CheckpointError(f"is a truncated or damaged torch zip ({error}); {_FETCH_AGAIN}") from error
     except Exception as error:  # a damaged or hostile pickle can raise anything at all
         raise CheckpointError(f"cannot be unpickled ({type(error).__name__}: {error}); {_FETCH_AGAIN}") from error
+
+
+def _of_one(path: Path, tensors: Mapping[str, Tensor], **more: Any) -> WeightsFile:
+    return WeightsFile(name=path.stem, files=(path,), tensors=tensors, **more)
 
 
 def _is_zip(path: Path) -> bool:
@@ -150,7 +143,7 @@ def _is_zip(path: Path) -> bool:
 _WEIGHTS, _OPTIMIZER = "state_dict", "optimizer_states"
 
 
-def _contents(root: object) -> Contents:
+def _sorted_out(path: Path, root: object) -> WeightsFile:
     """Sort out what a pickle holds at its root: `state_dict` and companions, or tensors alone.
 
     Raises:
@@ -163,12 +156,13 @@ def _contents(root: object) -> Contents:
         if not any(isinstance(value, Tensor) for value in entries.values()):
             names = ", ".join(str(key) for key in list(entries)[:5])
             raise CheckpointError(f"has no entry {_WEIGHTS!r} (found: {names}); it holds no weights")
-        return Contents(_weights(entries), is_pickle=True)
+        return _of_one(path, _weights(entries), is_pickle=True)
     moments = {id(leaf): leaf for leaf in pytree.tree_leaves(entries.get(_OPTIMIZER)) if isinstance(leaf, Tensor)}
     facts = entries.get("hyper_parameters")
     notes = cast("dict[object, object]", facts).get(NOTES) if isinstance(facts, dict) else None
     texts = cast("dict[object, object]", notes).items() if isinstance(notes, dict) else ()
-    return Contents(
+    return _of_one(
+        path,
         _weights(entries[_WEIGHTS]),
         metadata={key: value for key, value in texts if isinstance(key, str) and isinstance(value, str)},
         is_pickle=True,
@@ -248,7 +242,7 @@ def _read_folder(path: Path) -> WeightsFile:
         latent_scale=vae.scaling_factor,
     )
     name = path.resolve().name
-    return WeightsFile(name=name, layout="diffusers", files=tuple(files), contents=Contents(tensors), hints=hints)
+    return WeightsFile(name=name, files=tuple(files), tensors=tensors, hints=hints.over(told_by_name(name)))
 
 
 def _part_files(folder: Path) -> list[Path]:

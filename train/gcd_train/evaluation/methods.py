@@ -358,7 +358,7 @@ def _vanilla_svd(options: EvaluateOptions) -> VanillaSVD:
         family, digest = name, options.svd
     else:
         inspected = inspect_weights(weights_path(options.svd))
-        family, digest = inspected.family, inspected.digest[:12]
+        family, digest = inspected.family and inspected.family.name, inspected.digest[:12]
     if family not in ("svd", None):
         raise RecipeError(
             f"{VANILLA_SVD} wants weights that make a video out of a picture, {options.svd} is of the family "

@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool2d
 
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
-from gcd_model.live.depth_net import pixel_rays, plane_depth, plane_sweep
+from gcd_model.live.depth_net import plane_depth, plane_sweep
 from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
 from gcd_train.data.sample import to_network
@@ -104,11 +104,11 @@ def on_device(array: NDArray[Any] | Sequence[float], like: Tensor) -> Tensor:
 
 @lru_cache(maxsize=4096)
 def _rays(lens: Intrinsics, device: torch.device) -> Tensor:
-    return pixel_rays(lens, device)
+    return lens.rays(device)
 
 
 def rays_of(lenses: Sequence[Intrinsics], device: torch.device) -> Tensor:
-    """`pixel_rays` of N lenses: [N, 2, H, W]."""
+    """`Intrinsics.rays` of N lenses: [N, 2, H, W]."""
     return torch.stack([_rays(lens, device) for lens in lenses])
 
 

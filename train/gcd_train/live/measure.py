@@ -23,12 +23,10 @@ from gcd_model import hatched
 from gcd_model.errors import ModelError
 from gcd_model.geometry import invert_rigid
 from gcd_model.live.config import LiveConfig
-from gcd_model.live.depth_net import pixel_rays
-from gcd_model.live.eyes import Eyes, Floor
+from gcd_model.live.eyes import Eyes, Floor, SeenWorld
 from gcd_model.live.paint_net import filled, seen_of
-from gcd_model.live.painter import COVERED, LiveView
 from gcd_model.live.splat import splat, unproject
-from gcd_model.live.synthesizer import LiveSynthesizer
+from gcd_model.live.synthesizer import COVERED, LiveSynthesizer, Painter
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError, TrainError
@@ -98,7 +96,7 @@ class ExactSplat:
     def views(self, clip: LiveClip) -> MethodViews:
         """See Method."""
         source, lens, classes = pictures_of(clip), clip.lens("target"), len(LiveConfig().classes)
-        rays, nothing, labels = pixel_rays(lens), torch.zeros(lens.height, lens.width), source.labels.to(torch.uint8)
+        rays, nothing, labels = lens.rays(), torch.zeros(lens.height, lens.width), source.labels.to(torch.uint8)
         made, video = [], []
         for t, (pose, target) in enumerate(zip(clip.poses("source"), clip.poses("target"), strict=True)):
             surfels = unproject(source.metres[t], source.video[t], labels[t], source.lenses[t], pose, 1.0)
@@ -133,16 +131,14 @@ class LiveModel:
 
     def views(self, clip: LiveClip) -> MethodViews:
         """See Method."""
-        view = LiveView(self.networks, steps=self.steps)
-        view.eyes = self.eyes(self.networks)
+        eyes, config = self.eyes(self.networks), self.networks.config
+        world = SeenWorld(config, next(self.networks.parameters()).device)
+        painter = Painter(self.networks, steps=self.steps or config.steps)
         source, moves = pictures_of(clip), invert_rigid(clip.poses("source")) @ clip.poses("target")
         lens, target_lens = source.lenses[0], clip.lens("target")
-        frames = [
-            view.step(source.video[t], [move], lens=lens, floor=self._floor(source, t), target_lens=target_lens).views[
-                0
-            ]
-            for t, move in enumerate(moves)
-        ]
+        seen = (eyes.see(frame, lens=lens, floor=self._floor(source, t)) for t, frame in enumerate(source.video))
+        placed = (world.place(each, [move], target_lens) for each, move in zip(seen, moves, strict=True))
+        frames = [painter.paint(each)[0] for each in placed]
         return MethodViews(
             video=torch.stack([(frame.picture.clamp(-1, 1) + 1) / 2 for frame in frames]),
             classes=torch.stack([frame.classes for frame in frames]),

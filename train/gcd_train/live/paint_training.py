@@ -19,7 +19,7 @@ from torch.nn.utils.parametrizations import spectral_norm
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
-from gcd_model.live.painter import movable_classes
+from gcd_model.live.synthesizer import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import LiveTask, Random, autocast, class_weights, generator_on, on
 from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of

@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import LIVE_CLASSES, SKY_M, LiveConfig
 from gcd_model.live.depth_net import DepthNet, depth_inputs, plane_depth, read_depth
-from gcd_model.live.memory import seen_world
+from gcd_model.live.eyes import SeenWorld
 from gcd_model.live.paint_net import Painted, Seen, camera_features
 from gcd_model.live.splat import Splat, splat, unproject
 from gcd_train.data.sample import to_network
@@ -82,7 +82,7 @@ def roughened(source: Pictures, random: Random) -> Pictures:
 
 def splats_of(clip: LiveClip, source: Pictures, config: LiveConfig) -> list[Splat]:
     """What the target camera of every frame sees of what the source has shown so far. source: see the two above."""
-    world, lens = seen_world(config, torch.device("cpu")), clip.lens("target")
+    world, lens = SeenWorld(config), clip.lens("target")
     labels, static = source.labels.to(torch.uint8), source.moves < 0.5
     made: list[Splat] = []
     for t, (own, pose, target) in enumerate(zip(source.lenses, *map(clip.poses, CAMERAS), strict=True)):

@@ -8,7 +8,7 @@ from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory, motion_bucket
 from gcd_model.layers import sinusoid
 from gcd_model.weights.families import Family
-from gcd_train.errors import DataError, RecipeError
+from gcd_train.errors import DataError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.training.setup import Precision
 
@@ -17,17 +17,11 @@ class Conditioner:
     """Condition channels, vectors and camera features of frames.
 
     family: says what motion number belongs to a camera path; None where nobody asks for one.
-    Raises RecipeError for a model with condition channels that nothing here can fill.
     """
 
     def __init__(
         self, config: ModelConfig, recipe: UNetRecipe, precision: Precision, family: Family | None = None
     ) -> None:
-        if config.extra_condition_channels:
-            raise RecipeError(
-                f"the model wants {config.extra_condition_channels} condition channels beside latents, which no data "
-                "here has; take another base model"
-            )
         self._config, self._recipe, self._precision, self._family = config, recipe, precision, family
         width = config.unet.vector_width
         told = micro_conditioning(recipe.fps, recipe.motion_bucket, recipe.augmentation, width)

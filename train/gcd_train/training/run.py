@@ -208,7 +208,7 @@ class Trainer:
         export(
             networks,
             self._folder,
-            Card(name=recipe.name, config=config, family=self._family.name, move_time=goal),
+            Card(name=recipe.name, config=config, family=self._family, move_time=goal),
             recipe.export,
             self._validation(),
             updates=updates,
