@@ -119,8 +119,15 @@ def _car(style: _Style, paint: Colour, lamps: Lamps, near: bool) -> Assembly:
         *_lights(length, width, 0.68 * style.belt, lamps, label, near),
         *_wheels((-0.3 * length, 0.31 * length), width, style.wheel, label, near),
     ]  # fmt: skip
-    if near:
-        parts += _fittings(style, paint)
+    if near:  # grille, bumpers, plate and mirrors
+        front, mirror = length / 2, style.cabin[1] * length - length / 2 - 0.3
+        parts += [
+            block((front + 0.01, 0, 0.62 * style.belt), (0.05, width * 0.42, 0.16), _DARK, label),
+            block((front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
+            block((-front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
+            block((-front - 0.02, 0, 0.6 * style.belt), (0.05, 0.5, 0.11), (0.85, 0.85, 0.8), label),
+            block((mirror, 0, style.belt + 0.1), (0.12, width + 0.08, 0.12), paint, label, gloss=0.35),
+        ]
     return Assembly(parts=tuple(parts), length=length + 0.1, width=width + 0.1)
 
 
@@ -156,19 +163,6 @@ def _lights(length: float, width: float, z: float, lamps: Lamps, label: Label, n
         parts.append(block((length / 2, y, z), (0.07, 0.34, 0.14), _HEADLIGHT, label, gloss=0.6, lit=lamps.lit))
         parts.append(block((-length / 2, y, z + 0.06), (0.07, 0.3, 0.17), tail, label, gloss=0.6, lit=red))
     return parts
-
-
-def _fittings(style: _Style, paint: Colour) -> list[Part]:
-    """Grille, bumpers, plates and mirrors."""
-    front, width, label = style.length / 2, style.width, Label.CAR
-    mirror = style.cabin[1] * style.length - front - 0.3
-    return [
-        block((front + 0.01, 0, 0.62 * style.belt), (0.05, width * 0.42, 0.16), _DARK, label),
-        block((front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
-        block((-front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
-        block((-front - 0.02, 0, 0.6 * style.belt), (0.05, 0.5, 0.11), (0.85, 0.85, 0.8), label),
-        block((mirror, 0, style.belt + 0.1), (0.12, width + 0.08, 0.12), paint, label, gloss=0.35),
-    ]
 
 
 def _wheels(axles: tuple[float, ...], width: float, radius: float, label: Label, near: bool) -> list[Part]:
