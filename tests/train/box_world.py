@@ -64,6 +64,7 @@ def box_object(name: str, instance: int, body: int, size: tuple[float, float, fl
     turns = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1).astype(np.float64)
     return SceneObject(
         name=name,
+        parts=(),
         instance=instance,
         body=body,
         label=body,

@@ -15,14 +15,23 @@ from gcd_train.evaluation.clips import cameras_of
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe
 from gcd_train.scenes.driving.world import driving_scene
-from gcd_train.scenes.worlds import CameraWay, PairForm, World, WorldOptions, agree, driving_world, read_world
+from gcd_train.scenes.worlds import (
+    SCENE_WORLDS,
+    CameraWay,
+    PairForm,
+    World,
+    WorldOptions,
+    agree,
+    pair_world,
+    read_world,
+)
 from gcd_train.training.setup import family_of, model_config
 
 FORM = PairForm(width=48, height=32, frames=3, oversample=1)
 
 
 def world(path: CameraWay, mount: WorldOptions | None = None) -> World:
-    return driving_world(FORM, mount or WorldOptions(), path)
+    return pair_world(SCENE_WORLDS["driving"], FORM, mount=mount or WorldOptions(), path=path)
 
 
 def folder(place: Path, path: CameraWay, first_seed: int = 0) -> Path:

@@ -15,9 +15,9 @@ from gcd_train.scenes.driving import FPS, ONTOLOGY, class_ids, driving_drive, dr
 from gcd_train.scenes.driving.classes import Label, coarse
 from gcd_train.scenes.driving.flow import Crowd, RoadUser, random_drive
 from gcd_train.scenes.driving.roads import random_street
-from gcd_train.scenes.driving.roadside import Place, Plot
+from gcd_train.scenes.driving.roadside import Plot
 from gcd_train.scenes.driving.vehicles import Lamps, random_bus
-from gcd_train.scenes.driving.world import WEATHERS, random_weather, random_world
+from gcd_train.scenes.driving.world import random_weather, random_world
 from gcd_train.scenes.drop.things import outline
 from gcd_train.scenes.renderer import Renderer
 
@@ -26,6 +26,7 @@ FRAMES = 50
 VEHICLES = (
     Label.CAR, Label.TRUCK, Label.BUS, Label.OWN_CAR, Label.MOTORCYCLIST, Label.CYCLIST, Label.MOTORCYCLE, Label.BICYCLE
 )  # fmt: skip
+WEATHERS = {"clear", "cloudy", "low sun", "overcast", "rain", "fog", "dusk", "night"}
 PUBLISHED = {
     "Bicyclist": (64, 64, 64), "Motorcyclist": (128, 128, 128), "Pedestrian": (220, 20, 60), "Bus": (0, 60, 100),
     "Car": (0, 0, 142), "Bicycle": (119, 11, 32), "Motorcycle": (0, 0, 230), "OwnCar(EgoCar)": (128, 230, 128),
@@ -111,8 +112,7 @@ def test_no_camera_is_ever_inside_a_solid(seed: int) -> None:
 
 def test_nothing_is_put_where_a_camera_passes() -> None:
     street = random_street(np.random.default_rng(3))
-    place = Place(road=street.main, s=0.0, side=1.0, away=40.0)
-    house = place.put([Part("box", (0, 0, 4), (8, 8, 8), Paint((1, 1, 1)), Label.BUILDING)])
+    house = street.main.put([Part("box", (0, 0, 4), (8, 8, 8), Paint((1, 1, 1)), Label.BUILDING)], 0.0, 40.0)
     inside = np.array([house[0].centre])
     above = inside + np.array([0.0, 0.0, 6.0])
     assert not Plot(street=street, cameras=inside).put(house)
@@ -170,7 +170,7 @@ def test_drives_vary_in_what_there_is() -> None:
 
 def test_every_weather_occurs_and_its_light_can_be_drawn() -> None:
     drawn = [random_weather(np.random.default_rng(seed)) for seed in range(200)]
-    assert {weather.kind for weather in drawn} == set(WEATHERS)
+    assert {weather.kind for weather in drawn} == WEATHERS
     for weather in drawn:
         light = weather.light
         assert np.linalg.norm(light.sun_to) == pytest.approx(1.0)

@@ -130,10 +130,10 @@ def test_sigterm_stops_the_workers_and_keeps_whole_shards(tmp_path: Path) -> Non
 
 @needs_egl
 def test_a_failing_scene_leaves_no_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: Renderer, scene: object) -> None:
+    def broken(*_: object) -> None:
         raise RuntimeError("driver lost")
 
-    monkeypatch.setattr(Renderer, "render", broken)
+    monkeypatch.setattr(Renderer, "views", broken)
     with pytest.raises(RuntimeError, match="driver lost"):
         write_shard(tmp_path, TINY, range(2))
     assert list(tmp_path.iterdir()) == []

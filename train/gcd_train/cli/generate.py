@@ -17,8 +17,7 @@ from gcd_train.scenes.worlds import (
     PairForm,
     SceneWorld,
     WorldOptions,
-    driving_world,
-    orbit_world,
+    pair_world,
 )
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
@@ -95,11 +94,9 @@ def _add(world: SceneWorld, about: str, *, clips_a_scene: int, clips_a_shard: in
                     "--scenes and --compact make whole scenes; --clips, --pairs, a mount and a path pairs; give one"
                 )
             pair = PairForm(clips_per_shard=clips_per_shard, **given)
-            if on_road:
-                made = driving_world(pair, mount, path)
-            else:
-                made = orbit_world(world, pair, clips_per_scene=clips_per_scene)
-            seeds = made.seeds_of(first_seed, clips or 100)
+            made = pair_world(world, pair, mount=mount, path=path, clips_per_scene=clips_per_scene)
+            first = first_seed * made.clips_per_scene
+            seeds = range(first, first + (clips or 100))
             with progress_bar("clips", len(seeds), keep=True) as show:
                 for done in generate(place, made, seeds, processes, ray):
                     show(done)

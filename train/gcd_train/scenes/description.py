@@ -6,7 +6,7 @@ writers know nothing else.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from typing import Any, Self, TypeVar
 
@@ -181,48 +181,27 @@ class Tracks:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class SceneObject:
-    """What is known of a thing beyond its picture: as the metadata of Kubric-4D tells it.
+class SceneObject(Thing):
+    """What is known of a thing in a scene beyond its picture: as the metadata of Kubric-4D tells it.
 
-    name: which asset it is. instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id.
-    size, middle, dynamic: as in `Thing`. positions, quaternions, velocities, angular_velocities: [T, 3 or 4], as in
-    `Tracks`.
+    instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id. positions, quaternions,
+    velocities, angular_velocities: [T, 3 or 4], as in `Tracks`.
     """
 
-    name: str
     instance: int
     body: int
     label: int
-    size: Point
-    dynamic: bool
-    mass_kg: float
-    friction: float
-    restitution: float
     positions: Doubles
     quaternions: Doubles
     velocities: Doubles
     angular_velocities: Doubles
-    middle: Point = (0.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, thing: Thing, tracks: Tracks, number: int, *, instance: int, body: int, label: int) -> Self:
         """A thing whose motion is number so-and-so of the tracks."""
-        return cls(
-            name=thing.name,
-            instance=instance,
-            body=body,
-            label=label,
-            size=thing.size,
-            middle=thing.middle,
-            dynamic=thing.dynamic,
-            mass_kg=thing.mass_kg,
-            friction=thing.friction,
-            restitution=thing.restitution,
-            positions=tracks.positions[:, number],
-            quaternions=tracks.quaternions[:, number],
-            velocities=tracks.velocities[:, number],
-            angular_velocities=tracks.angular_velocities[:, number],
-        )
+        known = {each.name: getattr(thing, each.name) for each in fields(Thing)}
+        motion = {each.name: getattr(tracks, each.name)[:, number] for each in fields(Tracks)}
+        return cls(**known, **motion, instance=instance, body=body, label=label)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

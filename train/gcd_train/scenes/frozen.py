@@ -28,7 +28,6 @@ from gcd_train.scenes.description import (
     Part,
     Pattern,
     Scene,
-    Sheet,
     rotations,
     upright,
 )
@@ -127,8 +126,12 @@ def vertices_of(scene: Scene) -> Vertices:
     place, tags = standing["position"][:, 0], standing["tags"][:, 0]
     away = np.where(tags[:, 2] > 0, 0.0, np.hypot(place[:, 0], place[:, 1]))
     standing = standing[np.lexsort((away, _paint(tags[:, 3], standing["colour"][:, 0, 3])))]
-    lying = [_of_sheet(sheet).reshape(-1, 3) for sheet in reversed(scene.sheets)]
-    return np.concatenate([standing, *lying, parts[is_sky]]).reshape(-1)
+    lying = [np.empty((len(sheet.corners), 3), VERTEX) for sheet in scene.sheets]
+    for made, sheet in zip(lying, scene.sheets, strict=True):
+        made["position"], made["normal"] = sheet.corners, (0.0, 0.0, 1.0)
+        made["colour"], made["accent"] = _bytes(sheet.paint)
+        made["tags"] = (sheet.label, 0, 0, sheet.paint.pattern)
+    return np.concatenate([standing, *reversed(lying), parts[is_sky]]).reshape(-1)
 
 
 def _paint(pattern: NDArray[np.uint8], gloss: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -153,15 +156,6 @@ def _of_parts(name: str, parts: list[Part]) -> Vertices:
     made["colour"], made["accent"] = paints[:, :1], paints[:, 1:]
     made["tags"] = np.array([(p.label, p.instance, p.body, p.paint.pattern) for p in parts], np.uint8)[:, None]
     return made.reshape(-1)
-
-
-def _of_sheet(sheet: Sheet) -> Vertices:
-    made = np.empty(sheet.corners.shape[0] * 3, VERTEX)
-    made["position"] = sheet.corners.reshape(-1, 3)
-    made["normal"] = (0.0, 0.0, 1.0)
-    made["colour"], made["accent"] = _bytes(sheet.paint)
-    made["tags"] = (sheet.label, 0, 0, sheet.paint.pattern)
-    return made
 
 
 def _bytes(paint: Paint) -> list[tuple[int, ...]]:

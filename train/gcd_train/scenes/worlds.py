@@ -97,6 +97,11 @@ class WorldOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     tilt_deg: float = CameraMount().tilt_deg
 
 
+_MOUNT = WorldOptions()
+_STRIDE = 2
+"""Time steps of a stage from one frame of a clip to the next."""
+
+
 class Orbit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a clip of an orbit world was cut from its scene.
 
@@ -146,11 +151,6 @@ class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """The seed of the scene that a clip was cut from."""
         return seed // self.clips_per_scene
 
-    def seeds_of(self, first_scene: int, clips: int) -> range:
-        """Numbers of so many clips, from the first one of a scene on."""
-        first = first_scene * self.clips_per_scene
-        return range(first, first + clips)
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PairForm:
@@ -163,48 +163,41 @@ class PairForm:
     clips_per_shard: int = 8
 
 
-def driving_world(form: PairForm, mount: WorldOptions, path: CameraWay = "gradual") -> World:
-    """Pairs of the forward camera and the path to the view from above.
+def pair_world(
+    scenes: SceneWorld,
+    form: PairForm,
+    *,
+    mount: WorldOptions = _MOUNT,
+    path: CameraWay = "gradual",
+    clips_per_scene: int = 3,
+) -> World:
+    """Pairs of clips of a world: of driving the forward camera and the path to the view from above, of a world on
+    Kubric-4D's stage a source that stands and a target that goes over the sphere.
 
-    mount: where the source camera really sits. path: how the target camera gets there.
-    Raises: PoseError if that is no mount.
-    """
-    CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
-    drive = SCENE_WORLDS["driving"]
-    return World(
-        name=drive.name,
-        **asdict(form),
-        fps=drive.fps,
-        hfov_deg=DRIVING_HFOV_DEG,
-        options=mount,
-        edition=drive.edition,
-        path=path,
-    )
-
-
-def orbit_world(scenes: SceneWorld, form: PairForm, *, stride: int = 2, clips_per_scene: int = 3) -> World:
-    """Pairs of clips of a world on Kubric-4D's stage: the source stands, the target goes over the sphere.
+    mount, path: of driving, where the source camera really sits, and how the target camera gets to its goal.
+    clips_per_scene: of a stage.
 
     Raises:
-        RecipeError: this world has no stage, or its scenes are too short for such clips.
+        PoseError: that is no mount.
+        RecipeError: the scenes are too short for such clips.
     """
-    if scenes.layout != "kubric4d":
-        raise RecipeError(f"the world {scenes.name} has no stage to go round; choose drop or tabletop")
-    if (form.frames - 1) * stride + 2 > scenes.frames:  # its last frame stays out of reach, see `FrameSampling`
+    shared = {"name": scenes.name, "edition": scenes.edition, **asdict(form)}
+    if scenes.layout == "parallel_domain4d":
+        CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
+        return World(**shared, fps=scenes.fps, hfov_deg=DRIVING_HFOV_DEG, options=mount, path=path)
+    if (form.frames - 1) * _STRIDE + 2 > scenes.frames:  # its last frame stays out of reach, see `FrameSampling`
         raise RecipeError(
             f"a {scenes.name} scene has {scenes.frames} time steps, too few for {form.frames} frames at stride "
-            f"{stride}; ask for up to {(scenes.frames - 2) // stride + 1}"
+            f"{_STRIDE}; ask for up to {(scenes.frames - 2) // _STRIDE + 1}"
         )
     return World(
-        name=scenes.name,
-        **asdict(form),
-        fps=scenes.fps / stride,
+        **shared,
+        fps=scenes.fps / _STRIDE,
         hfov_deg=STAGE_HFOV_DEG,
         classes=(),
         camera="orbit",
         clips_per_scene=clips_per_scene,
-        edition=scenes.edition,
-        stride=stride,
+        stride=_STRIDE,
     )
 
 

@@ -200,12 +200,11 @@ def _two_wheelers(crowd: Crowd, random: np.random.Generator) -> None:
     for side, kerb in road.sides:
         for _ in range(int(random.integers(0, 4))):
             s, heavy = float(random.uniform(-45, 70)), random.random() < 0.3
-            make = vehicles.left_motorcycle if heavy else vehicles.left_bicycle
             for number in range(int(random.integers(1, 5))):
                 rows = _along(road, np.full(frames, s + number * (1.1 if heavy else 0.8)), side * (kerb + 1.25))
                 rows[:, 2:] += [PAVEMENT_M, np.pi / 2]
                 if road.is_free(s, 8.0):
-                    crowd.add(make(random), rows)
+                    crowd.add(vehicles.left_two_wheeler(random, heavy), rows)
     for side, lanes in ((-1.0, road.lanes_right), (1.0, road.lanes_left)):
         for _ in range(0 if crowd.drive.waits_at else int(random.integers(0, 4))):
             covered = travelled(float(random.uniform(2.5, 6.0)), 0.0, frames)
@@ -232,7 +231,7 @@ def _walkers(crowd: Crowd, random: np.random.Generator) -> None:
                     rows[:, 2] = PAVEMENT_M
                     crowd.add(vehicles.random_person(random, not stands), rows)
     crossed = crowd.street.roads[:1] if crowd.drive.waits_at else crowd.street.crossed
-    for road, crossing in ((road, crossing) for road in crossed for crossing in road.crossings):
+    for road, crossing in [(each, crossing) for each in crossed for crossing in each.crossings]:
         near, far = zebra_m(crossing)
         for _ in range(int(random.integers(1, 6)) if crossing.zebra else 0):
             way, end = float(random.choice([-1, 1])), float(random.choice([-1, 1]))

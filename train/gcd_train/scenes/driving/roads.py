@@ -112,7 +112,7 @@ def ribbon(road: Road, right: Edge, left: Edge, spans: list[Span] | None = None)
     """A strip along the road between two edges, all along or over some stretches."""
     pieces = [np.zeros((0, 3, 3), np.float32)]
     for begin, end in [(road.start_m, road.end_m)] if spans is None else spans:
-        inside = _KNOTS_M[(_KNOTS_M > begin + 0.3) & (_KNOTS_M < end - 0.3)]
+        inside = _KNOTS_M[(begin + 0.3 < _KNOTS_M) & (end - 0.3 > _KNOTS_M)]
         s = np.sort(np.concatenate([[begin], inside, [end]]))
         low, high = (_lifted(road.places(s, lateral), z) for lateral, z in (right, left))
         pieces.append(quads(low[:-1], low[1:], high[1:], high[:-1]))

@@ -28,7 +28,7 @@ Side = tuple[Road, float, float]
 def touches(first: Footprints, second: Footprints, gap_m: float = 0.0) -> bool:
     """Whether any two rectangles of a pair come closer than a gap; sizes broadcast.
 
-    Two convex shapes are apart if and only if an edge's normal separates them. Only pairs near each other are looked at.
+    Two convex shapes are apart if and only if an edge's normal separates them. Only near pairs are looked at.
     """
     away = first[..., :2] - second[..., :2]
     radius = np.hypot(first[..., 3], first[..., 4]) + np.hypot(second[..., 3], second[..., 4]) + 2 * gap_m

@@ -124,20 +124,19 @@ def lit_windows(house: Sequence[Part], random: np.random.Generator) -> list[Part
     return parts
 
 
-def leaf_colour(random: np.random.Generator) -> Colour:
+def _leaf_colour(random: np.random.Generator) -> Colour:
     """Mostly green."""
     return tone(random, (0.26, 0.4, 0.16) if random.random() < 0.85 else (0.5, 0.42, 0.15), 0.25)
 
 
-def foliage(at: Point, size: Point, colour: Colour, shape: str = "ball", yaw: float = 0.0) -> Part:
-    """One body of leaves."""
+def _foliage(at: Point, size: Point, colour: Colour, shape: str = "ball", yaw: float = 0.0) -> Part:
     return block(at, size, colour, Label.VEGETATION, shape=shape, pattern=Pattern.LEAVES, yaw=yaw)
 
 
 def tree(random: np.random.Generator) -> list[Part]:
     """A stem with two or three crowns."""
     height, spread = float(random.uniform(4.5, 10)), float(random.uniform(2.4, 5.0))
-    leaf, stem = leaf_colour(random), height * float(random.uniform(0.3, 0.42))
+    leaf, stem = _leaf_colour(random), height * float(random.uniform(0.3, 0.42))
     size = (0.3, 0.3, stem + 0.6)
     parts = [block((0, 0, stem / 2 + 0.3), size, (0.3, 0.22, 0.16), Label.VEGETATION, shape="post")]
     for _ in range(int(random.integers(2, 4))):
@@ -145,14 +144,14 @@ def tree(random: np.random.Generator) -> list[Part]:
         crown = (height - stem) * float(random.uniform(0.75, 1.0))
         size = (spread * float(random.uniform(0.7, 1)), spread * float(random.uniform(0.7, 1)), crown)
         z = stem + crown / 2 + float(random.uniform(-0.2, 0.6))
-        parts.append(foliage((x, y, z), size, tone(random, leaf, 0.1)))
+        parts.append(_foliage((x, y, z), size, tone(random, leaf, 0.1)))
     return parts
 
 
 def bush(random: np.random.Generator) -> list[Part]:
     """One low crown."""
     size = (float(random.uniform(1.2, 3.5)), float(random.uniform(0.9, 1.5)), float(random.uniform(0.8, 1.7)))
-    return [foliage((0, 0, size[2] * 0.35), size, leaf_colour(random))]
+    return [_foliage((0, 0, size[2] * 0.35), size, _leaf_colour(random))]
 
 
 def conifer(random: np.random.Generator) -> list[Part]:
@@ -162,7 +161,7 @@ def conifer(random: np.random.Generator) -> list[Part]:
     parts = [block((0, 0, 0.7), (0.3, 0.3, 1.4), (0.28, 0.2, 0.14), Label.VEGETATION)]
     for tier, (low, share, tall) in enumerate(((0.1, 1.0, 0.55), (0.32, 0.78, 0.45), (0.55, 0.5, 0.45))):
         size = (wide * share, wide * share, high * tall)
-        parts.append(foliage((0, 0, high * (low + tall / 2)), size, green, "cone", 0.5 * tier))
+        parts.append(_foliage((0, 0, high * (low + tall / 2)), size, green, "cone", 0.5 * tier))
     return parts
 
 
@@ -170,7 +169,7 @@ def hedge(random: np.random.Generator, length: float) -> list[Part]:
     """A clipped hedge along the road."""
     high = float(random.uniform(0.9, 1.9))
     size = (length, 0.8, high)
-    return [foliage((0, 0, high / 2 - 0.05), size, leaf_colour(random), "taper" if high < 1.2 else "box")]
+    return [_foliage((0, 0, high / 2 - 0.05), size, _leaf_colour(random), "taper" if high < 1.2 else "box")]
 
 
 def fence(random: np.random.Generator, length: float) -> list[Part]:
@@ -253,4 +252,4 @@ def planter(random: np.random.Generator) -> list[Part]:
     """A tub with a small bush."""
     grey = tone(random, (0.55, 0.53, 0.5))
     tub = block((0, 0, 0.35), (1.3, 1.0, 0.7), grey, Label.STREET_FURNITURE, shape="taper")
-    return [tub, foliage((0, 0, 0.95), (1.1, 0.9, 0.9), leaf_colour(random))]
+    return [tub, _foliage((0, 0, 0.95), (1.1, 0.9, 0.9), _leaf_colour(random))]

@@ -48,6 +48,7 @@ EDITION = 2
 """Rises whenever a seed draws another world."""
 _PATH_STEPS = 8
 _PAVED = ("city", "business")
+_MOUNT = CameraMount()
 _SIDE_YAW_DEG, _SIDE_M = 60.0, 0.25
 _FOCUS_AHEAD_M = 28.0
 """Shadows fall around a point that far ahead of the vehicle."""
@@ -91,9 +92,7 @@ def driving_drive(seed: int, frames: int = 50) -> Scene:
     return replace(scene, cameras=_on_vehicle(users[0].rows))
 
 
-def driving_scene(
-    seed: int, *, frames: int = 14, mount: CameraMount = CameraMount(), move_time: int | None = None  # noqa: B008
-) -> Scene:
+def driving_scene(seed: int, *, frames: int = 14, mount: CameraMount = _MOUNT, move_time: int | None = None) -> Scene:
     """A scene for pairs, seen by a source and a target camera that ride on the vehicle, in the models' thirteen
     classes; the arguments decide it all.
 
