@@ -97,7 +97,8 @@ def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: in
         if thing.dynamic:
             place = stage.put(i, random, (-5.0, -5.0, 1.0), (5.0, 5.0, 6.0))
             pull = np.array([place[0], place[1], 0.0])  # Kubric's throw: anywhere, and towards the middle
-            stage.throw(i, random.uniform((-4, -4, 0), (4, 4, 0)) - pull, random.uniform(-2.5, 2.5, 3))
+            velocity, spin = random.uniform((-4, -4, 0), (4, 4, 0)) - pull, random.uniform(-2.5, 2.5, 3)
+            stage.data.qvel[6 * i : 6 * i + 6] = np.concatenate([velocity, spin])  # about its own axes
     return stage.watch(frames)
 
 
@@ -108,7 +109,7 @@ class _Stage:
         self._mujoco = load_mujoco()
         self._things = things
         self._model: Any = _compiled(self._mujoco, things)
-        self._data: Any = self._mujoco.MjData(self._model)
+        self.data: Any = self._mujoco.MjData(self._model)
         for i, thing in enumerate(things):  # far outside, alone, where it disturbs nothing
             self._place(i, np.array([500.0 + 20.0 * i, 500.0, thing.size[2] / 2 + 0.01]), np.eye(4)[0])
 
@@ -118,8 +119,8 @@ class _Stage:
             quaternion = random.normal(size=4)
             place = random.uniform(low, high)
             self._place(i, place, quaternion / np.linalg.norm(quaternion))
-            self._mujoco.mj_forward(self._model, self._data)
-            if not (self._model.geom_bodyid[self._data.contact.geom] == i + 1).any():
+            self._mujoco.mj_forward(self._model, self.data)
+            if not (self._model.geom_bodyid[self.data.contact.geom] == i + 1).any():
                 return place
         raise UnsoundSceneError(f"no free place for a {self._things[i].name} in {_TRIES} tries")
 
@@ -130,17 +131,13 @@ class _Stage:
         self._run(_SETTLING_S)
         rows = [6 * i + k for i in which for k in range(6)]
         waited = _SETTLING_S
-        while np.abs(self._data.qvel[rows]).max(initial=0.0) > _STILL_M_S:
+        while np.abs(self.data.qvel[rows]).max(initial=0.0) > _STILL_M_S:
             if waited >= _LONGEST_SETTLING_S:
                 raise UnsoundSceneError(f"something still moves after {waited:.0f} s")
             self._run(0.5)
             waited += 0.5
-        self._data.qvel[:] = 0.0
+        self.data.qvel[:] = 0.0
         self._model.dof_damping[:] = 0.0
-
-    def throw(self, i: int, velocity: Doubles, spin: Doubles) -> None:
-        """Give it a velocity, metres a second, and a spin about its own axes, radians a second."""
-        self._data.qvel[6 * i : 6 * i + 6] = np.concatenate([velocity, spin])
 
     def watch(self, frames: int) -> tuple[Tracks, float]:
         """The motion from now on, and how deep solids overlapped at most."""
@@ -148,8 +145,8 @@ class _Stage:
         for frame in range(frames):
             if frame:
                 deepest = max(deepest, self._run(1 / FPS))
-            q.append(self._data.qpos.reshape(-1, 7).copy())
-            v.append(self._data.qvel.reshape(-1, 6).copy())
+            q.append(self.data.qpos.reshape(-1, 7).copy())
+            v.append(self.data.qvel.reshape(-1, 6).copy())
         q, v = np.stack(q), np.stack(v)  # [T, N, 7], [T, N, 6]
         spin = rotations(q[..., 3:]) @ v[..., 3:, None]  # MuJoCo's are in the body's frame
         tracks = Tracks(
@@ -161,15 +158,15 @@ class _Stage:
         """Let time pass. Returns how deep solids overlapped at most. Raises UnsoundSceneError if it diverged."""
         deepest = 0.0
         for _ in range(round(seconds / _STEP_S)):
-            self._mujoco.mj_step(self._model, self._data)
-            deepest = min(deepest, self._data.contact.dist.min(initial=0.0))
-        if any(warning.number for warning in self._data.warning):  # MuJoCo starts anew after such
+            self._mujoco.mj_step(self._model, self.data)
+            deepest = min(deepest, self.data.contact.dist.min(initial=0.0))
+        if any(warning.number for warning in self.data.warning):  # MuJoCo starts anew after such
             raise UnsoundSceneError("the simulation diverged")
         return -float(deepest)
 
     def _place(self, i: int, place: Doubles, quaternion: Doubles) -> None:
-        self._data.qpos[7 * i : 7 * i + 7] = np.concatenate([place, quaternion])
-        self._data.qvel[6 * i : 6 * i + 6] = 0.0
+        self.data.qpos[7 * i : 7 * i + 7] = np.concatenate([place, quaternion])
+        self.data.qvel[6 * i : 6 * i + 6] = 0.0
 
 
 def load_mujoco() -> Any:
@@ -258,7 +255,24 @@ def drop_scene(seed: int, frames: int = 60) -> Scene:
         except UnsoundSceneError as error:
             reasons.append(str(error))
             continue
-        return _scene(things, tracks, np.random.default_rng([seed, 0x100C]), {"seed": seed, "attempts": attempt + 1})
+        random = np.random.default_rng([seed, 0x100C])
+        surroundings, dome, floor = random_surroundings(random)
+        counts = {"settled": len(settled), "thrown": len(things) - len(settled)}
+        return Scene(
+            parts=(dome, *(part.of(instance=i, body=i) for i, thing in enumerate(things, 1) for part in thing.parts)),
+            sheets=(floor,),
+            poses=with_world(rotations(tracks.quaternions), tracks.positions),
+            focus=np.zeros((frames, 3), np.float32),
+            cameras=orbit_cameras(frames),
+            hfov_deg=HFOV_DEG,
+            light=random_light(random),
+            facts={"seed": seed, "attempts": attempt + 1, "surroundings": surroundings, **counts},
+            objects=tuple(
+                SceneObject.of(thing, tracks, i, instance=i + 1, body=i + 1, label=DropLabel.OBJECT)
+                for i, thing in enumerate(things)
+            ),
+            extent=ORBIT,
+        )
     raise RenderError(f"drop scene {seed}: no sound simulation in {_ATTEMPTS} attempts ({'; '.join(reasons)}); skip it")
 
 
@@ -283,27 +297,6 @@ def _require_free_cameras(things: list[Thing], tracks: Tracks) -> None:
     away = np.linalg.norm(tracks.positions[:, :, None] - cameras, axis=-1).min((0, 2))  # [N]
     if (away < reach).any():
         raise UnsoundSceneError(f"a {things[int((away - reach).argmin())].name} reaches a camera")
-
-
-def _scene(things: list[Thing], tracks: Tracks, random: np.random.Generator, facts: dict[str, float | str]) -> Scene:
-    frames = len(tracks.positions)
-    surroundings, dome, floor = random_surroundings(random)
-    thrown = sum(thing.dynamic for thing in things)
-    return Scene(
-        parts=(dome, *(part.of(instance=i, body=i) for i, thing in enumerate(things, 1) for part in thing.parts)),
-        sheets=(floor,),
-        poses=with_world(rotations(tracks.quaternions), tracks.positions),
-        focus=np.zeros((frames, 3), np.float32),
-        cameras=orbit_cameras(frames),
-        hfov_deg=HFOV_DEG,
-        light=random_light(random),
-        facts={**facts, "surroundings": surroundings, "settled": len(things) - thrown, "thrown": thrown},
-        objects=tuple(
-            SceneObject.of(thing, tracks, i, instance=i + 1, body=i + 1, label=DropLabel.OBJECT)
-            for i, thing in enumerate(things)
-        ),
-        extent=ORBIT,
-    )
 
 
 DOME_M = 40.0
