@@ -265,6 +265,11 @@ def rotations(quaternions: NDArray[Any]) -> NDArray[Any]:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
+def moved(a_from_b: Doubles, points: NDArray[Any]) -> NDArray[Any]:
+    """Points [..., 3] of one frame in another, by a rigid transform [4, 4]."""
+    return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+
+
 def with_world(turns: Doubles, positions: Doubles) -> Floats:
     """world_from_body [T, 1 + B, 3, 4]: the world itself, then bodies by rotation [T, B, 3, 3] and origin [T, B, 3]."""
     moving = np.concatenate([turns, positions[..., None]], -1)

@@ -2,7 +2,7 @@
 
 from gcd_train.scenes.driving.classes import ONTOLOGY, OntologyItem, class_ids
 from gcd_train.scenes.driving.flow import FPS
-from gcd_train.scenes.driving.world import EDITION, HFOV_DEG, driving_drive, driving_scene, vehicle_from_camera
+from gcd_train.scenes.driving.world import EDITION, HFOV_DEG, driving_drive, driving_scene, looking, vehicle_from_camera
 
 __all__ = [
     "EDITION",
@@ -13,5 +13,6 @@ __all__ = [
     "class_ids",
     "driving_drive",
     "driving_scene",
+    "looking",
     "vehicle_from_camera",
 ]

@@ -24,6 +24,7 @@ from gcd_train.scenes.description import (
     SceneObject,
     Sheet,
     Tracks,
+    moved,
     pick,
     rotations,
     shaded,
@@ -104,7 +105,7 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     scene = Scene(
         parts=(*walls, *parts),
         sheets=(floor,),
-        poses=with_world(turns, UNITS_A_METRE * _moved(world_from_table, motion.tracks.positions)),
+        poses=with_world(turns, UNITS_A_METRE * moved(world_from_table, motion.tracks.positions)),
         focus=np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (frames, 1)),
         cameras=orbit_cameras(frames),
         hfov_deg=HFOV_DEG,
@@ -160,10 +161,10 @@ def _counted(
 def _in_world(moving: Tracks, clutter: tuple[Placed, ...], world_from_table: Doubles) -> Tracks:
     """The tracks of all bodies and, after them, of the clutter, from the table's frame to the world's, scene units."""
     turn, still = world_from_table[:3, :3], np.zeros((len(moving.positions), len(clutter), 3))
-    places = still + np.stack([_moved(world_from_table, np.array(each.place)) for each in clutter])
+    places = still + np.stack([moved(world_from_table, np.array(each.place)) for each in clutter])
     turned = still[..., :1] + np.stack([yawed(np.eye(4)[0], each.yaw) for each in clutter])
     return Tracks(
-        positions=UNITS_A_METRE * np.concatenate([_moved(world_from_table, moving.positions), places], 1),
+        positions=UNITS_A_METRE * np.concatenate([moved(world_from_table, moving.positions), places], 1),
         quaternions=yawed(np.concatenate([moving.quaternions, turned], 1), math.atan2(turn[1, 0], turn[0, 0])),
         velocities=UNITS_A_METRE * np.concatenate([moving.velocities @ turn.T, still], 1),
         angular_velocities=np.concatenate([moving.angular_velocities @ turn.T, still], 1),
@@ -206,11 +207,6 @@ def _in_units(poses: Doubles) -> Doubles:
 
 def _scaled(point: Point) -> Point:
     return point[0] * UNITS_A_METRE, point[1] * UNITS_A_METRE, point[2] * UNITS_A_METRE
-
-
-def _moved(world_from_table: Doubles, points: Doubles) -> Doubles:
-    """Points [..., 3] of the table's frame in the world."""
-    return points @ world_from_table[:3, :3].T + world_from_table[:3, 3]
 
 
 def room(random: np.random.Generator) -> tuple[list[Part], Sheet]:
