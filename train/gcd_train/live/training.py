@@ -4,7 +4,7 @@ clips -> depth network -> what it shows of every target (inputs) -> paint networ
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -86,16 +86,21 @@ def train_live(
     def save(path: Path) -> None:
         alone(lambda: save_live(path, networks, recipe.name, overwrite=True))
 
-    def run(name: LiveStageName, stage: LiveStage, task: Task, processes: Processes) -> None:
-        """Train a stage, whose weights are then in a file of their own; one to be kept is kept."""
+    def run(name: LiveStageName, task: Task, processes: Processes) -> None:
+        """Train a stage, whose weights are then averaged and in a file of their own; one to be kept is kept."""
         if name not in recipe.keep:
-            _train(recipe, folder, stop, name, stage, task, processes)
+            _train(recipe, name, task, folder, stop, processes)
             save(out / f"{recipe.name}-{name}.safetensors")
         task.module.eval().requires_grad_(False)
 
     depth = DepthTask(networks.depth, model, clips, measured, recipe.depth, seed)
-    run("depth", recipe.depth, depth, processes)
-    exact, learned, shown = _input_folders(out / "inputs", recipe, networks.depth)
+    run("depth", depth, processes)
+    # inputs by exact depth, by learned depth, and of held-out clips; named by all that decides what is seen
+    memory = digest_of(model.memory, model.memory_frames, seed)
+    by_net = f"{memory}-{weights_digest(networks.depth.state_dict())}"
+    exact, learned, shown = (
+        out / "inputs" / name for name in (f"exact/{memory}", f"learned/{by_net}", f"held-out/{by_net}")
+    )
     make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(recipe.workers, processes.count))
     alone(lambda: make(exact, clips.paths[:: recipe.exact_every], None))
     alone(lambda: make(learned, clips.paths[:: recipe.learned_every], networks.depth))
@@ -107,12 +112,12 @@ def train_live(
         for part in range(recipe.paint.parts)
     ]
     paint = PaintTask(networks.paint, model, batches, clips.paths, views, recipe.paint.small_share)
-    run("paint", recipe.paint, paint, processes)
+    run("paint", paint, processes)
     path = out / f"{recipe.name}.safetensors"
 
     def finish() -> None:
         seen = ViewBatches(clips, inputs, model, recipe.detail.batch, seed + 1, carried["detail"])
-        run("detail", recipe.detail, DetailTask(networks.paint, networks.depth, model, seen, views), ALONE)
+        run("detail", DetailTask(networks.paint, networks.depth, model, seen, views), ALONE)
         calibrate(networks.cpu(), clips.paths, held_out, views, depth.class_weights, paint.class_weights)
         save_live(path, networks, recipe.name, overwrite=True)
         _log.info("wrote %s", path)
@@ -121,11 +126,24 @@ def train_live(
     return path
 
 
-def _input_folders(out: Path, recipe: LiveRecipe, depth: DepthNet) -> tuple[Path, Path, Path]:
-    """Of inputs by exact depth, by learned depth, and of held-out clips; named by all that decides what is seen."""
-    memory = digest_of(recipe.model.memory, recipe.model.memory_frames, recipe.seed)
-    by_net = f"{memory}-{weights_digest(depth.state_dict())}"
-    return out / "exact" / memory, out / "learned" / by_net, out / "held-out" / by_net
+def _train(
+    recipe: LiveRecipe, name: LiveStageName, task: Task, folder: RunFolder, stop: Event, processes: Processes
+) -> None:
+    """Train a stage to the end of its budget; its module then has the averaged weights."""
+    stage: LiveStage = getattr(recipe, name)
+    options = LoopOptions(
+        stage=name,
+        identity=digest_of(recipe.model.depth, recipe.model.paint, recipe.seed, name),
+        table=stage,
+        log=recipe.log,
+        stop=stop,
+        frames_per_clip=recipe.model.frames,
+        parts=stage.parts,
+        engine=Engine(processes=processes, compute=ComputeRecipe(parallel="ddp")),
+    )
+    loop = Loop(task, folder, options)
+    loop.run()
+    loop.adopt_average()
 
 
 def _networks(recipe: LiveRecipe) -> LiveNetworks:
@@ -152,31 +170,6 @@ def _require_fit(recipe: LiveRecipe, learned: Sequence[Path], held_out: Sequence
         found = read_clip(path, names=["target.labels"]).arrays["target.labels"].shape
         if found != wanted:
             raise DataError(f"the recipe's model takes clips of [T, H, W] {wanted}, {path} has {found}")
-
-
-def _train(
-    recipe: LiveRecipe,
-    folder: RunFolder,
-    stop: Event,
-    name: LiveStageName,
-    stage: LiveStage,
-    task: Task,
-    processes: Processes,
-) -> None:
-    """Train a stage to the end of its budget; its module then has the averaged weights."""
-    options = LoopOptions(
-        stage=name,
-        identity=digest_of(recipe.model.depth, recipe.model.paint, recipe.seed, name),
-        table=stage,
-        log=recipe.log,
-        stop=stop,
-        frames_per_clip=recipe.model.frames,
-        parts=stage.parts,
-        engine=Engine(processes=processes, compute=ComputeRecipe(parallel="ddp")),
-    )
-    loop = Loop(task, folder, options)
-    loop.run()
-    loop.adopt_average()
 
 
 def _make_all_inputs(
@@ -229,17 +222,38 @@ def calibrate(
     networks.eval()
     config = networks.config
     depth_head, paint_head = networks.depth.head.out, networks.paint.head.out
-    _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, lambda: _source_classes(networks, paths))
-    _take_back(paint_head, 3, paint_weights, lambda: _view_classes(networks, views))
-    _learn_familiar(networks, learned, np.random.default_rng(0))
+    _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, _source_classes(networks, paths))
+    made = ((networks.paint.first_step(each.seen, filled(each.seen), config.sigma_max, detail=False), each)
+            for each in views.views)  # fmt: skip
+    _take_back(paint_head, 3, paint_weights, ((painted.classes, each.labels) for painted, each in made))
+    # what is familiar: a frame of each of some clips that were learned from
+    random = np.random.default_rng(0)
+    some = [learned[i] for i in random.permutation(len(learned))[:_FAMILIAR]]
+    outputs = (each for path in some for each in _outputs(networks, path, int(random.integers(14))))
+    networks.familiarity.fit(torch.cat([each.summary for each in outputs]))
+
+    def ood_scores(path: Path, t: int) -> list[float]:
+        return [
+            float(networks.familiarity.score(each.summary, read_depth(each, config.depth).entropy))
+            for each in _outputs(networks, path, t)
+        ]
+
+    scores = [np.mean([ood_scores(path, t) for t in range(14)[_FRAMES]], axis=0).max() for path in paths]
+    # of painted, seen before and seen now, so that the 90 % interval holds 90 %
+    networks.config = msgspec.structs.replace(config, spread_shift=(0.0, 0.0, 0.0))
+    model, histogram = LiveModel(networks=networks), SpreadHistogram()
+    for path in paths:
+        clip = read_clip(path)
+        shown, truth = model.views(clip), (to_network(clip.arrays["target.rgb"]) + 1) / 2
+        assert shown.log_variance is not None
+        assert shown.visibility is not None
+        histogram.add((shown.video - truth)[1:], shown.log_variance[1:], shown.visibility[1:])
     networks.config = msgspec.structs.replace(
-        config, spread_shift=_spread_shift(networks, paths), ood_threshold=_threshold(networks, paths)
+        config, spread_shift=fit_spread(histogram), ood_threshold=min(_DOUBT * float(max(scores)), 1.0)
     )
 
 
-def _take_back(
-    head: nn.Conv2d, first: int, weights: Tensor, classes: Callable[[], Iterator[tuple[Tensor, Tensor]]]
-) -> None:
+def _take_back(head: nn.Conv2d, first: int, weights: Tensor, classes: Iterator[tuple[Tensor, Tensor]]) -> None:
     """Lower the biases of the classes, which begin at `first`, by that share of the weights with the best mean IoU.
 
     classes: pairs of logits [N, K, H, W] and labels [N, H, W].
@@ -247,7 +261,7 @@ def _take_back(
     assert head.bias is not None
     count, excess = len(weights), weights.log().cpu()  # of a training on the GPU
     confusions = torch.zeros(len(_SHARES), count, count, dtype=torch.int64)
-    for logits, labels in classes():
+    for logits, labels in classes:
         for confusion, share in zip(confusions, _SHARES, strict=True):
             confusion += confusion_matrix((logits - share * excess[:, None, None]).argmax(1), labels, count)
     means = [class_iou(each)[each.sum(1) > 0].mean() for each in confusions]
@@ -261,44 +275,6 @@ def _source_classes(networks: LiveNetworks, paths: Sequence[Path]) -> Iterator[t
         inputs = depth_inputs(source.video, source.rays, source.ground())
         output = networks.depth(inputs, source.sweeps(networks.config.depth))
         yield output.classes[_FRAMES], source.labels[_FRAMES]
-
-
-def _view_classes(networks: LiveNetworks, held_out: HeldOutViews) -> Iterator[tuple[Tensor, Tensor]]:
-    for views in held_out.views:
-        made = networks.paint.first_step(views.seen, filled(views.seen), networks.config.sigma_max, detail=False)
-        yield made.classes, views.labels
-
-
-def _spread_shift(networks: LiveNetworks, paths: Sequence[Path]) -> tuple[float, float, float]:
-    """Of painted, seen before and seen now, so that the 90 % interval holds 90 %."""
-    networks.config = msgspec.structs.replace(networks.config, spread_shift=(0.0, 0.0, 0.0))
-    model, histogram = LiveModel(networks=networks), SpreadHistogram()
-    for path in paths:
-        clip = read_clip(path)
-        views, truth = model.views(clip), (to_network(clip.arrays["target.rgb"]) + 1) / 2
-        assert views.log_variance is not None
-        assert views.visibility is not None
-        histogram.add((views.video - truth)[1:], views.log_variance[1:], views.visibility[1:])
-    return fit_spread(histogram)
-
-
-def _threshold(networks: LiveNetworks, paths: Sequence[Path]) -> float:
-    def score(output: DepthOutput) -> float:
-        return float(networks.familiarity.score(output.summary, read_depth(output, networks.config.depth).entropy))
-
-    frames = range(14)[_FRAMES]
-    means = [
-        np.mean([[score(output) for output in _outputs(networks, path, t)] for t in frames], axis=0).max()
-        for path in paths
-    ]
-    return min(_DOUBT * float(max(means)), 1.0)
-
-
-def _learn_familiar(networks: LiveNetworks, paths: Sequence[Path], random: np.random.Generator) -> None:
-    """From a frame of each of some clips that were learned from."""
-    some = [paths[i] for i in random.permutation(len(paths))[:_FAMILIAR]]
-    outputs = (each for path in some for each in _outputs(networks, path, int(random.integers(14))))
-    networks.familiarity.fit(torch.cat([each.summary for each in outputs]))
 
 
 def _outputs(networks: LiveNetworks, path: Path, t: int) -> Iterator[DepthOutput]:

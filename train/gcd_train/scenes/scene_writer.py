@@ -3,7 +3,7 @@
 import io
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -68,12 +68,8 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
         "world": world.name,
         "seed": seed,
         "edition": world.edition,
-        "frames": form.frames,
         "fps": world.fps,
-        "width": form.width,
-        "height": form.height,
-        "oversample": form.oversample,
-        "compact": form.compact,
+        **asdict(form),
     }
     if place.exists():
         there = read_manifest(place)
