@@ -24,6 +24,7 @@ from gcd_model.live.depth_net import pixel_rays, plane_depth, plane_sweep
 from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
 from gcd_train.data.sample import to_network
+from gcd_train.evaluation.metrics import class_iou
 from gcd_train.live.clips import Camera, LiveClip, Poses, TrainingClips, decode_depth, evenly, read_clip, tensor_of
 from gcd_train.training.loop import Task
 
@@ -102,9 +103,7 @@ def on_device(array: NDArray[Any] | Sequence[float], like: Tensor) -> Tensor:
     return torch.from_numpy(np.asarray(array)).to(like)
 
 
-@lru_cache(maxsize=4096)
-def _rays(lens: Intrinsics, device: torch.device) -> Tensor:
-    return pixel_rays(lens, device)
+_rays = lru_cache(maxsize=4096)(pixel_rays)
 
 
 def rays_of(lenses: Sequence[Intrinsics], device: torch.device) -> Tensor:
@@ -178,7 +177,9 @@ class FrameBatches:
         median = far.nanmedian(dim=1).values.nan_to_num(0.0).double()
         moves = on_device(np.linalg.inv(poses_before) @ poses, median)
         near = moves[:, :3, 3].norm(dim=1) <= 2 * LONGEST * median
-        turned = _slightly_turned(random, count, median)
+        x, y, z = random.normal(size=(3, count)) * np.radians(_TURN_NOISE_DEG)
+        one = np.ones(count)  # angles are so small that their first order is enough
+        turned = on_device(np.array([[one, -z, y], [z, one, -x], [-y, x, one]]).transpose(2, 0, 1), median)
         shifted = on_device(random.normal(size=(count, 3)) * _MOVE_NOISE, median) * median[:, None]
         moves[:, :3] = torch.cat([moves[:, :3, :3] @ turned, moves[:, :3, 3:] + shifted[..., None]], dim=2)
         return replace(
@@ -187,13 +188,6 @@ class FrameBatches:
             earlier_from_camera=moves,
             compared=on_device(compared, near) & near,
         )
-
-
-def _slightly_turned(random: Random, n: int, like: Tensor) -> Tensor:
-    """Rotations by angles so small that their first order is enough: [N, 3, 3]."""
-    x, y, z = random.normal(size=(3, n)) * np.radians(_TURN_NOISE_DEG)
-    one = np.ones(n)
-    return on_device(np.array([[one, -z, y], [z, one, -x], [-y, x, one]]).transpose(2, 0, 1), like)
 
 
 def augmented(pictures: Pictures, random: Random) -> Pictures:
@@ -255,6 +249,12 @@ def class_weights(paths: Sequence[Path], config: LiveConfig, power: float) -> Te
     shares = torch.from_numpy(counts / counts.sum()).float()
     weights = shares.clamp(min=1e-4) ** power
     return weights / (weights * shares).sum()
+
+
+def class_figures(confusion: Tensor, names: Sequence[str], shown: Sequence[int]) -> dict[str, float]:
+    """Mean IoU of the classes that occur in the truth, and that of some of them."""
+    iou, occurs = class_iou(confusion), confusion.sum(1) > 0
+    return {"miou": float(iou[occurs].mean()), **{f"iou_{names[k]}": float(iou[k]) for k in shown if occurs[k]}}
 
 
 def autocast(device: torch.device) -> torch.autocast:

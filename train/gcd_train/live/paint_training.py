@@ -21,7 +21,8 @@ from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.painter import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import LiveTask, Random, autocast, class_weights, generator_on, on
+from gcd_train.live.batches import LiveTask, Random, autocast, class_figures, class_weights, generator_on, on
+from gcd_train.live.figures import STATES
 from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import gradient_l1, ssim
@@ -269,7 +270,9 @@ class HeldOutViews:
             there = on(device, views)
             base = filled(there.seen)
             made, base = on(cpu, net.first_step(there.seen, base, config.sigma_max)), base.cpu()
-            of_base, square = (_square_error(each, views.target) for each in (base, made.mean))
+            of_base, square = (
+                ((each.clamp(-1, 1) - views.target) / 2).square().mean(dim=1) for each in (base, made.mean)
+            )
             never = views.visibility == 0
             for each, values in zip(errors.values(), (of_base, square, square[~never], square[never]), strict=True):
                 each.append(values.flatten())
@@ -278,20 +281,12 @@ class HeldOutViews:
             if i % max(len(self.views) // 10, 1) == 0:
                 rows.append([x[0] for x in (views.seen.colour, base, made.mean, made.picture, views.target)])
         write_sheet(sheet, rows)
-        iou, occurs, state_iou = class_iou(confusion), confusion.sum(1) > 0, class_iou(states)
         names = [entry.name for entry in config.classes]
         return {
-            **{name: _psnr(torch.cat(each)) for name, each in errors.items()},
-            "miou": float(iou[occurs].mean()),
-            **{f"iou_{names[c]}": float(iou[c]) for c in (7, 8, 10, 11) if occurs[c]},
-            **{f"iou_{name}": float(state_iou[s]) for s, name in enumerate(("painted", "before", "now"))},
+            **{
+                name: -10 * float(np.log10(max(float(torch.cat(each).sum()) / max(sum(map(len, each)), 1), 1e-10)))
+                for name, each in errors.items()
+            },
+            **class_figures(confusion, names, (7, 8, 10, 11)),
+            **{f"iou_{name}": float(iou) for name, iou in zip(STATES, class_iou(states), strict=True)},
         }
-
-
-def _square_error(made: Tensor, true: Tensor) -> Tensor:
-    """Of pictures in [0, 1], mean over colours: [N, H, W]."""
-    return ((made.clamp(-1, 1) - true) / 2).square().mean(dim=1)
-
-
-def _psnr(squares: Tensor) -> float:
-    return -10 * float(np.log10(max(float(squares.sum()) / max(len(squares), 1), 1e-10)))

@@ -61,27 +61,8 @@ _DRIFT = 0.15
 """Largest standard deviation of the colours' drift, for colours in [-1, 1]."""
 
 
-@torch.inference_mode()
-def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Pictures:
-    """Source frames with depth, classes and motion as the depth network has them, computed where that is."""
-    device = next(net.parameters()).device
-    there = on(device, source)
-    with autocast(device):
-        output = net(depth_inputs(there.video, there.rays, ground.to(device)), there.sweeps(config.depth))
-    made = {"labels": output.classes.argmax(1), "moves": (output.moves >= 0).float()}
-    return on(torch.device("cpu"), replace(there, metres=read_depth(output, config.depth).metres, **made))
-
-
-def roughened(source: Pictures, random: Random) -> Pictures:
-    """Source frames whose depth is off by a few per cent in wide patches, as depth from anywhere is."""
-    metres = source.metres
-    rough = torch.from_numpy(random.normal(size=(len(metres), 1, 4, 6)) * _DEPTH_NOISE).float()
-    smooth = interpolate(rough, size=metres.shape[-2:], mode="bilinear")[:, 0]
-    return replace(source, metres=torch.where(metres < SKY_M, metres * smooth.exp(), metres))
-
-
 def splats_of(clip: LiveClip, source: Pictures, config: LiveConfig) -> list[Splat]:
-    """What the target camera of every frame sees of what the source has shown so far. source: see the two above."""
+    """What the target camera of every frame sees of what the source has shown so far, by the depth of `source`."""
     world, lens = seen_world(config, torch.device("cpu")), clip.lens("target")
     labels, static = source.labels.to(torch.uint8), source.moves < 0.5
     made: list[Splat] = []
@@ -122,11 +103,25 @@ def make_inputs(out: Path, paths: Sequence[Path], net: DepthNet | None, config: 
     for path in paths:
         clip = read_clip(path)
         source, random = with_true_references(clip), np.random.default_rng([seed, int(path.stem.replace("-", ""))])
-        if net is None:
-            source = roughened(source, random)
+        if net is None:  # off by a few per cent in wide patches, as depth from anywhere is
+            metres = source.metres
+            rough = torch.from_numpy(random.normal(size=(len(metres), 1, 4, 6)) * _DEPTH_NOISE).float()
+            smooth = interpolate(rough, size=metres.shape[-2:], mode="bilinear")[:, 0]
+            source = replace(source, metres=torch.where(metres < SKY_M, metres * smooth.exp(), metres))
         else:
-            source = learned_geometry(net, config, source, source.ground(random, whole=True))
+            source = _as_learned(net, config, source, source.ground(random, whole=True))
         write_inputs(out / path.parent.name / path.name, splats_of(clip, source, config))
+
+
+@torch.inference_mode()
+def _as_learned(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Pictures:
+    """Source frames with depth, classes and motion as the depth network has them, computed where that is."""
+    device = next(net.parameters()).device
+    there = on(device, source)
+    with autocast(device):
+        output = net(depth_inputs(there.video, there.rays, ground.to(device)), there.sweeps(config.depth))
+    made = {"labels": output.classes.argmax(1), "moves": (output.moves >= 0).float()}
+    return on(torch.device("cpu"), replace(there, metres=read_depth(output, config.depth).metres, **made))
 
 
 def read_inputs(path: Path, frames: slice, names: Sequence[str] = INPUTS) -> dict[str, Array]:
