@@ -22,24 +22,14 @@ from gcd_model.live.synthesizer import save_live
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import gradient_map
-from gcd_train.live import measure
-from gcd_train.live.clips import LiveClip
-from gcd_train.live.figures import (
-    BEFORE,
-    NEVER,
-    NOW,
-    MethodViews,
-    SpreadHistogram,
-    Tally,
-    Truth,
-    cells,
-    fit_spread,
-    frechet_distance,
-    surface_motion,
-)
+from gcd_train.live.calibration import SpreadHistogram, fit_spread
+from gcd_train.live.clips import BEFORE, NEVER, NOW, LiveClip
+from gcd_train.live.training import live_model
 
 sys.path.append(str(Path(__file__).parents[2] / "tools"))
-live_variants, other_world = import_module("live_variants"), import_module("other_world")
+figure, measure, other_world = (import_module(name) for name in ("live_figures", "live_measure", "other_world"))
+MethodViews, Tally, Truth = figure.MethodViews, figure.Tally, figure.Truth
+cells, frechet_distance, surface_motion = figure.cells, figure.frechet_distance, figure.surface_motion
 FRAMES, HEIGHT, WIDTH = 4, 64, 96
 LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)
 
@@ -186,7 +176,7 @@ def _painted(rays: np.ndarray) -> np.ndarray:
 
 def test_the_homography_of_a_turn_is_exact() -> None:
     clip = turned_clip()
-    views = live_variants.BestHomography().views(clip)
+    views = measure.BestHomography().views(clip)
     seen = torch.from_numpy(clip.arrays["target.visibility"] == NOW)
     error = (views.video * 255 - torch.from_numpy(clip.arrays["target.rgb"]).permute(0, 3, 1, 2)).abs()
     assert float(error.permute(0, 2, 3, 1)[seen].mean()) < 1.0
@@ -210,9 +200,9 @@ def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:
         measure.chosen_methods(["telepathy"], [measure.ExactSplat(training=tmp_path)])
     save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError):
-        measure.live_model(str(tmp_path / "other.safetensors"))
+        live_model(str(tmp_path / "other.safetensors"))
     with pytest.raises(DataError, match="is no live model"):
-        measure.live_model("random:driving")
+        live_model("random:driving")
 
 
 # how unlike its training a camera looks to the live model

@@ -30,6 +30,9 @@ from gcd_train.errors import DataError
 
 _log = logging.getLogger(__name__)
 CAMERAS: tuple[str, ...] = ("source", "target")
+NEVER, BEFORE, NOW = 0, 1, 2
+STATES = ("painted", "before", "now")
+"""Values of the visibility, and what views call them."""
 _HELD_OUT_SEED = 1_000_000
 """Scenes from here on are not learned from."""
 _NEAREST_M, _CODES = 0.02, 65534

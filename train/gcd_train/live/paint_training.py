@@ -22,7 +22,7 @@ from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.painter import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
 from gcd_train.live.batches import LiveTask, Random, autocast, class_figures, class_weights, generator_on, on
-from gcd_train.live.figures import STATES
+from gcd_train.live.clips import STATES
 from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of
 from gcd_train.training.loop import Progress, StepLoss
 from gcd_train.training.losses import gradient_l1, ssim

@@ -4,31 +4,25 @@ clips -> depth network -> what it shows of every target (inputs) -> paint networ
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from threading import Event
 
-import msgspec
-import numpy as np
 import torch
-from torch import Tensor, nn
 
 from gcd_model.live.blocks import layout
-from gcd_model.live.depth_net import DepthNet, DepthOutput, depth_inputs, read_depth
-from gcd_model.live.paint_net import filled
-from gcd_model.live.synthesizer import save_live
+from gcd_model.live.depth_net import DepthNet
+from gcd_model.live.synthesizer import LiveSynthesizer, save_live
+from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks, weights_digest
 from gcd_train.data.open import DataPlaces
-from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import PART_SEED, some_of, with_true_references
+from gcd_train.live.batches import PART_SEED
+from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import TrainingClips, clip_paths, read_clip, training_paths
 from gcd_train.live.depth_training import DepthTask
-from gcd_train.live.figures import SpreadHistogram, fit_spread
-from gcd_train.live.measure import LiveModel, live_model
 from gcd_train.live.paint_training import DetailTask, HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
 from gcd_train.live.views import InputShelf, ViewBatches, make_inputs
@@ -46,12 +40,6 @@ _CARRIED = {"paint": 0.35, "detail": 0.6}
 """Share of the views that see what was painted a frame before, of a model that carries that."""
 _CLIPS_A_TURN = 4
 """Clips whose inputs a process works out at a time."""
-_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-_FRAMES = slice(1, 14, 4)
-_FAMILIAR = 400
-"""So many clips of the training say what is familiar."""
-_DOUBT = 1.1
-"""A source counts as another world's from so many times the highest score of a held-out clip."""
 
 
 def valid_folder(data: DataPlaces) -> Path:
@@ -146,6 +134,14 @@ def _train(
     loop.adopt_average()
 
 
+def live_model(weights: str, *, device: str = "auto", dtype: str | None = None) -> LiveSynthesizer:
+    """A live model. Raises DataError for weights of another."""
+    loaded = load_synthesizer(weights, device=device, dtype=dtype)
+    if not isinstance(loaded, LiveSynthesizer):
+        raise DataError(f"{weights} is no live model; give the weights of one")
+    return loaded
+
+
 def _networks(recipe: LiveRecipe) -> LiveNetworks:
     """At random, or as a weight file has them. Raises DataError if that is another model."""
     networks = LiveNetworks(recipe.model)
@@ -197,89 +193,3 @@ def _inputs_of(out: Path, net: DepthNet | None, recipe: LiveRecipe, paths: list[
         make_inputs(out, paths, net, recipe.model, recipe.seed)
     finally:
         torch.set_num_threads(threads)
-
-
-# --- calibration -----------------------------------------------------------------------------------------------------
-
-
-@torch.no_grad()
-def calibrate(
-    networks: LiveNetworks,
-    learned: Sequence[Path],
-    paths: Sequence[Path],
-    views: HeldOutViews,
-    depth_weights: Tensor,
-    paint_weights: Tensor,
-) -> None:
-    """After the last stage, on the CPU: how likely a class is, how wide the spread, and what is another world's.
-
-    The losses make rare classes count for more, so their logits are too high by the logarithm of that; a share of it is
-    taken back. All is read off held-out clips, and written into the class biases of both networks and into the config.
-
-    learned: clips of the training. paths, views: of held-out clips. depth_weights, paint_weights: [K], how much the
-    losses made of each class.
-    """
-    networks.eval()
-    config = networks.config
-    depth_head, paint_head = networks.depth.head.out, networks.paint.head.out
-    _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, _source_classes(networks, paths))
-    made = ((networks.paint.first_step(each.seen, filled(each.seen), config.sigma_max, detail=False), each)
-            for each in views.views)  # fmt: skip
-    _take_back(paint_head, 3, paint_weights, ((painted.classes, each.labels) for painted, each in made))
-    # what is familiar: a frame of each of some clips that were learned from
-    random = np.random.default_rng(0)
-    some = [learned[i] for i in random.permutation(len(learned))[:_FAMILIAR]]
-    outputs = (each for path in some for each in _outputs(networks, path, int(random.integers(14))))
-    networks.familiarity.fit(torch.cat([each.summary for each in outputs]))
-
-    def ood_scores(path: Path, t: int) -> list[float]:
-        return [
-            float(networks.familiarity.score(each.summary, read_depth(each, config.depth).entropy))
-            for each in _outputs(networks, path, t)
-        ]
-
-    scores = [np.mean([ood_scores(path, t) for t in range(14)[_FRAMES]], axis=0).max() for path in paths]
-    # of painted, seen before and seen now, so that the 90 % interval holds 90 %
-    networks.config = msgspec.structs.replace(config, spread_shift=(0.0, 0.0, 0.0))
-    model, histogram = LiveModel(networks=networks), SpreadHistogram()
-    for path in paths:
-        clip = read_clip(path)
-        shown, truth = model.views(clip), (to_network(clip.arrays["target.rgb"]) + 1) / 2
-        assert shown.log_variance is not None
-        assert shown.visibility is not None
-        histogram.add((shown.video - truth)[1:], shown.log_variance[1:], shown.visibility[1:])
-    networks.config = msgspec.structs.replace(
-        config, spread_shift=fit_spread(histogram), ood_threshold=min(_DOUBT * float(max(scores)), 1.0)
-    )
-
-
-def _take_back(head: nn.Conv2d, first: int, weights: Tensor, classes: Iterator[tuple[Tensor, Tensor]]) -> None:
-    """Lower the biases of the classes, which begin at `first`, by that share of the weights with the best mean IoU.
-
-    classes: pairs of logits [N, K, H, W] and labels [N, H, W].
-    """
-    assert head.bias is not None
-    count, excess = len(weights), weights.log().cpu()  # of a training on the GPU
-    confusions = torch.zeros(len(_SHARES), count, count, dtype=torch.int64)
-    for logits, labels in classes:
-        for confusion, share in zip(confusions, _SHARES, strict=True):
-            confusion += confusion_matrix((logits - share * excess[:, None, None]).argmax(1), labels, count)
-    means = [class_iou(each)[each.sum(1) > 0].mean() for each in confusions]
-    best = _SHARES[int(torch.stack(means).argmax())]
-    head.bias[first : first + count] -= (best * excess).to(head.bias)
-
-
-def _source_classes(networks: LiveNetworks, paths: Sequence[Path]) -> Iterator[tuple[Tensor, Tensor]]:
-    for path in paths:
-        source = with_true_references(read_clip(path))
-        inputs = depth_inputs(source.video, source.rays, source.ground())
-        output = networks.depth(inputs, source.sweeps(networks.config.depth))
-        yield output.classes[_FRAMES], source.labels[_FRAMES]
-
-
-def _outputs(networks: LiveNetworks, path: Path, t: int) -> Iterator[DepthOutput]:
-    """Of a frame of a clip's source: with its mount and an earlier frame, and without."""
-    frame = some_of(with_true_references(read_clip(path, slice(t + 1))), slice(-1, None))
-    ground = frame.ground()
-    yield networks.depth(depth_inputs(frame.video, frame.rays, ground), frame.sweeps(networks.config.depth))
-    yield networks.depth(depth_inputs(frame.video, frame.rays, torch.zeros_like(ground)))
