@@ -40,7 +40,7 @@ from gcd_train.live.calibration import SpreadHistogram, calibrate, floors_of, fr
 from gcd_train.live.clips import Shelf, TrainingClips, read_clip, training_paths
 from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
-from gcd_train.live.recipe import LiveRecipe, LiveStage, load_live_recipe
+from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipe
 from gcd_train.live.training import train_live
 from gcd_train.live.views import (
     InputShelf,
@@ -218,7 +218,7 @@ def test_an_unknown_key_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "live.toml"
     path.write_text('kind = "live"\nname = "x"\nspeed = 1\n')
     with pytest.raises(RecipeError, match="speed"):
-        load_live_recipe(str(path))
+        live_recipe(str(path))
 
 
 def test_batches_follow_from_the_update_alone(data: Path) -> None:

@@ -1,11 +1,9 @@
 """The arm, six hinges and a parallel gripper, and the physics: arm, table and things as one MuJoCo model, in metres."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcd_train.scenes.description import Colour, Doubles, Part, pick, rotations
 from gcd_train.scenes.drop.world import load_mujoco
@@ -180,28 +178,8 @@ def _finger(side: str, sign: int, shell: str) -> str:
 </body>"""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Model:
-    """A compiled model and the numbers of what is in it.
-
-    joints, fingers: [J], [2] addresses in qpos; rates: of `joints` in qvel. controls, grips: their actuators.
-    things: body ids. site: the tool.
-    """
-
-    mujoco: Any
-    model: Any
-    joints: NDArray[np.int64]
-    rates: NDArray[np.int64]
-    fingers: NDArray[np.int64]
-    controls: NDArray[np.int64]
-    grips: NDArray[np.int64]
-    things: tuple[int, ...]
-    site: int
-
-
-def build_model(setting: Setting) -> Model:
-    """Compile everything. Raises RenderError without MuJoCo."""
-    mujoco = load_mujoco()
+def build_model(setting: Setting) -> Any:
+    """Everything as one MjModel; body `thing_3` is number 3 of the things. Raises RenderError without MuJoCo."""
     floor = f'<geom class="still" type="plane" size="5 5 0.1" pos="0 0 {FLOOR_M}"/>'  # what falls off the table lands
     still = floor + "\n".join(_geom(part, "still") for part in setting.table)
     still += "\n".join(_body(placed, None) for placed in setting.clutter)
@@ -211,26 +189,15 @@ def build_model(setting: Setting) -> Model:
         f'<position name="{name}" joint="{name}" class="{kind}"/>'
         for name, kind in zip((*JOINTS, *FINGERS), classes, strict=True)
     )
-    model = mujoco.MjModel.from_xml_string(f"""<mujoco>{_OPTIONS}
+    return load_mujoco().MjModel.from_xml_string(f"""<mujoco>{_OPTIONS}
 <default>{_DEFAULTS}</default>
 <worldbody>{still}<body name="mount" pos="{BASE[0]} {BASE[1]} {BASE[2]}">{setting.arm}</body>{loose}</worldbody>
 <equality>{_MOVED_ALIKE}</equality>
 <actuator>{actuators}</actuator>
 </mujoco>""")
-    return Model(
-        mujoco=mujoco,
-        model=model,
-        joints=np.array([model.joint(name).qposadr[0] for name in JOINTS]),
-        rates=np.array([model.joint(name).dofadr[0] for name in JOINTS]),
-        fingers=np.array([model.joint(name).qposadr[0] for name in FINGERS]),
-        controls=np.array([model.actuator(name).id for name in JOINTS]),
-        grips=np.array([model.actuator(name).id for name in FINGERS]),
-        things=tuple(model.body(f"thing_{index}").id for index in range(len(setting.things))),
-        site=model.site("tool").id,
-    )
 
 
-def arm_links(model: Model) -> list[tuple[TableThing, int, TabletopClass]]:
+def arm_links(model: Any) -> list[tuple[TableThing, int, TabletopClass]]:
     """The arm's links, the gripper's last, each with its body's number and its class.
 
     Their names tell the class too, for layouts that keep no classes: robot_arm/upper_arm, gripper/palm.
@@ -238,7 +205,7 @@ def arm_links(model: Model) -> list[tuple[TableThing, int, TabletopClass]]:
     found: list[tuple[TableThing, int, TabletopClass]] = []
     for name in (*_LINKS, *_GRIPPER):
         label = TabletopClass.GRIPPER if name in _GRIPPER else TabletopClass.ROBOT_ARM
-        body = model.model.body(name).id
+        body = model.body(name).id
         parts = _parts_of_body(model, body, label)
         corners: list[Doubles] = []  # of the parts' own boxes, along the body's axes
         for part in parts:
@@ -252,25 +219,25 @@ def arm_links(model: Model) -> list[tuple[TableThing, int, TabletopClass]]:
             parts=parts,
             size=tuple((high - low).tolist()),
             middle=tuple(((low + high) / 2).tolist()),
-            mass_kg=float(model.model.body_mass[body]),
+            mass_kg=float(model.body_mass[body]),
             friction=0.8,
         )
         found.append((link, body, label))
     return found
 
 
-def _parts_of_body(model: Model, body: int, label: TabletopClass) -> tuple[Part, ...]:
+def _parts_of_body(model: Any, body: int, label: TabletopClass) -> tuple[Part, ...]:
     """The geoms of one body of a compiled model, as they are seen."""
-    kinds, compiled = model.mujoco.mjtGeom, model.model
+    kinds = load_mujoco().mjtGeom
     shapes = {kinds.mjGEOM_BOX: "box", kinds.mjGEOM_CYLINDER: "cylinder", kinds.mjGEOM_CAPSULE: "capsule"}
-    first = compiled.body_geomadr[body]
+    first = model.body_geomadr[body]
     found: list[Part] = []
-    for geom in range(first, first + compiled.body_geomnum[body]):
-        shape = shapes[kinds(compiled.geom_type[geom])]
-        x, y, z = (2 * compiled.geom_size[geom]).tolist()
+    for geom in range(first, first + model.body_geomnum[body]):
+        shape = shapes[kinds(model.geom_type[geom])]
+        x, y, z = (2 * model.geom_size[geom]).tolist()
         size = (x, y, z) if shape == "box" else (x, x, y)
-        colour, place = tuple(compiled.geom_rgba[geom][:3].tolist()), tuple(compiled.geom_pos[geom].tolist())
-        found.append(Part(shape, place, size, plain(colour, 0.25), label, tuple(compiled.geom_quat[geom].tolist())))
+        colour, place = tuple(model.geom_rgba[geom][:3].tolist()), tuple(model.geom_pos[geom].tolist())
+        found.append(Part(shape, place, size, plain(colour, 0.25), label, tuple(model.geom_quat[geom].tolist())))
     return tuple(found)
 
 

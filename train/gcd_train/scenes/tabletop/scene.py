@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from gcd_train.scenes.description import (
     yawed,
 )
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model, random_setting
+from gcd_train.scenes.tabletop.arm import BASE, arm_links, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
 from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TabletopClass
 
@@ -135,7 +136,7 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
 
 
 def _counted(
-    model: Model, setting: Setting, motion: Motion, world_from_table: Doubles
+    model: Any, setting: Setting, motion: Motion, world_from_table: Doubles
 ) -> tuple[list[Part], list[SceneObject]]:
     """The table's parts; those of things, links and clutter, and what metadata tells of them, in scene units.
 
@@ -144,7 +145,8 @@ def _counted(
     parts = [piece.of(instance=0, body=_TABLE) for part in setting.table for piece in _drawn(part)]
     objects: list[SceneObject] = []
     tracks = _in_world(motion.tracks, setting.clutter, world_from_table)
-    things = [(each.thing, body, TabletopClass.OBJECT) for each, body in zip(setting.things, model.things, strict=True)]
+    numbers = [model.body(f"thing_{index}").id for index in range(len(setting.things))]
+    things = [(each.thing, body, TabletopClass.OBJECT) for each, body in zip(setting.things, numbers, strict=True)]
     rows = [(*row, row[1], None) for row in (*things, *arm_links(model))]
     bodies = motion.tracks.positions.shape[1]
     rows += [(each.thing, 0, TabletopClass.CLUTTER, bodies + k, each) for k, each in enumerate(setting.clutter)]

@@ -6,13 +6,24 @@ A task is planned when the last one is done, from where things are by then.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Doubles, Point, Tracks
-from gcd_train.scenes.tabletop.arm import BASE, FINGER_ROOM_M, HOME, OPEN_M, STEP_S, Model, is_reachable, reachable_spot
+from gcd_train.scenes.drop.world import load_mujoco
+from gcd_train.scenes.tabletop.arm import (
+    BASE,
+    FINGER_ROOM_M,
+    FINGERS,
+    HOME,
+    JOINTS,
+    OPEN_M,
+    STEP_S,
+    is_reachable,
+    reachable_spot,
+)
 from gcd_train.scenes.tabletop.things import Placed
 
 FPS = 24.0
@@ -77,11 +88,18 @@ class Motion:
 
 
 class Simulation:
-    """One run. `model`: built of `things`; `speed`: of the tool, metres a second."""
+    """One run. `model`: see `build_model`; `things`: in it; `speed`: of the tool, metres a second."""
 
-    def __init__(self, model: Model, things: tuple[Placed, ...], random: np.random.Generator, speed: float) -> None:
-        self._m, self._things, self._random, self._speed = model, [each.thing for each in things], random, speed
-        self._data, self._scratch = model.mujoco.MjData(model.model), model.mujoco.MjData(model.model)
+    def __init__(self, model: Any, things: tuple[Placed, ...], random: np.random.Generator, speed: float) -> None:
+        self._mujoco, self._model = load_mujoco(), model
+        self._things, self._random, self._speed = [each.thing for each in things], random, speed
+        self._data, self._scratch = self._mujoco.MjData(model), self._mujoco.MjData(model)
+        # where joints and fingers are in qpos, and joints in qvel; their actuators; bodies of the things; the tool
+        self._at = [model.joint(name).qposadr[0] for name in (*JOINTS, *FINGERS)]
+        self._rates = [model.joint(name).dofadr[0] for name in JOINTS]
+        self._controls = [model.actuator(name).id for name in (*JOINTS, *FINGERS)]
+        self._bodies = [model.body(f"thing_{index}").id for index in range(len(things))]
+        self._site = model.site("tool").id
         self._joints, self._opening = np.asarray(HOME), 1.0
         self._rows: list[tuple[Doubles, ...]] = []
         self._names: list[str] = []
@@ -95,10 +113,10 @@ class Simulation:
 
         Raises: RenderError if the physics became unstable.
         """
-        m, data = self._m, self._data
-        data.qpos[m.joints], data.qpos[m.fingers] = self._joints, OPEN_M
+        mujoco, data = self._mujoco, self._data
+        data.qpos[self._at] = (*self._joints, OPEN_M, OPEN_M)
         self._command(self._joints)
-        m.mujoco.mj_step(m.model, data, round(_SETTLE_S / STEP_S))
+        mujoco.mj_step(self._model, data, round(_SETTLE_S / STEP_S))
         first = round(skipped_s / _TICK_S)
         clock = -first * _TICK_S
         last = None
@@ -110,12 +128,12 @@ class Simulation:
                 self._keep(step)
             if len(self._names) == frames:
                 break
-            m.mujoco.mj_step(m.model, data, _STEPS_A_TICK)
+            mujoco.mj_step(self._model, data, _STEPS_A_TICK)
             clock += _TICK_S
             if self._held >= 0:
                 self._slip = max(self._slip, float(np.linalg.norm(self._in_hand() - self._offset)))
         self._end_grasp()
-        faults = m.mujoco.mjtWarning  # MuJoCo starts a diverging simulation anew and only counts that
+        faults = mujoco.mjtWarning  # MuJoCo starts a diverging simulation anew and only counts that
         kinds = (faults.mjWARN_BADQPOS, faults.mjWARN_BADQVEL, faults.mjWARN_BADQACC)
         if any(data.warning[int(kind)].number for kind in kinds):
             raise RenderError("the physics of this tabletop scene became unstable; leave its seed out")
@@ -128,9 +146,9 @@ class Simulation:
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""
-        x, y, z = self._data.site_xpos[self._m.site].tolist()
+        x, y, z = self._data.site_xpos[self._site].tolist()
         place: Point = (x, y, z)
-        here, yaw = _polar(place), math.atan2(*self._data.site_xmat[self._m.site][[3, 0]].tolist())
+        here, yaw = _polar(place), math.atan2(*self._data.site_xmat[self._site][[3, 0]].tolist())
         while True:
             for step in self._next_task(place):
                 goal, turn = _polar(step.place), yaw + (step.yaw - yaw + math.pi) % (2 * math.pi) - math.pi
@@ -154,17 +172,17 @@ class Simulation:
         "Selectively damped least squares for inverse kinematics" (2005), section 2: the plain damped form, with the
         pull towards the home pose in the null space.
         """
-        m, model, data, joints = self._m, self._m.model, self._scratch, self._joints
-        limits, cos, sin = model.jnt_range[model.dof_jntid[m.rates]].T, np.cos(yaw), np.sin(yaw)
+        mujoco, model, data, joints = self._mujoco, self._model, self._scratch, self._joints
+        limits, cos, sin = model.jnt_range[model.dof_jntid[self._rates]].T, np.cos(yaw), np.sin(yaw)
         wanted = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])  # the tool's axes as columns
         for _ in range(_ROUNDS):
-            data.qpos[m.joints] = joints
-            m.mujoco.mj_kinematics(model, data)
-            m.mujoco.mj_comPos(model, data)
+            data.qpos[self._at[: len(joints)]] = joints
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
             full = np.zeros((6, model.nv))
-            m.mujoco.mj_jacSite(model, data, full[:3], full[3:], m.site)
-            twist = 0.5 * np.cross(data.site_xmat[m.site].reshape(3, 3), wanted, axis=0).sum(1)
-            error, jacobian = np.concatenate([place - data.site_xpos[m.site], twist]), full[:, m.rates]
+            mujoco.mj_jacSite(model, data, full[:3], full[3:], self._site)
+            twist = 0.5 * np.cross(data.site_xmat[self._site].reshape(3, 3), wanted, axis=0).sum(1)
+            error, jacobian = np.concatenate([place - data.site_xpos[self._site], twist]), full[:, self._rates]
             square = jacobian @ jacobian.T + _DAMPING**2 * np.eye(6)
             pull = _HOMING * (np.asarray(HOME) - joints)
             move = pull + jacobian.T @ np.linalg.solve(square, error - jacobian @ pull)
@@ -172,20 +190,18 @@ class Simulation:
         return joints
 
     def _command(self, joints: Doubles) -> None:
-        self._data.ctrl[self._m.controls] = joints
-        self._data.ctrl[self._m.grips] = self._opening * OPEN_M
+        self._data.ctrl[self._controls] = (*joints, *(2 * [self._opening * OPEN_M]))
 
     def _keep(self, step: Step) -> None:
-        m, data = self._m, self._data
-        m.mujoco.mj_forward(m.model, data)
-        rates = np.zeros((m.model.nbody, 6))
-        for body in range(m.model.nbody):
-            m.mujoco.mj_objectVelocity(m.model, data, m.mujoco.mjtObj.mjOBJ_BODY, body, rates[body], 0)
+        mujoco, model, data = self._mujoco, self._model, self._data
+        mujoco.mj_forward(model, data)
+        rates = np.zeros((model.nbody, 6))
+        for body, row in enumerate(rates):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, row, 0)
         tool = np.eye(4)
-        tool[:3, :3], tool[:3, 3] = data.site_xmat[m.site].reshape(3, 3), data.site_xpos[m.site]
-        state = data.qpos[np.concatenate([m.joints, m.fingers])].copy()
-        action = np.concatenate([self._joints, data.ctrl[m.grips]])
-        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, state, action))
+        tool[:3, :3], tool[:3, 3] = data.site_xmat[self._site].reshape(3, 3), data.site_xpos[self._site]
+        action = np.concatenate([self._joints, data.ctrl[self._controls[len(JOINTS) :]]])
+        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, data.qpos[self._at].copy(), action))
         self._names.append(step.name)
 
     # whether what was grasped follows the hand
@@ -210,9 +226,8 @@ class Simulation:
 
     def _in_hand(self) -> Doubles:
         """The held thing's origin in the tool's frame."""
-        data, site = self._data, self._m.site
-        turned = data.site_xmat[site].reshape(3, 3)
-        return turned.T @ (data.xpos[self._m.things[self._held]] - data.site_xpos[site])
+        data, site = self._data, self._site
+        return data.site_xmat[site].reshape(3, 3).T @ (data.xpos[self._bodies[self._held]] - data.site_xpos[site])
 
     # tasks: chosen at random and turned into steps, from where things are by now
 
@@ -225,7 +240,7 @@ class Simulation:
                 return self._push(pushed)
         for i in order:
             (x, y, z), _ = self._pose(i)
-            stands = self._data.xmat[self._m.things[i]][8] > 0.98 and abs(z - self._things[i].size[2] / 2) < 0.01
+            stands = self._data.xmat[self._bodies[i]][8] > 0.98 and abs(z - self._things[i].size[2] / 2) < 0.01
             if stands and is_reachable(x, y) and self._clearance(np.array([x, y]), i) > 0.06:
                 return self._pick_and_place(i)
         return [Step("wait", here, _natural_yaw(here), 1.0)]
@@ -292,7 +307,7 @@ class Simulation:
 
     def _pose(self, index: int) -> tuple[Point, float]:
         """Place and yaw of a thing now."""
-        body = self._m.things[index]
+        body = self._bodies[index]
         x, y, z = self._data.xpos[body].tolist()
         turned = self._data.xmat[body].reshape(3, 3)
         return (x, y, z), math.atan2(turned[1, 0], turned[0, 0])
