@@ -74,11 +74,9 @@ class DepthTask(LiveTask):
         inputs = depth_inputs(pictures.video, pictures.rays, ground)
         log = pictures.metres.log()[:, None]  # edges and thin things are drawn more often
         edge = ((F.max_pool2d(log, 3, 1, 1) + F.max_pool2d(-log, 3, 1, 1))[:, 0] > 2 * _EDGE).float()
-        weights = (1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()).flatten(
-            1
-        )  # [N, H * W]
-        generator = generator_on(self._device, random)
-        pixels = torch.multinomial(weights, int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
+        weights = 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()  # [N, H, W]
+        count, generator = int(weights[0].numel() * _PIXEL_SHARE), generator_on(self._device, random)
+        pixels = torch.multinomial(weights.flatten(1), count, True, generator=generator)
         sweeps = pictures.sweeps(self._config.depth)
         with autocast(self._device):
             output = self.network(inputs, sweeps, pixels)

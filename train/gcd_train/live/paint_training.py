@@ -4,7 +4,7 @@ In the detail stage a critic looks at patches of whole pictures and learns to te
 head learns to pass. It alone learns there, on features that are held fixed: all else stays as it was, to the last bit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -54,6 +54,18 @@ class _ViewTask(LiveTask):
         self._net, self._held_out = net, held_out
         self._movable = movable_classes(config).to(self._device)
 
+    def _views(
+        self, batches: ViewBatches, update: int, first_step: Callable[[Seen], Painted] | None, *, small: bool = False
+    ) -> tuple[Views, Random]:
+        """A batch, mirrored or not. first_step: what is painted by it before is carried along."""
+        before, now, random = batches.batch(update)
+        if small:
+            before, now = tuple(map(halved_views, before)), halved_views(now)
+        if first_step is not None:
+            now = carried_through(first_step, before, now, self._movable, random)
+        self._net.train()
+        return mirrored(now) if random.random() < 0.5 else now, random
+
     def measure(self, picture: Path) -> dict[str, float]:
         """See `HeldOutViews.measure`."""
         self._net.eval()
@@ -84,15 +96,9 @@ class PaintTask(_ViewTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of views."""
-        before, now, random = self._batches[progress.part].batch(progress.updates)
-        if progress.share < self._small_share:
-            before, now = tuple(map(halved_views, before)), halved_views(now)
-        later = progress.share >= _MEAN_ALONE
-        if later:
-            now = carried_through(partial(self._first_step, network=self._net), before, now, self._movable, random)
-        if random.random() < 0.5:
-            now = mirrored(now)
-        self._net.train()
+        later, small = progress.share >= _MEAN_ALONE, progress.share < self._small_share
+        carry = partial(self._first_step, network=self._net) if later else None
+        now, random = self._views(self._batches[progress.part], progress.updates, carry, small=small)
         # the same for all parts of an update: processes average what they log by name
         if later and np.random.default_rng([_DRAWS, progress.updates]).random() < _DENOISING_SHARE:
             parts = {"denoising": self._denoising(now, random)}
@@ -196,11 +202,7 @@ class DetailTask(_ViewTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of the detail against the critic, and of the critic: their gradients do not meet."""
-        before, now, random = self._batches.batch(progress.updates)
-        now = carried_through(self._first_step, before, now, self._movable, random)
-        if random.random() < 0.5:
-            now = mirrored(now)
-        self._net.train()
+        now, _ = self._views(self._batches, progress.updates, self._first_step)
         made = self._first_step(now.seen)
         parts = self._losses(made, now)
         return StepLoss(total=torch.stack(list(parts.values())).sum(), parts=parts, frames=len(now.poses))
@@ -283,10 +285,11 @@ class HeldOutViews:
         write_sheet(sheet, rows)
         names = [entry.name for entry in config.classes]
         return {
-            **{
-                name: -10 * float(np.log10(max(float(torch.cat(each).sum()) / max(sum(map(len, each)), 1), 1e-10)))
-                for name, each in errors.items()
-            },
+            **{name: _psnr(torch.cat(each)) for name, each in errors.items()},
             **class_figures(confusion, names, (7, 8, 10, 11)),
             **{f"iou_{name}": float(iou) for name, iou in zip(STATES, class_iou(states), strict=True)},
         }
+
+
+def _psnr(squares: Tensor) -> float:
+    return -10 * float(np.log10(max(float(squares.sum()) / max(len(squares), 1), 1e-10)))

@@ -265,7 +265,7 @@ def rotations(quaternions: NDArray[Any]) -> NDArray[Any]:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def moved(a_from_b: Doubles, points: NDArray[Any]) -> NDArray[Any]:
+def moved(a_from_b: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
     """Points [..., 3] of one frame in another, by a rigid transform [4, 4]."""
     return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 

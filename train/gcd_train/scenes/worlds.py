@@ -5,7 +5,7 @@ about itself, and how its clips are numbered.
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
@@ -181,7 +181,7 @@ def pair_world(
         PoseError: that is no mount.
         RecipeError: the scenes are too short for such clips.
     """
-    shared = {"name": scenes.name, "edition": scenes.edition, **asdict(form)}
+    shared: dict[str, Any] = {"name": scenes.name, "edition": scenes.edition, **asdict(form)}
     if scenes.layout == "parallel_domain4d":
         CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
         return World(**shared, fps=scenes.fps, hfov_deg=DRIVING_HFOV_DEG, options=mount, path=path)

@@ -6,6 +6,7 @@ A footprint is [..., 5]: x and y of its centre, yaw in radians, half its length 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,7 @@ def footprint_of(parts: Sequence[Part]) -> Footprints:
     return np.array([x, y, yaw, *((high - low) / 2)])
 
 
-def holds_a_point(parts: Sequence[Part], points: Doubles, margin_m: float) -> bool:
+def holds_a_point(parts: Sequence[Part], points: NDArray[Any], margin_m: float) -> bool:
     """Whether a point [N, 3] lies within a margin of a part's bounding box; the parts stand upright."""
     hub = np.array(parts[0].centre)
     radius = max(float(np.linalg.norm(part.centre - hub) + np.linalg.norm(part.size) / 2) for part in parts)
@@ -72,7 +73,7 @@ def holds_a_point(parts: Sequence[Part], points: Doubles, margin_m: float) -> bo
     )
 
 
-def turned_back(away: NDArray[np.floating], yaw: NDArray[np.floating] | float) -> NDArray[np.floating]:
+def turned_back(away: NDArray[Any], yaw: NDArray[Any] | float) -> NDArray[Any]:
     """Points [..., 3] about an origin, in axes that are turned about the vertical by `yaw` radians."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     x, y = away[..., 0] * cos + away[..., 1] * sin, away[..., 1] * cos - away[..., 0] * sin

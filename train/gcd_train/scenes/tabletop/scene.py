@@ -38,7 +38,7 @@ from gcd_train.scenes.description import (
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.tabletop.arm import BASE, arm_links, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
-from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TabletopClass
+from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TableThing, TabletopClass
 
 UNITS_A_METRE = 10.0
 _EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
@@ -145,9 +145,11 @@ def _counted(
     parts = [piece.of(instance=0, body=_TABLE) for part in setting.table for piece in _drawn(part)]
     objects: list[SceneObject] = []
     tracks = _in_world(motion.tracks, setting.clutter, world_from_table)
-    numbers = [model.body(f"thing_{index}").id for index in range(len(setting.things))]
-    things = [(each.thing, body, TabletopClass.OBJECT) for each, body in zip(setting.things, numbers, strict=True)]
-    rows = [(*row, row[1], None) for row in (*things, *arm_links(model))]
+    rows: list[tuple[TableThing, int, TabletopClass, int, Placed | None]] = []
+    for index, each in enumerate(setting.things):
+        body = model.body(f"thing_{index}").id
+        rows.append((each.thing, body, TabletopClass.OBJECT, body, None))
+    rows += [(link, body, label, body, None) for link, body, label in arm_links(model)]
     bodies = motion.tracks.positions.shape[1]
     rows += [(each.thing, 0, TabletopClass.CLUTTER, bodies + k, each) for k, each in enumerate(setting.clutter)]
     for instance, (thing, body, label, track, stands) in enumerate(rows, start=1):

@@ -70,7 +70,7 @@ class Grasp:
         return self.lifted > 0.05 and self.slip < _SLIP_M
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Motion:
     """What happened, a row a frame; metres, radians, seconds, in the frame of the table.
 
@@ -141,8 +141,8 @@ class Simulation:
         tracks = Tracks(
             positions=positions, quaternions=quaternions, velocities=rates[..., 3:], angular_velocities=rates[..., :3]
         )
-        told = {"steps": tuple(self._names), "grasps": tuple(self._grasps), "tasks": tuple(self._tasks)}
-        return Motion(tracks=tracks, tool=tool, state=state, action=action, **told)
+        kept = tuple(self._names), tuple(self._grasps), tuple(self._tasks)
+        return Motion(tracks, tool, state, action, *kept)
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""

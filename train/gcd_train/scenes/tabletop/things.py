@@ -168,10 +168,11 @@ _PATTERNS = (Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.CHECKER, Pat
 
 def _paints(random: _Random) -> tuple[Paint, Paint]:
     """Two paints of one thing: a patterned one, and its second colour alone."""
-    colour, accent = (
-        tuple(min(1.0, channel * float(random.uniform(0.85, 1.15))) for channel in _COLOURS[int(index)])
-        for index in random.choice(len(_COLOURS), 2, replace=False)
-    )
+    colours: list[Colour] = []
+    for index in random.choice(len(_COLOURS), 2, replace=False):
+        red, green, blue = (min(1.0, part * float(random.uniform(0.85, 1.15))) for part in _COLOURS[int(index)])
+        colours.append((red, green, blue))
+    colour, accent = colours
     pattern = pick(random, _PATTERNS)
     grain_m, gloss = float(random.uniform(0.02, 0.06)), float(random.uniform(0.0, 0.5))
     return Paint(colour, accent, pattern, grain_m, gloss), plain(accent, gloss)
