@@ -25,7 +25,7 @@ from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
 from gcd_train.data.sample import to_network
 from gcd_train.evaluation.metrics import class_iou
-from gcd_train.live.clips import Camera, LiveClip, Poses, TrainingClips, decode_depth, evenly, read_clip, tensor_of
+from gcd_train.live.clips import Cameras, LiveClip, TrainingClips, decode_depth, evenly, read_clip, tensor_of
 from gcd_train.training.loop import Task
 
 Random = np.random.Generator
@@ -114,21 +114,20 @@ def rays_of(lenses: Sequence[Intrinsics], device: torch.device) -> Tensor:
 def pictures_of(clip: LiveClip) -> Pictures:
     """All source frames that were read of a clip, without earlier ones."""
     arrays = {name: tensor_of(array) for name, array in clip.arrays.items() if name.startswith("source")}
-    poses = clip.arrays["source.pose"]
-    return _pictures(arrays, "source", [clip.camera("source")] * len(poses), poses)
+    return _pictures(arrays, "source", clip.cameras("source"))
 
 
-def _pictures(arrays: dict[str, Tensor], name: str, cameras: Sequence[Camera], poses: Poses) -> Pictures:
-    """arrays: as a clip has them, of frames of N cameras that stand at `poses`, [N, 4, 4]."""
+def _pictures(arrays: dict[str, Tensor], name: str, cameras: Cameras) -> Pictures:
+    """arrays: as a clip has them, of frames of N cameras."""
     video = to_network(arrays[f"{name}.rgb"])
     return Pictures(
         video=video,
         metres=decode_depth(arrays[f"{name}.depth"]),
         labels=arrays[f"{name}.labels"].long(),
         moves=arrays[f"{name}.moves"].float(),
-        lenses=tuple(camera.lens for camera in cameras),
-        ups=on_device(poses[:, 2, :3].copy(), video),
-        heights_m=on_device([camera.height_m(pose) for camera, pose in zip(cameras, poses, strict=True)], video),
+        lenses=cameras.lenses,
+        ups=on_device(cameras.poses[:, 2, :3].copy(), video),
+        heights_m=on_device(cameras.heights_m, video),
         earlier=video,
         earlier_from_camera=torch.eye(4, dtype=torch.float64, device=video.device).expand(len(video), 4, 4),
         compared=torch.zeros(len(video), dtype=torch.bool, device=video.device),
@@ -170,12 +169,12 @@ class FrameBatches:
         before = frames - random.integers(1, _MOST_GAP + 1, size=count)
         compared = (before >= 0) & (random.random(count) < _REFERENCE_SHARE)
         before = before.clip(0)
-        poses, poses_before = (self._clips.poses(name, chosen, times) for times in (frames, before))
+        now, then = (self._clips.cameras(name, chosen, times) for times in (frames, before))
         names = [f"{name}.{array}" for array in ("rgb", "depth", "labels", "moves")]
-        pictures = _pictures(self._clips.take(chosen, frames, names), name, self._clips.cameras(name, chosen), poses)
+        pictures = _pictures(self._clips.take(chosen, frames, names), name, now)
         far = torch.where(pictures.metres < SKY_M, pictures.metres, torch.nan).flatten(1)
         median = far.nanmedian(dim=1).values.nan_to_num(0.0).double()
-        moves = on_device(np.linalg.inv(poses_before) @ poses, median)
+        moves = on_device(np.linalg.inv(then.poses) @ now.poses, median)
         near = moves[:, :3, 3].norm(dim=1) <= 2 * LONGEST * median
         x, y, z = random.normal(size=(3, count)) * np.radians(_TURN_NOISE_DEG)
         one = np.ones(count)  # angles are so small that their first order is enough

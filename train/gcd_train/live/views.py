@@ -37,7 +37,7 @@ from gcd_train.live.batches import (
 from gcd_train.live.clips import (
     CAMERAS,
     Array,
-    Camera,
+    Cameras,
     LiveClip,
     Numbers,
     Poses,
@@ -151,21 +151,17 @@ def views_of(path: Path, inputs: Path, frames: slice) -> Views:
     """Some frames of a clip, with what is seen of them as it is stored there, and with a declared floor."""
     clip = read_clip(path, frames, [*(f"{name}.pose" for name in CAMERAS), *PIXELS])
     arrays = {name: tensor_of(array) for name, array in (clip.arrays | read_inputs(inputs, frames)).items()}
-    sources, targets = (clip.arrays[f"{name}.pose"] for name in CAMERAS)
-    n = len(targets)
-    return _views(arrays, [clip.camera("target")] * n, sources, targets, np.full(n, True))
+    targets = clip.cameras("target")
+    return _views(arrays, clip.arrays["source.pose"], targets, np.full(len(targets.poses), True))
 
 
-def _views(
-    arrays: dict[str, Tensor], cameras: Sequence[Camera], sources: Poses, targets: Poses, ground: Array
-) -> Views:
-    """arrays: as clips and inputs have them, of N frames. cameras: the targets'; their poses and the sources',
-    [N, 4, 4]. ground: bool [N], where it is told.
+def _views(arrays: dict[str, Tensor], sources: Poses, cameras: Cameras, ground: Array) -> Views:
+    """arrays: as clips and inputs have them, of N frames. sources: poses [N, 4, 4]; cameras: the targets'. ground:
+    bool [N], where it is told.
     """
-    target, lenses = to_network(arrays["target.rgb"]), tuple(camera.lens for camera in cameras)
-    heights = [camera.height_m(pose) for camera, pose in zip(cameras, targets, strict=True)]
-    rays = rays_of(lenses, target.device)
-    floor = plane_depth(rays, on_device(targets[:, 2, :3].copy(), target), on_device(heights, target))
+    target, poses = to_network(arrays["target.rgb"]), cameras.poses
+    rays = rays_of(cameras.lenses, target.device)
+    floor = plane_depth(rays, on_device(poses[:, 2, :3].copy(), target), on_device(cameras.heights_m, target))
     coverage = arrays["coverage"].float() / 255
     covered = coverage > 0
     share = (arrays["label_share"].float() / 255 * covered)[:, None]
@@ -181,7 +177,7 @@ def _views(
         painted_coverage=torch.zeros_like(coverage),
         rays=rays,
         ground_m=floor * on_device(ground, target)[:, None, None],
-        camera=camera_features(torch.from_numpy(np.linalg.inv(sources) @ targets)).to(target.device),
+        camera=camera_features(torch.from_numpy(np.linalg.inv(sources) @ poses)).to(target.device),
     )
     return Views(
         seen=seen,
@@ -189,8 +185,8 @@ def _views(
         labels=arrays["target.labels"].long(),
         log_depth=decode_depth(arrays["target.depth"]).log(),
         visibility=arrays["target.visibility"].long(),
-        poses=torch.from_numpy(targets),
-        lenses=lenses,
+        poses=torch.from_numpy(poses),
+        lenses=cameras.lenses,
     )
 
 
@@ -252,8 +248,8 @@ class ViewBatches:
             """The first so many, some frames earlier."""
             times, some = frames[:count] - back, clips[:count]
             arrays = self._clips.take(some, times, PIXELS) | self._inputs.take(inputs[:count], times, INPUTS)
-            sources, targets = (self._clips.poses(name, some, times) for name in CAMERAS)
-            return look(_views(arrays, self._clips.cameras("target", some), sources, targets, ground[:count]))
+            sources, targets = (self._clips.cameras(name, some, times) for name in CAMERAS)
+            return look(_views(arrays, sources.poses, targets, ground[:count]))
 
         return tuple(views(back, carried) for back in range(run, 0, -1)), views(0, self._size), random
 
