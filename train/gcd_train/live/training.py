@@ -86,9 +86,8 @@ def train_live(
     # inputs by exact depth, by learned depth, and of held-out clips; named by all that decides what is seen
     memory = digest_of(model.memory, model.memory_frames, seed)
     by_net = f"{memory}-{weights_digest(networks.depth.state_dict())}"
-    exact, learned, shown = (
-        out / "inputs" / name for name in (f"exact/{memory}", f"learned/{by_net}", f"held-out/{by_net}")
-    )
+    exact = out / "inputs" / "exact" / memory
+    learned, shown = (out / "inputs" / name / by_net for name in ("learned", "held-out"))
     make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(recipe.workers, processes.count))
     alone(lambda: make(exact, clips.paths[:: recipe.exact_every], None))
     alone(lambda: make(learned, clips.paths[:: recipe.learned_every], networks.depth))

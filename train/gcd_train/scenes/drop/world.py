@@ -6,7 +6,7 @@ twelve at 5.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from gcd_train.scenes.description import (
     Paint,
     Part,
     Pattern,
+    Point,
     Scene,
     SceneObject,
     Sheet,
@@ -88,85 +89,69 @@ def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: in
         overlapped at most, metres.
     Raises: UnsoundSceneError if no free place was found or something never came to rest; RenderError without MuJoCo.
     """
-    stage = _Stage(things)
-    settled = [i for i, thing in enumerate(things) if not thing.dynamic]
-    for i in settled:
-        stage.put(i, random, (-7.0, -7.0, 0.0), (7.0, 7.0, 7.0))
-    stage.settle(settled)
-    for i, thing in enumerate(things):
-        if thing.dynamic:
-            place = stage.put(i, random, (-5.0, -5.0, 1.0), (5.0, 5.0, 6.0))
-            pull = np.array([place[0], place[1], 0.0])  # Kubric's throw: anywhere, and towards the middle
-            velocity, spin = random.uniform((-4, -4, 0), (4, 4, 0)) - pull, random.uniform(-2.5, 2.5, 3)
-            stage.data.qvel[6 * i : 6 * i + 6] = np.concatenate([velocity, spin])  # about its own axes
-    return stage.watch(frames)
+    mujoco, model = load_mujoco(), _compiled(things)
+    data = mujoco.MjData(model)
+    q, v = (
+        data.qpos.reshape(-1, 7),
+        data.qvel.reshape(-1, 6),
+    )  # what MuJoCo works on: places and attitudes; speeds, spins
+    for i, thing in enumerate(things):  # far outside, alone, where it disturbs nothing
+        q[i] = (500.0 + 20.0 * i, 500.0, thing.size[2] / 2 + 0.01, *np.eye(4)[0])
 
-
-class _Stage:
-    """A floor and things on it; the only owner of MuJoCo's state."""
-
-    def __init__(self, things: Sequence[Thing]) -> None:
-        self._mujoco = load_mujoco()
-        self._things = things
-        self._model: Any = _compiled(self._mujoco, things)
-        self.data: Any = self._mujoco.MjData(self._model)
-        for i, thing in enumerate(things):  # far outside, alone, where it disturbs nothing
-            self._place(i, np.array([500.0 + 20.0 * i, 500.0, thing.size[2] / 2 + 0.01]), np.eye(4)[0])
-
-    def put(self, i: int, random: np.random.Generator, low: Sequence[float], high: Sequence[float]) -> Doubles:
+    def put(i: int, low: Point, high: Point) -> Doubles:
         """Somewhere in a box, in any attitude, where it touches nothing; its place [3]."""
         for _ in range(_TRIES):
-            quaternion = random.normal(size=4)
-            place = random.uniform(low, high)
-            self._place(i, place, quaternion / np.linalg.norm(quaternion))
-            self._mujoco.mj_forward(self._model, self.data)
-            if not (self._model.geom_bodyid[self.data.contact.geom] == i + 1).any():
+            quaternion, place = random.normal(size=4), random.uniform(low, high)
+            q[i], v[i] = (*place, *(quaternion / np.linalg.norm(quaternion))), 0.0
+            mujoco.mj_forward(model, data)
+            if not (model.geom_bodyid[data.contact.geom] == i + 1).any():
                 return place
-        raise UnsoundSceneError(f"no free place for a {self._things[i].name} in {_TRIES} tries")
+        raise UnsoundSceneError(f"no free place for a {things[i].name} in {_TRIES} tries")
 
-    def settle(self, which: Sequence[int]) -> None:
-        """Until all of them lie still, which is then made exact. Air as thick as syrup saves waiting for what rolls."""
-        mass, inertia = self._model.body_mass[1:, None], self._model.body_inertia[1:]
-        self._model.dof_damping[:] = _SYRUP_HZ * np.concatenate([mass, mass, mass, inertia], 1).ravel()
-        self._run(_SETTLING_S)
-        rows = [6 * i + k for i in which for k in range(6)]
-        waited = _SETTLING_S
-        while np.abs(self.data.qvel[rows]).max(initial=0.0) > _STILL_M_S:
-            if waited >= _LONGEST_SETTLING_S:
-                raise UnsoundSceneError(f"something still moves after {waited:.0f} s")
-            self._run(0.5)
-            waited += 0.5
-        self.data.qvel[:] = 0.0
-        self._model.dof_damping[:] = 0.0
-
-    def watch(self, frames: int) -> tuple[Tracks, float]:
-        """The motion from now on, and how deep solids overlapped at most."""
-        deepest, q, v = 0.0, [], []
-        for frame in range(frames):
-            if frame:
-                deepest = max(deepest, self._run(1 / FPS))
-            q.append(self.data.qpos.reshape(-1, 7).copy())
-            v.append(self.data.qvel.reshape(-1, 6).copy())
-        q, v = np.stack(q), np.stack(v)  # [T, N, 7], [T, N, 6]
-        spin = rotations(q[..., 3:]) @ v[..., 3:, None]  # MuJoCo's are in the body's frame
-        tracks = Tracks(
-            positions=q[..., :3], quaternions=q[..., 3:], velocities=v[..., :3], angular_velocities=spin[..., 0]
-        )
-        return tracks, deepest
-
-    def _run(self, seconds: float) -> float:
-        """Let time pass. Returns how deep solids overlapped at most. Raises UnsoundSceneError if it diverged."""
+    def run(seconds: float) -> float:
+        """Let time pass. Returns how deep solids overlapped at most."""
         deepest = 0.0
         for _ in range(round(seconds / _STEP_S)):
-            self._mujoco.mj_step(self._model, self.data)
-            deepest = min(deepest, self.data.contact.dist.min(initial=0.0))
-        if any(warning.number for warning in self.data.warning):  # MuJoCo starts anew after such
+            mujoco.mj_step(model, data)
+            deepest = min(deepest, data.contact.dist.min(initial=0.0))
+        if any(warning.number for warning in data.warning):  # MuJoCo starts anew after such
             raise UnsoundSceneError("the simulation diverged")
         return -float(deepest)
 
-    def _place(self, i: int, place: Doubles, quaternion: Doubles) -> None:
-        self.data.qpos[7 * i : 7 * i + 7] = np.concatenate([place, quaternion])
-        self.data.qvel[6 * i : 6 * i + 6] = 0.0
+    settled, thrown = ([i for i, thing in enumerate(things) if thing.dynamic == flies] for flies in (False, True))
+    for i in settled:
+        put(i, (-7.0, -7.0, 0.0), (7.0, 7.0, 7.0))
+    mass, inertia = model.body_mass[1:, None], model.body_inertia[1:]
+    # air as thick as syrup saves waiting for what rolls
+    model.dof_damping[:] = _SYRUP_HZ * np.concatenate([mass, mass, mass, inertia], 1).ravel()
+    waited = _SETTLING_S
+    run(waited)
+    while np.abs(v[settled]).max(initial=0.0) > _STILL_M_S:
+        if waited >= _LONGEST_SETTLING_S:
+            raise UnsoundSceneError(f"something still moves after {waited:.0f} s")
+        run(0.5)
+        waited += 0.5
+    v[:], model.dof_damping[:] = 0.0, 0.0  # they lie still, exactly
+    for i in thrown:
+        x, y, _ = put(i, (-5.0, -5.0, 1.0), (5.0, 5.0, 6.0))
+        # Kubric's throw: anywhere, and towards the middle; the spin is about its own axes
+        v[i] = (*(random.uniform((-4, -4, 0), (4, 4, 0)) - (x, y, 0.0)), *random.uniform(-2.5, 2.5, 3))
+    return _watched(q, v, run, frames)
+
+
+def _watched(q: Doubles, v: Doubles, run: Callable[[float], float], frames: int) -> tuple[Tracks, float]:
+    """The motion from now on, and how deep solids overlapped at most."""
+    deepest, places, rates = 0.0, [q.copy()], [v.copy()]
+    for _ in range(1, frames):
+        deepest = max(deepest, run(1 / FPS))
+        places.append(q.copy())
+        rates.append(v.copy())
+    q, v = np.stack(places), np.stack(rates)  # [T, N, 7], [T, N, 6]
+    spin = rotations(q[..., 3:]) @ v[..., 3:, None]  # MuJoCo's are in the body's frame
+    tracks = Tracks(
+        positions=q[..., :3], quaternions=q[..., 3:], velocities=v[..., :3], angular_velocities=spin[..., 0]
+    )
+    return tracks, deepest
 
 
 def load_mujoco() -> Any:
@@ -178,7 +163,8 @@ def load_mujoco() -> Any:
     return mujoco
 
 
-def _compiled(mujoco: Any, things: Sequence[Thing]) -> Any:
+def _compiled(things: Sequence[Thing]) -> Any:
+    mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.option.timestep = _STEP_S
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
