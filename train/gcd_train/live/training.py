@@ -71,14 +71,12 @@ def train_live(
     model, seed, out = recipe.model, recipe.seed, folder.path
     alone = partial(processes.by_the_first, stop=stop)
 
-    def save(path: Path) -> None:
-        alone(lambda: save_live(path, networks, recipe.name, overwrite=True))
-
     def run(name: LiveStageName, task: Task, processes: Processes) -> None:
         """Train a stage, whose weights are then averaged and in a file of their own; one to be kept is kept."""
         if name not in recipe.keep:
             _train(recipe, name, task, folder, stop, processes)
-            save(out / f"{recipe.name}-{name}.safetensors")
+            path = out / f"{recipe.name}-{name}.safetensors"
+            alone(lambda: save_live(path, networks, recipe.name, overwrite=True))
         task.module.eval().requires_grad_(False)
 
     depth = DepthTask(networks.depth, model, clips, measured, recipe.depth, seed)
