@@ -5,7 +5,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from headless import needs_egl
+from headless import drawn, needs_egl
 from numpy.typing import NDArray
 
 from gcd_model.config import DRIVING_CLASSES
@@ -19,7 +19,6 @@ from gcd_train.scenes.driving.roadside import Plot
 from gcd_train.scenes.driving.vehicles import Lamps, random_bus
 from gcd_train.scenes.driving.world import random_weather, random_world
 from gcd_train.scenes.drop.things import outline
-from gcd_train.scenes.renderer import Renderer
 
 SEEDS = (1, 6, 11)
 FRAMES = 50
@@ -225,8 +224,7 @@ def test_the_own_car_looks_the_same_in_every_scene() -> None:
 @needs_egl
 def test_the_forward_camera_sees_the_road_and_the_top_down_one_its_own_car() -> None:
     scene = driving_drive(11, frames=1)
-    with Renderer(96, 72, oversample=1) as renderer:
-        views = renderer.render(scene)
+    views = drawn(scene, 96, 72)
     assert Label.OWN_CAR not in views["yaw-0"][0].classes
     assert {Label.ROAD, Label.SKY} <= set(np.unique(views["yaw-0"][0].classes).tolist())
     assert {Label.ROAD, Label.OWN_CAR} <= set(np.unique(views["camera0"][0].classes).tolist())

@@ -11,7 +11,7 @@ import pytest
 from box_world import STAGE as FAST_STAGE
 from box_world import box_object
 from box_world import stage as fast_stage
-from headless import needs_egl
+from headless import drawn, needs_egl
 from tiny_world import TinyOrbits
 from typer.testing import CliRunner
 
@@ -24,7 +24,6 @@ from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.pair_writer import orbit_draw, write_shard
-from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.worlds import (
     SCENE_WORLDS,
     PairForm,
@@ -84,9 +83,7 @@ def test_a_clip_shows_its_time_steps_from_its_cameras(folder: Path) -> None:
     clip, numbers = clips[4], list(clips.orbit(4).frame_numbers)
     scene = stage(1, STAGE.frames)
     cut = replace(scene, poses=scene.poses[numbers], focus=scene.focus[numbers], cameras=told(clips, 4))
-    with Renderer(48, 32, oversample=1) as renderer:
-        drawn = renderer.render(cut)
-    for name, frames in drawn.items():
+    for name, frames in drawn(cut, 48, 32).items():
         apart = getattr(clip, name).astype(int) - np.stack([frame.rgb for frame in frames])
         assert np.abs(apart).mean() < 0.05  # poses on disk are rounded
         assert getattr(clip, f"{name}_instances").max() == 7

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from box_world import LIGHT
-from headless import needs_egl
+from headless import drawn, needs_egl
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
@@ -50,8 +50,7 @@ def scene(
 
 
 def draw(parts: list[Part], width: int = 96, height: int = 64, oversample: int = 1, **stage: Any) -> Rendering:
-    with Renderer(width, height, oversample=oversample) as renderer:
-        return renderer.render(scene(parts, **stage))["camera"][0]
+    return drawn(scene(parts, **stage), width, height, oversample)["camera"][0]
 
 
 def faces(corners: np.ndarray) -> np.ndarray:
@@ -168,8 +167,7 @@ def test_a_bowl_is_hollow() -> None:
 def test_a_floor_alone_is_a_scene() -> None:
     corners = np.array([[(1, -50, 0), (90, 50, 0), (1, 50, 0)], [(1, -50, 0), (90, -50, 0), (90, 50, 0)]], np.float32)
     floor = Sheet(corners, GREY, 4)
-    with Renderer(96, 64, oversample=1) as renderer:
-        shown = renderer.render(replace(scene([]), sheets=(floor,)))["camera"][0]
+    shown = drawn(replace(scene([]), sheets=(floor,)), 96, 64)["camera"][0]
     assert (shown.classes[40:] == 4).all()
     np.testing.assert_allclose(shown.depth[40:, 48], 1.5 * 48 / (np.arange(40, 64) + 0.5 - 32), rtol=1e-4)
 

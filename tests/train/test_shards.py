@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from headless import needs_egl
+from headless import drawn, needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
@@ -28,11 +28,9 @@ def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
     list(generate(tmp_path, TINY, range(3), workers=2))
     clips = PairedClips.open(tmp_path)
     assert (len(clips), clips.frames, clips.height, clips.width, clips.fps) == (3, 2, 32, 48, 10.0)
-    with Renderer(48, 32, oversample=1) as renderer:
-        drawn = renderer.render(driving_scene(2, frames=2))
     clip = clips[2]
     assert clip.seed == 2
-    for name, frames in drawn.items():
+    for name, frames in drawn(driving_scene(2, frames=2), 48, 32).items():
         np.testing.assert_array_equal(getattr(clip, name), np.stack([frame.rgb for frame in frames]))
         np.testing.assert_array_equal(getattr(clip, f"{name}_classes"), np.stack([frame.classes for frame in frames]))
         np.testing.assert_array_equal(

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from headless import needs_egl
+from headless import drawn, needs_egl
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.frozen import freeze, vertices_of
-from gcd_train.scenes.renderer import Renderer
+from gcd_train.scenes.frozen import vertices_of
 from gcd_train.scenes.tabletop import Episode, TabletopClass, tabletop_episode, tabletop_scene
 from gcd_train.scenes.tabletop.arm import FINGERS, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Simulation
@@ -129,10 +128,8 @@ def test_clips_begin_at_different_points_of_the_work() -> None:
 def test_arm_and_gripper_and_things_are_seen() -> None:
     scene = episode(0).scene
     cameras = {name: scene.cameras[name][:1] for name in ("view0", "view4", "view9")}
-    frozen = freeze(scene)
-    short = replace(frozen, poses=frozen.poses[:1], focus=frozen.focus[:1])
-    with Renderer(96, 64, oversample=1) as renderer:
-        views = [view for _, _, view in renderer.views(short, cameras)]
+    short = replace(scene, poses=scene.poses[:1], focus=scene.focus[:1], cameras=cameras)
+    views = [view for (view,) in drawn(short, 96, 64).values()]
     seen = set(np.unique(np.stack([view.classes for view in views])).tolist())
     wanted = set(TabletopClass) - {TabletopClass.SKY}
     assert seen >= wanted

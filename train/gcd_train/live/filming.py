@@ -123,9 +123,7 @@ def _film(renderer: Renderer, scene: Scene, draw: LiveDraw, world: LiveWorld) ->
     unit, ids = METRES_A_UNIT[world], {entry.name: number for number, entry in enumerate(LIVE_CLASSES)}
     labels = np.array([ids[name] for name in _LABELS[world]], np.uint8)
     cut = replace(freeze(scene), poses=scene.poses[draw.steps], focus=scene.focus[draw.steps])
-    views: dict[str, list[Rendering]] = {name: [] for name in CAMERAS}
-    for _, name, view in renderer.views(cut, draw.cameras, draw.hfov_deg):
-        views[name].append(view)
+    views = renderer.render(cut, draw.cameras, draw.hfov_deg)
     step = np.abs(np.diff(cut.poses, axis=0)).max((-1, -2)) > _STANDS_M  # [T-1, B]
     moves = np.pad(step, ((1, 0), (0, 0))) | np.pad(step, ((0, 1), (0, 0)))  # since the frame before, or until the next
     arrays: dict[str, Array] = {}
@@ -218,7 +216,7 @@ def _drive(seed: int, path: TargetPath, random: Random) -> tuple[Scene, list[Liv
     if not paper:  # a forward camera behind the windscreen of a car, a van or a small lorry; half of them the paper's
         mount = CameraMount(hfov_deg=_lens(random, _DRIVING_HFOV_DEG, 0.4))
         if random.random() >= 0.5:
-            height_m, tilt_deg = float(random.uniform(1.2, 2.1)), float(random.uniform(-3.0, 9.0))
+            height_m, tilt_deg = random.uniform(1.2, 2.1), random.uniform(-3.0, 9.0)
             mount = CameraMount(height_m=height_m, tilt_deg=tilt_deg, hfov_deg=mount.hfov_deg)
     # the paper's path is gradual where it is measured; in training it also stands at its goal, which is the live view
     move_time = FRAMES - 1 if path == "paper" else int(random.choice([0, FRAMES - 1], p=[0.6, 0.4]))
@@ -233,7 +231,7 @@ def _drive(seed: int, path: TargetPath, random: Random) -> tuple[Scene, list[Liv
 
 
 def _lens(random: Random, usual_deg: float, usually: float) -> float:
-    return usual_deg if random.random() < usually else float(random.uniform(55.0, 110.0))
+    return usual_deg if random.random() < usually else random.uniform(55.0, 110.0)
 
 
 def _around_vehicle(random: Random, vehicle_from_source: Poses) -> Poses:
@@ -251,7 +249,7 @@ def _around_vehicle(random: Random, vehicle_from_source: Poses) -> Poses:
 
 def _place(random: Random) -> tuple[Poses, Poses]:
     """A position and what is looked at from there, in the vehicle's frame, metres."""
-    height = float(random.uniform(0.9, 10.0))
+    height = random.uniform(0.9, 10.0)
     low = height < 3.0  # within the vehicle's own lane, which others keep off
     eye = np.array([random.uniform(-1.0, 3.0) if low else random.uniform(-12.0, 4.0), random.uniform(-1, 1), height])
     if not low:
@@ -267,9 +265,9 @@ def _stage_draw(scene: Scene, world: LiveWorld, path: TargetPath, seed: int, ran
     for _ in range(_ATTEMPTS):
         first = int(random.integers(0, scene.frames - 1 - span + _STAGE_STRIDE))
         start = Spherical(
-            azimuth_deg=float(random.uniform(0.0, 360.0)),
+            azimuth_deg=random.uniform(0.0, 360.0),
             elevation_deg=math.degrees(math.asin(random.uniform(0.03, math.sin(math.radians(50.0))))),
-            radius_m=float(random.uniform(11.0, 18.0)),
+            radius_m=random.uniform(11.0, 18.0),
         )
         source = np.tile(to_pose(start).numpy(), (FRAMES, 1, 1))
         if path == "mixed" and random.random() < 0.3:  # a camera that is carried

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.description import Extent, Floats, Scene
-from gcd_train.scenes.frozen import VERTEX, FrozenScene, Run, freeze, indexed, runs_of
+from gcd_train.scenes.description import Doubles, Extent, Floats
+from gcd_train.scenes.frozen import VERTEX, FrozenScene, Run, indexed, runs_of
 from gcd_train.scenes.shaders import SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
 
 
-def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> NDArray[np.float64]:
+def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> Doubles:
     """From camera axes (x right, y down, z ahead) to OpenGL's clip space: [4, 4]. aspect: width over height."""
     near, far = extent.near_m, extent.far_m
     focal = 1 / math.tan(math.radians(hfov_deg) / 2)
@@ -33,7 +33,7 @@ def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> NDArray[
     return matrix
 
 
-def sunlight_from_world(sun_to: NDArray[np.float64], focus: NDArray[np.float64], extent: Extent) -> NDArray[np.float64]:
+def sunlight_from_world(sun_to: Doubles, focus: Doubles, extent: Extent) -> Doubles:
     """Orthographic view along the sunlight around `focus`, snapped to whole shadow pixels against flicker: [4, 4].
 
     sun_to: [3], unit vector. focus: [3], metres.
@@ -105,21 +105,8 @@ class Renderer:
         self._frame = np.zeros((), _Frame)
         self._frame_block = self._context.buffer(reserve=_Frame.itemsize, dynamic=True)
 
-    def render(self, scene: Scene) -> dict[str, list[Rendering]]:
-        """Every camera of a scene, at every time step.
-
-        Raises: RenderError if there are more bodies than the renderer can move.
-        """
-        made: dict[str, list[Rendering]] = {name: [] for name in scene.cameras}
-        for _, name, view in self.views(freeze(scene), scene.cameras):
-            made[name].append(view)
-        return made
-
     def views(
-        self,
-        scene: FrozenScene,
-        cameras: Mapping[str, NDArray[np.float64]],
-        hfov_deg: Mapping[str, float] | None = None,
+        self, scene: FrozenScene, cameras: Mapping[str, Doubles], hfov_deg: Mapping[str, float] | None = None
     ) -> Generator[tuple[int, str, Rendering], None, None]:
         """Time step, camera and view, one after the other, so that a long scene needs no memory for all.
 
@@ -159,6 +146,15 @@ class Renderer:
                 for resource in (*(array for _, array in drawn), casting, buffer, index):
                     resource.release()
 
+    def render(
+        self, scene: FrozenScene, cameras: Mapping[str, Doubles], hfov_deg: Mapping[str, float] | None = None
+    ) -> dict[str, list[Rendering]]:
+        """All views of every camera, see `views`."""
+        made: dict[str, list[Rendering]] = {name: [] for name in cameras}
+        for _, name, view in self.views(scene, cameras, hfov_deg):
+            made[name].append(view)
+        return made
+
     def _program(self, vertex: str, fragment: str) -> Any:
         program = self._context.program(vertex_shader=vertex, fragment_shader=fragment)
         program["Frame"].binding = 0
@@ -195,7 +191,7 @@ class Renderer:
         self._frame_block.bind_to_uniform_block(0)
 
     def _view(
-        self, world_from_camera: NDArray[np.float64], hfov_deg: float, extent: Extent, drawn: Sequence[tuple[Run, Any]]
+        self, world_from_camera: Doubles, hfov_deg: float, extent: Extent, drawn: Sequence[tuple[Run, Any]]
     ) -> Rendering:
         self._target.use()
         self._context.enable_only(self._context.DEPTH_TEST | self._context.CULL_FACE)

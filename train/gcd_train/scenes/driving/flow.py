@@ -54,7 +54,7 @@ def random_drive(street: Street, frames: int, random: np.random.Generator) -> Dr
     """The ego's way through its street; it keeps its lane."""
     road = street.main
     lane = int(random.integers(road.lanes_right))
-    lateral = road.lane(lane) + float(random.normal(0, 0.1))
+    lateral = road.lane(lane) + random.normal(0, 0.1)
     for crossing in road.crossings:  # the first one before which the ego, starting near s = 0, can stand
         place = crossing.at_m - stop_line_m(crossing) - 1.8  # of its middle, with its nose at the stop line
         if place > -4.0:
@@ -62,7 +62,7 @@ def random_drive(street: Street, frames: int, random: np.random.Generator) -> Dr
                 break
             rows = _along(road, np.full(frames, min(0.0, place)), lateral)
             return Drive(lane=lane, speed=0.0, gain=0.0, waits_at=crossing, rows=rows)
-    speed, gain = float(random.uniform(3.5, 14.5)), float(np.clip(random.normal(0, 0.7), -1.6, 1.3))
+    speed, gain = random.uniform(3.5, 14.5), float(np.clip(random.normal(0, 0.7), -1.6, 1.3))
     covered = travelled(speed, gain, frames)
     rows = _along(road, covered - covered[-1] / 2, lateral)  # the world's origin is amid the drive: it is drawn first
     return Drive(lane=lane, speed=speed, gain=gain, waits_at=None, rows=rows)
@@ -117,7 +117,7 @@ class Crowd:
 def fill(crowd: Crowd, lamps: bool, random: np.random.Generator) -> None:
     """The ego first, then lanes, side roads, parked vehicles, cyclists and people."""
     crowd.add(vehicles.own_car(), crowd.drive.rows)
-    density = float(random.uniform(0.25, 1.1))
+    density = random.uniform(0.25, 1.1)
     for index in range(-crowd.street.main.lanes_left, crowd.street.main.lanes_right):
         _lane(crowd, index, density, lamps, random)
     for road, crossing in zip(crowd.street.crossed, crowd.street.main.crossings, strict=True):
@@ -130,7 +130,7 @@ def fill(crowd: Crowd, lamps: bool, random: np.random.Generator) -> None:
 
 
 def _vehicle(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
-    draw = float(random.random())
+    draw = random.random()
     if draw < 0.08:
         return vehicles.random_truck(random, lamps, near)
     if draw < 0.13:
@@ -146,21 +146,21 @@ def _lane(crowd: Crowd, index: int, density: float, lamps: bool, random: np.rand
     oncoming, waits = index < 0, drive.waits_at is not None
     speed, gain = drive.speed, drive.gain
     if index != drive.lane:
-        speed, gain = float(random.uniform(3.0, 13.0)), float(random.normal(0, 0.5))
+        speed, gain = random.uniform(3.0, 13.0), random.normal(0, 0.5)
     if waits:
         speed, gain = 0.0, 0.0
     shine = Lamps(lit=lamps, brakes=waits or gain < -0.4)
     covered = travelled(speed, gain, frames) * (-1 if oncoming else 1)
     thick = density * (1.8 if waits else 1.0)
-    rear = _BEGIN_M + float(random.exponential(12.0 / thick))
+    rear = _BEGIN_M + random.exponential(12.0 / thick)
     while rear < _END_M:
         near = any(crowd.is_near(road.at(at)) for at in (rear, rear + covered[-1]))
         made = _vehicle(random, shine, near)
         middle = rear + made.length / 2
         if not waits or road.is_free(middle, stop_line_m(_NOWHERE) + made.length / 2):
-            lateral = road.lane(index) + float(random.normal(0, 0.08))
+            lateral = road.lane(index) + random.normal(0, 0.08)
             crowd.add(made, _along(road, middle + covered, lateral, oncoming))
-        rear += made.length + float(random.uniform(2.2, 6.0)) + float(random.exponential(13.0 / thick))
+        rear += made.length + random.uniform(2.2, 6.0) + random.exponential(13.0 / thick)
 
 
 def _side_road(crowd: Crowd, road: Road, flows: bool, lamps: bool, random: np.random.Generator) -> None:
@@ -168,7 +168,7 @@ def _side_road(crowd: Crowd, road: Road, flows: bool, lamps: bool, random: np.ra
     crossing, frames = road.crossings[0], len(crowd.drive.rows)
     for index in range(-road.lanes_left, road.lanes_right):
         sign = -1 if index < 0 else 1
-        covered = travelled(float(random.uniform(5, 9)) if flows else 0.0, 0.0, frames)
+        covered = travelled(random.uniform(5, 9) if flows else 0.0, 0.0, frames)
         nose = 60.0 if flows else crossing.at_m * sign - stop_line_m(crossing)
         for _ in range(8 if flows else int(random.integers(0, 4))):
             made = _vehicle(random, Lamps(lit=lamps, brakes=not flows), crowd.is_near(road.at(sign * nose)))
@@ -176,21 +176,21 @@ def _side_road(crowd: Crowd, road: Road, flows: bool, lamps: bool, random: np.ra
             if nose < -90.0:
                 break
             crowd.add(made, _along(road, s, road.lane(index), index < 0))
-            nose -= made.length + float(random.uniform(1.5, 3.0)) + (float(random.exponential(9.0)) if flows else 0.0)
+            nose -= made.length + random.uniform(1.5, 3.0) + (random.exponential(9.0) if flows else 0.0)
 
 
 def _parked(crowd: Crowd, road: Road, random: np.random.Generator) -> None:
     frames = len(crowd.drive.rows)
     for (side, edge), strip in zip(road.sides, road.parking_m, strict=True):
-        fullness, s = float(random.uniform(0.35, 0.95)), max(_BEGIN_M, road.start_m)
+        fullness, s = random.uniform(0.35, 0.95), max(_BEGIN_M, road.start_m)
         while strip > 0 and s < min(170.0, road.end_m):
             near = crowd.is_near(road.at(s))
             kind = vehicles.random_truck if random.random() < 0.05 else vehicles.random_car
             made = kind(random, Lamps(), near)
-            s += made.length + float(random.uniform(0.7, 1.5))
+            s += made.length + random.uniform(0.7, 1.5)
             middle = s - made.length / 2
             if random.random() < fullness and road.is_free(middle, 7.5 + made.length / 2):
-                lateral = side * (edge - strip / 2 + float(random.normal(0, 0.06)))
+                lateral = side * (edge - strip / 2 + random.normal(0, 0.06))
                 crowd.add(made, _along(road, np.full(frames, middle), lateral, side > 0))
 
 
@@ -199,7 +199,7 @@ def _two_wheelers(crowd: Crowd, random: np.random.Generator) -> None:
     frames, road = len(crowd.drive.rows), crowd.street.main
     for side, kerb in road.sides:
         for _ in range(int(random.integers(0, 4))):
-            s, heavy = float(random.uniform(-45, 70)), random.random() < 0.3
+            s, heavy = random.uniform(-45, 70), random.random() < 0.3
             for number in range(int(random.integers(1, 5))):
                 rows = _along(road, np.full(frames, s + number * (1.1 if heavy else 0.8)), side * (kerb + 1.25))
                 rows[:, 2:] += [PAVEMENT_M, np.pi / 2]
@@ -207,25 +207,25 @@ def _two_wheelers(crowd: Crowd, random: np.random.Generator) -> None:
                     crowd.add(vehicles.left_two_wheeler(random, heavy), rows)
     for side, lanes in ((-1.0, road.lanes_right), (1.0, road.lanes_left)):
         for _ in range(0 if crowd.drive.waits_at else int(random.integers(0, 4))):
-            covered = travelled(float(random.uniform(2.5, 6.0)), 0.0, frames)
-            start = float(random.uniform(-15, 70))
+            covered = travelled(random.uniform(2.5, 6.0), 0.0, frames)
+            start = random.uniform(-15, 70)
             rows = _along(road, start - side * covered, side * (lanes * road.lane_m - 0.42), side > 0)
             crowd.add(vehicles.random_cyclist(random), rows)
 
 
 def _walkers(crowd: Crowd, random: np.random.Generator) -> None:
     """On the pavements; then on the zebras before waiting vehicles, or on the side roads' while the main road flows."""
-    frames, spacing = len(crowd.drive.rows), float(random.uniform(7, 45))
+    frames, spacing = len(crowd.drive.rows), random.uniform(7, 45)
     for road in crowd.street.roads:
         for side, kerb in road.sides:
             s = max(-40.0, road.start_m)
             while s < min(120.0, road.end_m):
-                s += float(random.exponential(spacing)) + 0.7
+                s += random.exponential(spacing) + 0.7
                 stands = random.random() < 0.2
-                speed = 0.0 if stands else float(random.uniform(0.7, 1.8))
+                speed = 0.0 if stands else random.uniform(0.7, 1.8)
                 way = float(random.choice([-1, 1]))
                 path = s + way * travelled(speed, 0.0, frames)
-                lateral = side * (kerb + float(random.uniform(0.5, road.pavement_m - 0.4)))
+                lateral = side * (kerb + random.uniform(0.5, road.pavement_m - 0.4))
                 if all(road.is_free(float(at), 2.5) for at in (path[0], path[-1])):
                     rows = _along(road, path, lateral, way < 0)
                     rows[:, 2] = PAVEMENT_M
@@ -235,9 +235,9 @@ def _walkers(crowd: Crowd, random: np.random.Generator) -> None:
         near, far = zebra_m(crossing)
         for _ in range(int(random.integers(1, 6)) if crossing.zebra else 0):
             way, end = float(random.choice([-1, 1])), float(random.choice([-1, 1]))
-            x, y, heading = road.at(crossing.at_m + end * float(random.uniform(near + 0.3, far - 0.3)))
-            start = float(random.uniform(-road.right_m - 1.5, road.left_m - 2.0))
-            across = way * (start + travelled(float(random.uniform(0.9, 1.7)), 0.0, frames))
+            x, y, heading = road.at(crossing.at_m + end * random.uniform(near + 0.3, far - 0.3))
+            start = random.uniform(-road.right_m - 1.5, road.left_m - 2.0)
+            across = way * (start + travelled(random.uniform(0.9, 1.7), 0.0, frames))
             rows = np.stack([x - across * np.sin(heading), y + across * np.cos(heading),
                              np.zeros(frames), np.full(frames, heading + way * np.pi / 2)], -1)  # fmt: skip
             crowd.add(vehicles.random_person(random, walks=True), rows.astype(np.float32))

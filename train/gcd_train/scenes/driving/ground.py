@@ -113,9 +113,9 @@ def _rim(middle: Doubles, first: Doubles, second: Doubles, radius: float, z: flo
 def _puddles(road: Road, random: np.random.Generator) -> Floats:
     pieces: list[Floats] = []
     for _ in range(24):
-        x, y, _ = road.at(float(random.uniform(-30, 110)), float(random.uniform(-road.right_m, road.left_m)))
+        x, y, _ = road.at(random.uniform(-30, 110), random.uniform(-road.right_m, road.left_m))
         turn = np.linspace(0, 2 * np.pi, 11)
-        radius = float(random.uniform(0.5, 1.8)) * random.uniform(0.75, 1.0, 11)
+        radius = random.uniform(0.5, 1.8) * random.uniform(0.75, 1.0, 11)
         radius[-1] = radius[0]
         rim = np.stack([x + radius * np.cos(turn), y + radius * np.sin(turn), np.full(11, PATCH_M + 0.003)], -1)
         pieces.append(fan(np.array([x, y, PATCH_M + 0.003]), rim))
@@ -124,11 +124,11 @@ def _puddles(road: Road, random: np.random.Generator) -> Floats:
 
 def _marks(street: Street, wetness: float, random: np.random.Generator) -> list[Sheet]:
     """Lane lines, centre lines, zebras and stop lines."""
-    white = float(random.uniform(0.78, 0.95))
-    paint: Colour = (white, white, white * float(random.uniform(0.93, 1.0)))
+    white = random.uniform(0.78, 0.95)
+    paint: Colour = (white, white, white * random.uniform(0.93, 1.0))
     middle: Colour = paint if random.random() < 0.6 else (white, 0.72 * white, 0.12)
-    width = float(random.uniform(0.12, 0.18))
-    dash = (float(random.uniform(2.5, 4.5)), float(random.uniform(4.0, 8.0)))
+    width = random.uniform(0.12, 0.18)
+    dash = (random.uniform(2.5, 4.5), random.uniform(4.0, 8.0))
     edged, solid = random.random() < 0.6, random.random() < 0.5
     none = [np.zeros((0, 3, 3), np.float32)]
     lanes, centre, zebras, stops = [*none], [*none], [*none], [*none]

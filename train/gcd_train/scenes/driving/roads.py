@@ -162,7 +162,7 @@ def random_street(random: np.random.Generator) -> Street:
     """A layout drawn at random. Roads neither meet themselves nor each other but in their crossings."""
     drawn: list[Crossing] = []
     for _ in range(int(random.choice([0, 1, 2, 3], p=[0.12, 0.38, 0.32, 0.18]))):
-        at, zebra = float(random.uniform(-45, 125)), bool(random.random() < 0.7)
+        at, zebra = random.uniform(-45, 125), bool(random.random() < 0.7)
         if all(abs(at - other.at_m) > _APART_M for other in drawn):
             drawn.append(Crossing(at_m=at, half_m=4.0, zebra=zebra))  # its width follows from the road below
     crossings = tuple(sorted(drawn, key=lambda crossing: crossing.at_m))
@@ -177,8 +177,8 @@ def random_street(random: np.random.Generator) -> Street:
 
 def _winding(s: Doubles, crossings: tuple[Crossing, ...], random: np.random.Generator) -> Doubles:
     """Headings that sway but never turn back; straight in junctions, 0 at s = 0. No bend below 60 m of radius."""
-    long, short = float(random.uniform(280, 480)), float(random.uniform(140, 240))
-    sway = float(random.choice([0.0, 0.35, 0.6])) * float(random.uniform(0.7, 1.0))
+    long, short = random.uniform(280, 480), random.uniform(140, 240)
+    sway = float(random.choice([0.0, 0.35, 0.6])) * random.uniform(0.7, 1.0)
     slow = sway * np.sin(2 * np.pi * (s / long + random.uniform()))
     curvature = np.gradient(slow + 0.15 * sway * np.sin(2 * np.pi * (s / short + random.uniform())), s)
     for crossing in crossings:
@@ -193,15 +193,15 @@ def _road(
     points = np.cumsum(np.stack([np.cos(headings), np.sin(headings)], -1) * STEP_M, 0)
     points -= [np.interp(0.0, s, points[:, i]) for i in (0, 1)]
     right, left = (int(random.choice([1, 2, 3], p=[0.5, 0.4, 0.1])) for _ in range(2))
-    strips = [float(random.uniform(2.25, 2.6)) if random.random() < 0.55 else 0.0 for _ in range(2)]
+    strips = [random.uniform(2.25, 2.6) if random.random() < 0.55 else 0.0 for _ in range(2)]
     return Road(
         points=points,
         headings=headings,
-        lane_m=float(random.uniform(3.2, 3.7)),
+        lane_m=random.uniform(3.2, 3.7),
         lanes_right=min(right, most_lanes),
         lanes_left=min(left, most_lanes),
         parking_m=(strips[0], strips[1]),
-        pavement_m=float(random.uniform(2.4, 4.6)),
+        pavement_m=random.uniform(2.4, 4.6),
         verge_m=float(random.choice([0.0, random.uniform(1, 6)])),
         crossings=crossings,
         start_m=float(s[0]),
@@ -215,7 +215,7 @@ def _side_road(main: Road, crossing: Crossing, random: np.random.Generator) -> R
     """
     s = np.arange(-_SIDE_M, _SIDE_M + STEP_M, STEP_M)
     x, y, heading = main.at(crossing.at_m)
-    settled = float(np.mean(main.headings)) + 0.2 * float(random.uniform(-1, 1))
+    settled = float(np.mean(main.headings)) + 0.2 * random.uniform(-1, 1)
     share = np.clip((np.abs(s) - 25.0) / 60.0, 0, 1)
     headings = np.pi / 2 + heading + (settled - heading) * share**2 * (3 - 2 * share)
     middle, half = (main.left_m - main.right_m) / 2, (main.left_m + main.right_m) / 2

@@ -150,8 +150,8 @@ def furnish(plot: Plot, district: District, paved: bool, lit: bool, green: bool,
             plot.put(road.put(shown, at, side * (kerb + 0.6), 0.0 if side < 0 else np.pi), on_pavement=True)
     sides = [(road, side, kerb) for road in plot.street.roads for side, kerb in road.sides]
     for road, side, kerb in sides:
-        every, height = float(random.uniform(22, 38)), float(random.uniform(5.8, 8.5))
-        first = max(_BEGIN_M, road.start_m) + float(random.uniform(0, every))
+        every, height = random.uniform(22, 38), random.uniform(5.8, 8.5)
+        first = max(_BEGIN_M, road.start_m) + random.uniform(0, every)
         for s in np.arange(first, min(road.end_m, 190.0), every).tolist():
             lamp = road.put(things.street_lamp(height, side, grey, lit), s, side * (kerb + 0.5))
             # its arm reaches over the road
@@ -167,13 +167,13 @@ def furnish(plot: Plot, district: District, paved: bool, lit: bool, green: bool,
 def _houses(plot: Plot, place: Side, district: District, paved: bool, lit: bool, random: np.random.Generator) -> None:
     road, side, kerb = place
     edge = road.pavement_m + road.verge_m * (0.0 if paved else 1.0) + 0.8
-    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, 10))
+    s = max(_BEGIN_M, road.start_m) + random.uniform(0, 10)
     while s < min(_END_M, road.end_m):
-        width, depth = float(random.uniform(*district.width_m)), float(random.uniform(9, 17))
+        width, depth = random.uniform(*district.width_m), random.uniform(9, 17)
         if random.random() < district.built:
             middle = s + width / 2
             bend = abs(road.at(middle + width / 2)[2] - road.at(middle - width / 2)[2])
-            back = float(random.uniform(*district.setback_m)) + (width * bend / 4 + 0.3)  # fronts are straight
+            back = random.uniform(*district.setback_m) + (width * bend / 4 + 0.3)  # fronts are straight
             lateral = side * (kerb + (edge + back + depth / 2))
             house = things.building(width, depth, district, random)
             roof = house[1]
@@ -185,7 +185,7 @@ def _houses(plot: Plot, place: Side, district: District, paved: bool, lit: bool,
             if paved and plot.shows_details(road, middle, lateral):
                 house += things.shop(width, -side * depth / 2, lit, random)
             plot.put(road.put(house, middle, lateral))
-        s += width + float(random.uniform(*district.gap_m))
+        s += width + random.uniform(*district.gap_m)
 
 
 def _furniture(plot: Plot, place: Side, lit: bool, grey: Colour, random: np.random.Generator) -> None:
@@ -196,12 +196,12 @@ def _furniture(plot: Plot, place: Side, lit: bool, grey: Colour, random: np.rand
         (lambda: things.shelter(random, lit), 1.3),
         (lambda: things.kiosk(random, lit), 1.6),
     )
-    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, 20))
+    s = max(_BEGIN_M, road.start_m) + random.uniform(0, 20)
     while s < min(150.0, road.end_m):
         make, away = makers[int(random.choice(4, p=[0.45, 0.2, 0.2, 0.15]))]
         if road.is_free(s, _CLEAR_M + 4.0) and road.pavement_m > away + 0.9:
             plot.put(road.put(make(), s, side * (kerb + away), 0.0 if side < 0 else np.pi), on_pavement=True)
-        s += float(random.uniform(12, 45))
+        s += random.uniform(12, 45)
 
 
 def _greenery(plot: Plot, place: Side, district: District, paved: bool, random: np.random.Generator) -> None:
@@ -211,20 +211,20 @@ def _greenery(plot: Plot, place: Side, district: District, paved: bool, random: 
     in_row = road.pavement_m - 0.7 if paved else road.pavement_m + max(0.5 * road.verge_m, 0.6)
     every = district.trees_every_m * (1.0 if paved else 0.8)
     begin = max(_BEGIN_M, road.start_m)
-    s = begin + float(random.uniform(0, every))
+    s = begin + random.uniform(0, every)
     while s < min(_PLANTED_M, road.end_m) and not bare:
-        draw = float(random.random())
+        draw = random.random()
         kind = things.bush if draw < 0.12 else things.conifer if draw < 0.12 + firs else things.tree
         made = kind(random)
-        lateral = side * (kerb + (in_row + float(random.uniform(0, 0.5))))
+        lateral = side * (kerb + (in_row + random.uniform(0, 0.5)))
         if road.is_free(s, _CLEAR_M + 3.0):
             whole = len(made) < 3 or plot.shows_details(road, s, lateral)  # far away one crown is enough
             plot.put(road.put(made if whole else made[:2], s, lateral), on_pavement=True, on_foot=True)
-        s += every * float(random.uniform(0.5, 1.6))
+        s += every * random.uniform(0.5, 1.6)
     s, edge = begin, road.pavement_m + road.verge_m + 0.5
     while s < min(150.0, road.end_m) and not paved:
-        length = float(random.uniform(5, 14))
+        length = random.uniform(5, 14)
         make = things.hedge if random.random() < 0.6 else things.fence
         if random.random() < 0.6 and road.is_free(s + length / 2, length / 2 + _CLEAR_M):
             plot.put(road.put(make(random, length), s + length / 2, side * (kerb + edge)), gap_m=0.1)
-        s += length + float(random.uniform(1.5, 8))
+        s += length + random.uniform(1.5, 8)

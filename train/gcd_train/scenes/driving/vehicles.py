@@ -170,8 +170,8 @@ def random_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assem
     """A box truck, a tipper or a lorry with a long trailer."""
     kind = str(random.choice(["box", "tipper", "trailer"], p=[0.55, 0.2, 0.25]))
     length = float(random.uniform(11, 13.5) if kind == "trailer" else random.uniform(6, 8.5))
-    height = 2.5 if kind == "tipper" else float(random.uniform(2.8, 3.6))
-    white = float(random.uniform(0.6, 0.92))
+    height = 2.5 if kind == "tipper" else random.uniform(2.8, 3.6)
+    white = random.uniform(0.6, 0.92)
     cargo: Colour = (white, white, white) if random.random() < 0.55 else random_paint(random)
     front, load, label = length / 2, length - 2.35, Label.TRUCK
     paint = random_paint(random)
@@ -195,7 +195,7 @@ def random_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assem
 
 def random_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     """A city bus or a coach."""
-    length, label = float(random.uniform(9.5, 12.2)), Label.BUS
+    length, label = random.uniform(9.5, 12.2), Label.BUS
     paint = varied(pick(random, _LIVERIES), random)
     band: Colour = (0.9, 0.9, 0.88)
     parts = [
@@ -220,7 +220,7 @@ def _cloth(random: np.random.Generator) -> Colour:
 def random_person(random: np.random.Generator, walks: bool) -> Assembly:
     """A grown-up or a child, walking or standing; some carry a bag."""
     height = float(random.uniform(1.52, 1.92) if random.random() < 0.88 else random.uniform(1.0, 1.35))
-    stride = float(random.uniform(0.12, 0.24)) * height / 1.7 if walks else 0.0
+    stride = random.uniform(0.12, 0.24) * height / 1.7 if walks else 0.0
     parts = _figure(random, height, Label.PERSON, stride)
     if random.random() < 0.3:
         parts.append(block((0.0, 0.3 * height / 1.7, 0.42 * height), (0.32, 0.12, 0.3), _cloth(random), Label.PERSON))

@@ -281,7 +281,7 @@ def random_weather(random: np.random.Generator) -> Weather:
     """Drawn at random; one in six is wet, one in ten dark."""
     kind = pick_by_share(random, tuple(_SHARES.items()))
     light = _light(kind, random)
-    wet = {"rain": float(random.uniform(0.7, 1.0)), "dusk": 0.3, "night": float(random.choice([0.0, 0.7]))}
+    wet = {"rain": random.uniform(0.7, 1.0), "dusk": 0.3, "night": float(random.choice([0.0, 0.7]))}
     return Weather(
         kind=kind,
         light=light,
@@ -292,8 +292,8 @@ def random_weather(random: np.random.Generator) -> Weather:
 
 
 def _light(kind: str, random: np.random.Generator) -> Light:
-    azimuth = float(random.uniform(0, 2 * math.pi))
-    exposure = float(random.uniform(0.9, 1.12))
+    azimuth = random.uniform(0, 2 * math.pi)
+    exposure = random.uniform(0.9, 1.12)
     if kind in _DIM:
         dim, height = _DIM[kind]
         return replace(dim, sun_to=towards(math.radians(height), azimuth), exposure=dim.exposure * exposure)
@@ -302,7 +302,7 @@ def _light(kind: str, random: np.random.Generator) -> Light:
         grey, _ = _GREY[kind]
         sky: Colour = (grey * 0.96, grey * 0.99, grey * 1.03)
         return Light(
-            sun_to=towards(math.radians(float(random.uniform(45, 75))), azimuth),
+            sun_to=towards(math.radians(random.uniform(45, 75)), azimuth),
             sun=(0.12, 0.12, 0.11),
             sky=(0.86 * grey + 0.16, 0.88 * grey + 0.16, 0.92 * grey + 0.16),
             ground=(0.3 * grey, 0.29 * grey, 0.28 * grey),
@@ -315,7 +315,7 @@ def _light(kind: str, random: np.random.Generator) -> Light:
     height, cloudy = float(random.uniform(9, 17) if kind == "low sun" else random.uniform(24, 66)), kind == "cloudy"
     low = math.exp(-height / 18.0)  # how golden the light is
     strength = 1.9 if cloudy else 2.5
-    blue = float(random.uniform(0.6, 1.0)) * (0.6 if cloudy else 1.0)
+    blue = random.uniform(0.6, 1.0) * (0.6 if cloudy else 1.0)
     return Light(
         sun_to=towards(math.radians(height), azimuth),
         sun=(strength, strength * (1 - 0.3 * low), strength * (0.94 - 0.55 * low)),
@@ -323,7 +323,7 @@ def _light(kind: str, random: np.random.Generator) -> Light:
         ground=(0.17, 0.16, 0.14),
         horizon=(0.64 - 0.12 * blue + 0.34 * low, 0.68 - 0.04 * blue + 0.02 * low, 0.8 - 0.3 * low),
         zenith=(0.5 - 0.42 * blue, 0.56 - 0.33 * blue, 0.68 + 0.02 * blue),
-        fog_m=float(random.uniform(320, 800)),
-        cloud=float(random.uniform(0.7, 1.0)) if cloudy else float(random.uniform(0, 0.45)),
+        fog_m=random.uniform(320, 800),
+        cloud=random.uniform(0.7, 1.0) if cloudy else random.uniform(0, 0.45),
         exposure=1.45 * exposure,
     )

@@ -333,7 +333,7 @@ def random_surroundings(random: np.random.Generator) -> tuple[str, Part, Sheet]:
     _, pattern, floors = _BACKDROPS[backdrop]
     name = pick(random, floors)
     colour, accent = _HILLS if backdrop == "hills" else pick(random, _WALLS)
-    side, bright, floor = 2 * DOME_M, float(random.uniform(0.85, 1.12)), _FLOORS[name]
+    side, bright, floor = 2 * DOME_M, random.uniform(0.85, 1.12), _FLOORS[name]
     dome = Part("sphere", (0, 0, 0), (-side, side, side), Paint(colour, accent, pattern), DropLabel.BACKGROUND)
     lit = replace(floor, colour=shaded(floor.colour, bright), accent=shaded(floor.accent, bright))
     return f"{name}, {backdrop}", dome, Sheet(square(DOME_M + 1.0, 0.0), lit, DropLabel.BACKGROUND)
@@ -342,11 +342,11 @@ def random_surroundings(random: np.random.Generator) -> tuple[str, Part, Sheet]:
 def random_light(random: np.random.Generator) -> Light:
     """A sun at some height, warmer when low, or a bright overcast sky."""
     overcast = random.random() < 0.2
-    height, round_ = float(random.uniform(math.radians(28), math.radians(72))), float(random.uniform(0, 2 * math.pi))
-    warm = float(random.uniform(0, 1)) * (1.1 - math.sin(height))
-    strength = 0.55 if overcast else float(random.uniform(1.3, 1.9))
-    fill = 0.85 if overcast else float(random.uniform(0.45, 0.62))
-    blue = 0.15 if overcast else float(random.uniform(0.4, 1.0))
+    height, round_ = random.uniform(math.radians(28), math.radians(72)), random.uniform(0, 2 * math.pi)
+    warm = random.uniform(0, 1) * (1.1 - math.sin(height))
+    strength = 0.55 if overcast else random.uniform(1.3, 1.9)
+    fill = 0.85 if overcast else random.uniform(0.45, 0.62)
+    blue = 0.15 if overcast else random.uniform(0.4, 1.0)
     return Light(
         sun_to=towards(height, round_),
         sun=(strength, strength * (1 - 0.3 * warm), strength * (0.95 - 0.6 * warm)),
@@ -354,7 +354,7 @@ def random_light(random: np.random.Generator) -> Light:
         ground=(0.5 * fill, 0.46 * fill, 0.42 * fill),
         horizon=(0.74 + 0.12 * warm, 0.77, 0.8 - 0.1 * warm),
         zenith=(0.62 - 0.42 * blue, 0.68 - 0.32 * blue, 0.8 - 0.02 * blue),
-        fog_m=float(random.uniform(70, 160)),
-        cloud=float(random.uniform(0.2, 0.9)),
-        exposure=float(random.uniform(1.35, 1.75)),
+        fog_m=random.uniform(70, 160),
+        cloud=random.uniform(0.2, 0.9),
+        exposure=random.uniform(1.35, 1.75),
     )

@@ -90,7 +90,7 @@ def random_setting(random: np.random.Generator) -> Setting:
             break
         first = len(placed) < 4
         thing = random_thing(random, 2 * OPEN_M - 0.022)
-        x, y = reachable_spot(random) if first else tuple(float(random.uniform(*span)) for span in _SPANS_M)
+        x, y = reachable_spot(random) if first else tuple(random.uniform(*span) for span in _SPANS_M)
         radius = thing.radius_m + (FINGER_ROOM_M - 0.02 if first else _GAP_M)
         others = [
             (math.hypot(x - each.place[0], y - each.place[1]), each.thing.radius_m) for each in (*placed, *clutter)
@@ -98,14 +98,14 @@ def random_setting(random: np.random.Generator) -> Setting:
         apart = math.hypot(x - BASE[0], y - BASE[1]) > 0.2 + radius
         if apart and all(away > radius + other for away, other in others):
             place = (x, y, thing.size[2] / 2 + _DROP_M)
-            placed.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-math.pi, math.pi))))
+            placed.append(Placed(thing=thing, place=place, yaw=random.uniform(-math.pi, math.pi)))
     return Setting(arm=arm, table=table, clutter=clutter, things=tuple(placed))
 
 
 def reachable_spot(random: np.random.Generator) -> tuple[float, float]:
     """A point of the table, x and y in metres, that the arm can grasp at from above."""
-    radius = float(random.uniform(REACH_M[0] + 0.02, REACH_M[1] - 0.02))
-    azimuth = float(random.uniform(-_WIDEST_AZIMUTH, _WIDEST_AZIMUTH))
+    radius = random.uniform(REACH_M[0] + 0.02, REACH_M[1] - 0.02)
+    azimuth = random.uniform(-_WIDEST_AZIMUTH, _WIDEST_AZIMUTH)
     return BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth)
 
 
@@ -121,8 +121,8 @@ def random_arm(random: np.random.Generator) -> str:
     from finger to finger.
     """
     shell, joint = pick(random, _LIVERIES)
-    upper, fore = float(random.uniform(0.33, 0.37)), float(random.uniform(0.30, 0.34))
-    r, (s, j) = 0.045 * float(random.uniform(0.9, 1.15)), (f'rgba="{a} {b} {c} 1"' for a, b, c in (shell, joint))
+    upper, fore = random.uniform(0.33, 0.37), random.uniform(0.30, 0.34)
+    r, (s, j) = 0.045 * random.uniform(0.9, 1.15), (f'rgba="{a} {b} {c} 1"' for a, b, c in (shell, joint))
     return f"""
 <body name="base" gravcomp="1">
   <geom class="arm" type="cylinder" size="{2.1 * r} 0.018" pos="0 0 0.018" {j}/>

@@ -94,9 +94,9 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     random = np.random.default_rng([seed, 0x7AB])
     setting = random_setting(random)
     model = build_model(setting)
-    drawn_s, speed = float(random.uniform(0, 1.4)), float(random.uniform(0.5, 0.9))
+    drawn_s, speed = random.uniform(0, 1.4), random.uniform(0.5, 0.9)
     motion = Simulation(model, setting.things, random, speed).run(frames, drawn_s if skipped_s is None else skipped_s)
-    world_from_table = _table_pose(float(random.uniform(-math.pi, math.pi)))
+    world_from_table = _table_pose(random.uniform(-math.pi, math.pi))
     walls, floor = room(random)
     verbs = {"lift": "pick up the {} and place it elsewhere", "push": "push the {} aside"}
     done = [verbs[name].format(setting.things[index].thing.name) for name, index in motion.tasks]
@@ -224,8 +224,8 @@ def room(random: np.random.Generator) -> tuple[list[Part], Sheet]:
         parts.append(Part("box", (x * _WALL, y * _WALL, middle), size, paint, TabletopClass.WALL))
     for side in range(4):  # cupboards, pictures and doors along the walls, so that the background tells where it is
         for along in np.arange(-0.75, 0.76, 0.5) + random.uniform(-0.12, 0.12, 4):
-            wide, deep, high = (float(random.uniform(*sides)) for sides in ((5, 11), (0.6, 4.5), (6, 22)))
-            red, green, blue = (float(random.uniform(0.2, most)) for most in (0.85, 0.8, 0.8))
+            wide, deep, high = (random.uniform(*sides) for sides in ((5, 11), (0.6, 4.5), (6, 22)))
+            red, green, blue = (random.uniform(0.2, most) for most in (0.85, 0.8, 0.8))
             lift, grey = 0.0 if deep > 1.5 else 8.0, 0.5 * (red + green)
             colour = ((red + grey) / 2, (green + grey) / 2, (blue + grey) / 2)
             pattern = pick(random, (Pattern.PLAIN, Pattern.WOOD, Pattern.STRIPES))
@@ -242,9 +242,9 @@ def room(random: np.random.Generator) -> tuple[list[Part], Sheet]:
 
 def random_light(random: np.random.Generator) -> Light:
     """A lamp high above, as parallel light, and the bright room around it."""
-    height, round_ = float(random.uniform(0.85, 1.35)), float(random.uniform(0, 2 * math.pi))
-    warm, strength = float(random.uniform(0.0, 0.3)), float(random.uniform(0.8, 1.5))
-    fill = float(random.uniform(0.55, 0.85))
+    height, round_ = random.uniform(0.85, 1.35), random.uniform(0, 2 * math.pi)
+    warm, strength = random.uniform(0.0, 0.3), random.uniform(0.8, 1.5)
+    fill = random.uniform(0.55, 0.85)
     return Light(
         sun_to=towards(height, round_),
         sun=(strength, strength * (1 - 0.4 * warm), strength * (1 - 0.8 * warm)),
@@ -254,5 +254,5 @@ def random_light(random: np.random.Generator) -> Light:
         zenith=(0.80, 0.80, 0.79),
         fog_m=4000.0,
         cloud=0.0,
-        exposure=float(random.uniform(1.1, 1.5)),
+        exposure=random.uniform(1.1, 1.5),
     )

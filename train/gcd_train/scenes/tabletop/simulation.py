@@ -252,10 +252,10 @@ class Simulation:
         above, grip = max(level + _ABOVE_M, 0.16), (x, y, level)
         natural = _natural_yaw(grip)
         if thing.any_yaw:
-            turn = natural + float(self._random.uniform(-0.4, 0.4))
+            turn = natural + self._random.uniform(-0.4, 0.4)
         else:  # fingers across the thing's y axis, with the least turn of the wrist
             turn = natural + (yaw - natural + math.pi / 2) % math.pi - math.pi / 2
-        lifted = level + float(self._random.uniform(0.10, 0.17))
+        lifted = level + self._random.uniform(0.10, 0.17)
         apart, to_x, to_y = max(FINGER_ROOM_M, thing.radius_m + 0.03), x, y
         for spot in [reachable_spot(self._random) for _ in range(40)]:  # near by, with room for the thing and the hand
             way = math.hypot(spot[0] - x, spot[1] - y)
@@ -263,7 +263,7 @@ class Simulation:
                 to_x, to_y = spot
                 break
         carried, down = (to_x, to_y, lifted), (to_x, to_y, level + 0.003)
-        turned = _natural_yaw(carried) + (turn - natural) * float(self._random.uniform(0, 1))
+        turned = _natural_yaw(carried) + (turn - natural) * self._random.uniform(0, 1)
         opening = min(1.0, (thing.size[1] / 2 + 0.018) / OPEN_M)
         return [
             Step("reach", (x, y, above), turn, opening, index),
