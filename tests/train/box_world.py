@@ -8,7 +8,7 @@ import numpy as np
 from gcd_train.data.files import SceneManifest, faults, read_manifest
 from gcd_train.errors import DataError
 from gcd_train.scenes.description import Light, Paint, Part, Pattern, Scene, SceneObject, Sheet, square, upright
-from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
+from gcd_train.scenes.drop.world import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld
 
 RED, GREEN = 9, 4

@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_train.scenes.description import Paint, Part, Scene
-from gcd_train.scenes.driving import FPS, ONTOLOGY, class_ids, driving_drive, driving_scene, vehicle_from_camera
-from gcd_train.scenes.driving.classes import Label, coarse
-from gcd_train.scenes.driving.flow import Crowd, RoadUser, random_drive
+from gcd_train.scenes.driving.classes import ONTOLOGY, Label, class_ids, coarse
+from gcd_train.scenes.driving.flow import FPS, Crowd, RoadUser, random_drive
 from gcd_train.scenes.driving.roads import random_street
 from gcd_train.scenes.driving.roadside import Plot
 from gcd_train.scenes.driving.vehicles import Lamps, random_bus
-from gcd_train.scenes.driving.world import random_weather, random_world
+from gcd_train.scenes.driving.world import (
+    driving_drive,
+    driving_scene,
+    random_weather,
+    random_world,
+    vehicle_from_camera,
+)
 from gcd_train.scenes.drop.things import outline
 
 SEEDS = (1, 6, 11)

@@ -12,9 +12,17 @@ from headless import drawn, needs_egl
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
 from gcd_train.scenes.description import Part, Scene, Tracks, rotations
-from gcd_train.scenes.drop import FPS, HFOV_DEG, DropLabel, drop_scene, orbit_cameras, world
-from gcd_train.scenes.drop.things import KINDS, bounds, outline, random_paint, random_thing
-from gcd_train.scenes.drop.world import DOME_M, UnsoundSceneError, require_sound
+from gcd_train.scenes.drop import world
+from gcd_train.scenes.drop.things import KINDS, DropLabel, bounds, outline, random_paint, random_thing
+from gcd_train.scenes.drop.world import (
+    DOME_M,
+    FPS,
+    HFOV_DEG,
+    UnsoundSceneError,
+    drop_scene,
+    orbit_cameras,
+    require_sound,
+)
 from gcd_train.scenes.primitives import CONVEX
 
 FRAMES = 18

@@ -16,7 +16,8 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.errors import DataError
-from gcd_train.scenes.driving import class_ids, driving_drive
+from gcd_train.scenes.driving.classes import class_ids
+from gcd_train.scenes.driving.world import driving_drive
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.scene_writer import SceneFormat, write_scene

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from gcd_train.cli.main import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError
-from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.pair_writer import generate, shard_path, write_shard
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.worlds import World, read_world

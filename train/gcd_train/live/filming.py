@@ -23,9 +23,9 @@ from gcd_train.live.clips import CAMERAS, Array, Poses, encode_depth
 from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.pointcloud.project import tangents
 from gcd_train.scenes.description import Scene, moved, rotations
-from gcd_train.scenes.driving import HFOV_DEG as _DRIVING_HFOV_DEG
-from gcd_train.scenes.driving import driving_scene, looking
-from gcd_train.scenes.drop import HFOV_DEG as _STAGE_HFOV_DEG
+from gcd_train.scenes.driving.world import HFOV_DEG as _DRIVING_HFOV_DEG
+from gcd_train.scenes.driving.world import driving_scene, looking
+from gcd_train.scenes.drop.world import HFOV_DEG as _STAGE_HFOV_DEG
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.worlds import scene_world

@@ -30,7 +30,7 @@ from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RenderError
 from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, agree, scene_world

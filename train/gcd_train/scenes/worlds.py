@@ -20,11 +20,12 @@ from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.files import write_whole
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.driving import EDITION, ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
-from gcd_train.scenes.driving import HFOV_DEG as DRIVING_HFOV_DEG
-from gcd_train.scenes.drop import HFOV_DEG as STAGE_HFOV_DEG
-from gcd_train.scenes.drop import drop_scene
-from gcd_train.scenes.tabletop import tabletop_scene
+from gcd_train.scenes.driving.classes import ONTOLOGY, OntologyItem
+from gcd_train.scenes.driving.world import EDITION, driving_drive, vehicle_from_camera
+from gcd_train.scenes.driving.world import HFOV_DEG as DRIVING_HFOV_DEG
+from gcd_train.scenes.drop.world import HFOV_DEG as STAGE_HFOV_DEG
+from gcd_train.scenes.drop.world import drop_scene
+from gcd_train.scenes.tabletop.scene import tabletop_scene
 
 Layout = Literal["kubric4d", "parallel_domain4d"]
 

@@ -35,7 +35,7 @@ from gcd_train.scenes.description import (
     with_world,
     yawed,
 )
-from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
+from gcd_train.scenes.drop.world import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.tabletop.arm import BASE, arm_links, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
 from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TableThing, TabletopClass
