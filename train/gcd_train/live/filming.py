@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+import torch
 from safetensors.numpy import save_file
 
-from gcd_model.geometry import CameraMount, Intrinsics, Spherical, path_progress, to_pose
+from gcd_model.geometry import CameraMount, Intrinsics, path_progress, sphere_poses
 from gcd_model.live.config import LIVE_CLASSES, SKY_M
 from gcd_train.errors import RecipeError, RenderError
 from gcd_train.files import whole
@@ -264,12 +265,9 @@ def _stage_draw(scene: Scene, world: LiveWorld, path: TargetPath, seed: int, ran
     floor = min((float(sheet.corners[..., 2].min()) for sheet in scene.sheets), default=0.0)
     for _ in range(_ATTEMPTS):
         first = int(random.integers(0, scene.frames - 1 - span + _STAGE_STRIDE))
-        start = Spherical(
-            azimuth_deg=random.uniform(0.0, 360.0),
-            elevation_deg=math.degrees(math.asin(random.uniform(0.03, math.sin(math.radians(50.0))))),
-            radius_m=random.uniform(11.0, 18.0),
-        )
-        source = np.tile(to_pose(start).numpy(), (FRAMES, 1, 1))
+        azimuth_deg, sine = random.uniform(0.0, 360.0), random.uniform(0.03, math.sin(math.radians(50.0)))
+        start = np.array([azimuth_deg, math.degrees(math.asin(sine)), random.uniform(11.0, 18.0)])
+        source = _on_sphere(np.tile(start, (FRAMES, 1)))
         if path == "mixed" and random.random() < 0.3:  # a camera that is carried
             source = _sphere_path(random, start, 25.0)
         small = path == "small" or (path == "mixed" and random.random() < 0.25)
@@ -285,39 +283,31 @@ def _stage_draw(scene: Scene, world: LiveWorld, path: TargetPath, seed: int, ran
     raise RenderError(f"{world} scene {seed}: no path leaves the cameras clear of all things; skip it")
 
 
-def _orbit(random: Random, start: Spherical, path: TargetPath) -> Poses:
+def _on_sphere(places: Array) -> Poses:
+    """Poses [T, 4, 4] at azimuth and elevation in degrees and radius, [T, 3]."""
+    return sphere_poses(torch.from_numpy(places)).numpy()
+
+
+def _orbit(random: Random, start: Array, path: TargetPath) -> Poses:
     """Orbits of up to 90 degrees from the source; in the training's mixture some stand and some jump."""
     most = 60.0 if path == "orbit60" else 90.0
-    if path == "mixed":
-        kind = random.choice(["gradual", "stands", "jumps"], p=[0.5, 0.3, 0.2])
-        if kind == "jumps":
-            return np.stack([to_pose(_goal(random, start, most)).numpy() for _ in range(FRAMES)])
-        if kind == "stands":
-            return np.tile(to_pose(_goal(random, start, most)).numpy(), (FRAMES, 1, 1))
-    return _sphere_path(random, start, most)
+    kind = random.choice(["gradual", "stands", "jumps"], p=[0.5, 0.3, 0.2]) if path == "mixed" else "gradual"
+    if kind == "gradual":
+        return _sphere_path(random, start, most)
+    goals = [_goal(random, start, most) for _ in range(FRAMES if kind == "jumps" else 1)]
+    return _on_sphere(np.broadcast_to(goals, (FRAMES, 3)).copy())
 
 
-def _sphere_path(random: Random, start: Spherical, most_deg: float) -> Poses:
+def _sphere_path(random: Random, start: Array, most_deg: float) -> Poses:
     change = _goal(random, start, most_deg) - start
-    places = [
-        Spherical(
-            azimuth_deg=start.azimuth_deg + share * change.azimuth_deg,
-            elevation_deg=start.elevation_deg + share * change.elevation_deg,
-            radius_m=start.radius_m + share * change.radius_m,
-        )
-        for share in np.arange(FRAMES) / (FRAMES - 1)
-    ]
-    return np.stack([to_pose(place).numpy() for place in places])
+    return _on_sphere(start + (np.arange(FRAMES) / (FRAMES - 1))[:, None] * change)
 
 
-def _goal(random: Random, start: Spherical, most_deg: float) -> Spherical:
+def _goal(random: Random, start: Array, most_deg: float) -> Array:
     side = random.choice([-1.0, 1.0])
-    return replace(
-        start,
-        azimuth_deg=start.azimuth_deg + float(side * random.uniform(10.0 if most_deg > 30 else 0.0, most_deg)),
-        elevation_deg=float(np.clip(start.elevation_deg + random.uniform(-30.0, 30.0), 1.0, 60.0)),
-        radius_m=float(np.clip(start.radius_m + random.uniform(-3.0, 3.0), 10.5, 18.0)),
-    )
+    azimuth_deg = start[0] + side * random.uniform(10.0 if most_deg > 30 else 0.0, most_deg)
+    elevation_deg = np.clip(start[1] + random.uniform(-30.0, 30.0), 1.0, 60.0)
+    return np.array([azimuth_deg, elevation_deg, np.clip(start[2] + random.uniform(-3.0, 3.0), 10.5, 18.0)])
 
 
 def _moved_little(random: Random, source: Poses, metres_a_unit: float) -> Poses:

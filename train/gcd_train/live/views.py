@@ -279,14 +279,8 @@ def mirrored(views: Views) -> Views:
     turned = {f.name: getattr(seen, f.name).flip(-1) for f in fields(seen) if f.name not in fixed}
     # x becomes -x in both cameras: rotation entries that mix x with another axis change sign, and so does the move in x
     signs = torch.tensor([1.0, -1, -1, -1, 1, 1, -1, 1, 1, -1, 1, 1], device=seen.camera.device)
-    return replace(
-        views,
-        seen=replace(seen, **turned, camera=seen.camera * signs),
-        target=views.target.flip(-1),
-        labels=views.labels.flip(-1),
-        log_depth=views.log_depth.flip(-1),
-        visibility=views.visibility.flip(-1),
-    )
+    truth = {name: getattr(views, name).flip(-1) for name in ("target", "labels", "log_depth", "visibility")}
+    return replace(views, seen=replace(seen, **turned, camera=seen.camera * signs), **truth)
 
 
 @torch.no_grad()

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.files import (
     GEOMETRY,
     MANIFEST,
@@ -62,7 +63,8 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
         RenderError: nothing can be drawn on this machine.
         OSError: the disk is full, or cannot be written.
     """
-    place = root / world.scene_name(seed)
+    names = kubric4d if world.layout == "kubric4d" else parallel_domain4d
+    place = root / names.scene_name(seed)
     header: dict[str, Any] = {
         "layout": world.layout,
         "world": world.name,

@@ -50,11 +50,6 @@ class SceneWorld:
     classes: tuple[OntologyItem, ...] = ()
     vehicle_from_camera: Callable[[], dict[str, NDArray[np.float64]]] | None = None
 
-    def scene_name(self, seed: int) -> str:
-        """The folder in which the scene of a seed lies: its number is the seed."""
-        names = kubric4d if self.layout == "kubric4d" else parallel_domain4d
-        return names.scene_name(seed)
-
 
 SCENE_WORLDS: dict[str, SceneWorld] = {
     "drop": SceneWorld(name="drop", make=drop_scene),
