@@ -22,7 +22,7 @@ needs_egl = pytest.mark.skipif(
 )
 
 
-def drawn(scene: Scene, width: int, height: int, oversample: int = 1) -> dict[str, list[Rendering]]:
-    """By camera, at every time step."""
+def drawn(scene: Scene, width: int, height: int, oversample: int = 1) -> dict[str, Rendering]:
+    """By camera, at all time steps."""
     with Renderer(width, height, oversample=oversample) as renderer:
         return renderer.render(freeze(scene), scene.cameras)

@@ -230,10 +230,10 @@ def test_the_own_car_looks_the_same_in_every_scene() -> None:
 def test_the_forward_camera_sees_the_road_and_the_top_down_one_its_own_car() -> None:
     scene = driving_drive(11, frames=1)
     views = drawn(scene, 96, 72)
-    assert Label.OWN_CAR not in views["yaw-0"][0].classes
-    assert {Label.ROAD, Label.SKY} <= set(np.unique(views["yaw-0"][0].classes).tolist())
-    assert {Label.ROAD, Label.OWN_CAR} <= set(np.unique(views["camera0"][0].classes).tolist())
-    assert all(view[0].depth.max() > 5.0 for view in views.values())
+    assert Label.OWN_CAR not in views["yaw-0"].classes
+    assert {Label.ROAD, Label.SKY} <= set(np.unique(views["yaw-0"].classes).tolist())
+    assert {Label.ROAD, Label.OWN_CAR} <= set(np.unique(views["camera0"].classes).tolist())
+    assert all(view.depth.max() > 5.0 for view in views.values())
 
 
 def _inside(parts: list[Part], points: NDArray[np.float64]) -> NDArray[np.bool_]:

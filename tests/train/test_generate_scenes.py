@@ -130,14 +130,14 @@ class TestWriteScene:
 
     def test_pictures_are_those_of_the_renderer_and_of_the_kept_geometry(self, tmp_path: Path) -> None:
         folder, cameras = write_scene(tmp_path, box_world(), FORM, 0).folder, box_scene(0, 2).cameras
-        picture = drawn(box_scene(0, 2), 48, 32)["view1"][1]
+        picture = drawn(box_scene(0, 2), 48, 32)["view1"]
         with Renderer(48, 32, oversample=1) as renderer:
             again = [view for _, _, view in renderer.views(FrozenScene.load(folder / GEOMETRY), cameras)][-1]
         rgba = cv2.imread(str(kubric4d.frame_path(folder, "view1", "rgba", 1)), cv2.IMREAD_UNCHANGED)
         assert rgba is not None
-        np.testing.assert_array_equal(rgba[..., 2::-1], picture.rgb)
-        np.testing.assert_array_equal(again.rgb, picture.rgb)
-        assert {0, 4, 9} == set(np.unique(picture.instances).tolist()), "the picture shows ground, both boxes"
+        np.testing.assert_array_equal(rgba[..., 2::-1], picture.rgb[1])
+        np.testing.assert_array_equal(again.rgb, picture.rgb[1])
+        assert {0, 4, 9} == set(np.unique(picture.instances[1]).tolist()), "the picture shows ground, both boxes"
 
     def test_a_scene_that_is_there_is_kept_and_one_of_another_kind_refused(self, tmp_path: Path) -> None:
         manifest = write_scene(tmp_path, box_world(), FORM, 0).folder / MANIFEST

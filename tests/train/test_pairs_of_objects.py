@@ -83,8 +83,8 @@ def test_a_clip_shows_its_time_steps_from_its_cameras(folder: Path) -> None:
     clip, numbers = clips[4], list(clips.orbit(4).frame_numbers)
     scene = stage(1, STAGE.frames)
     cut = replace(scene, poses=scene.poses[numbers], focus=scene.focus[numbers], cameras=told(clips, 4))
-    for name, frames in drawn(cut, 48, 32).items():
-        apart = getattr(clip, name).astype(int) - np.stack([frame.rgb for frame in frames])
+    for name, view in drawn(cut, 48, 32).items():
+        apart = getattr(clip, name).astype(int) - view.rgb
         assert np.abs(apart).mean() < 0.05  # poses on disk are rounded
         assert getattr(clip, f"{name}_instances").max() == 7
         assert not getattr(clip, f"{name}_classes").any()

@@ -30,14 +30,11 @@ def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
     assert (len(clips), clips.frames, clips.height, clips.width, clips.fps) == (3, 2, 32, 48, 10.0)
     clip = clips[2]
     assert clip.seed == 2
-    for name, frames in drawn(driving_scene(2, frames=2), 48, 32).items():
-        np.testing.assert_array_equal(getattr(clip, name), np.stack([frame.rgb for frame in frames]))
-        np.testing.assert_array_equal(getattr(clip, f"{name}_classes"), np.stack([frame.classes for frame in frames]))
-        np.testing.assert_array_equal(
-            getattr(clip, f"{name}_instances"), np.stack([frame.instances for frame in frames])
-        )
-        depth = np.stack([frame.depth for frame in frames])
-        np.testing.assert_allclose(getattr(clip, f"{name}_depth"), depth.clip(0, 255.99), atol=1 / 256)
+    for name, view in drawn(driving_scene(2, frames=2), 48, 32).items():
+        np.testing.assert_array_equal(getattr(clip, name), view.rgb)
+        np.testing.assert_array_equal(getattr(clip, f"{name}_classes"), view.classes)
+        np.testing.assert_array_equal(getattr(clip, f"{name}_instances"), view.instances)
+        np.testing.assert_allclose(getattr(clip, f"{name}_depth"), view.depth.clip(0, 255.99), atol=1 / 256)
 
 
 @needs_egl

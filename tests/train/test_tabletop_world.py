@@ -130,7 +130,7 @@ def test_arm_and_gripper_and_things_are_seen() -> None:
     scene = episode(0).scene
     cameras = {name: scene.cameras[name][:1] for name in ("view0", "view4", "view9")}
     short = replace(scene, poses=scene.poses[:1], focus=scene.focus[:1], cameras=cameras)
-    views = [view for (view,) in drawn(short, 96, 64).values()]
+    views = drawn(short, 96, 64).values()
     seen = set(np.unique(np.stack([view.classes for view in views])).tolist())
     wanted = set(TabletopClass) - {TabletopClass.SKY}
     assert seen >= wanted

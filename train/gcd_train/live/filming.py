@@ -128,19 +128,18 @@ def _film(renderer: Renderer, scene: Scene, draw: LiveDraw, world: LiveWorld) ->
     step = np.abs(np.diff(cut.poses, axis=0)).max((-1, -2)) > _STANDS_M  # [T-1, B]
     moves = np.pad(step, ((1, 0), (0, 0))) | np.pad(step, ((0, 1), (0, 0)))  # since the frame before, or until the next
     arrays: dict[str, Array] = {}
-    for name, frames in views.items():
+    for name, view in views.items():
         metric = draw.cameras[name].copy()
         metric[:, :3, 3] *= unit
-        bodies = np.stack([frame.bodies for frame in frames])
         arrays |= {
-            f"{name}.rgb": np.stack([frame.rgb for frame in frames]),
-            f"{name}.depth": encode_depth(np.stack([frame.depth for frame in frames]) * unit),
-            f"{name}.labels": labels[np.stack([frame.classes for frame in frames])],
-            f"{name}.instances": np.stack([frame.instances for frame in frames]),
-            f"{name}.moves": moves[np.arange(len(frames))[:, None, None], bodies].astype(np.uint8),
+            f"{name}.rgb": view.rgb,
+            f"{name}.depth": encode_depth(view.depth * unit),
+            f"{name}.labels": labels[view.classes],
+            f"{name}.instances": view.instances,
+            f"{name}.moves": moves[np.arange(FRAMES)[:, None, None], view.bodies].astype(np.uint8),
             f"{name}.pose": metric,
         }
-    height, width = views["target"][0].depth.shape
+    _, height, width = views["target"].depth.shape
     lenses = {name: Intrinsics.from_hfov(angle, width, height) for name, angle in draw.hfov_deg.items()}
     arrays["target.visibility"] = visibility(views, draw.cameras, lenses, cut.poses, SKY_M / unit)
     if (arrays["source.depth"] > 0).mean() < 0.05:
@@ -149,7 +148,7 @@ def _film(renderer: Renderer, scene: Scene, draw: LiveDraw, world: LiveWorld) ->
 
 
 def visibility(
-    views: dict[str, list[Rendering]],
+    views: dict[str, Rendering],
     cameras: dict[str, Poses],
     lenses: dict[str, Intrinsics],
     bodies: Array,
@@ -159,14 +158,14 @@ def visibility(
 
     A point counts as seen where the source's depth at its place is no nearer than the point itself.
     """
-    depths = {name: [np.where(view.depth > 0, view.depth, np.float32(sky)) for view in views[name]] for name in CAMERAS}
+    depths = {name: np.where(view.depth > 0, view.depth, np.float32(sky)) for name, view in views.items()}
     right, down = np.meshgrid(*tangents(lenses["target"], 0.5))
     rays = np.stack([right, down, np.ones_like(right)], axis=-1)  # [H, W, 3]
     states = np.zeros((len(depths["target"]), rays[..., 0].size), np.uint8)
     for t, (depth, pose) in enumerate(zip(depths["target"], cameras["target"], strict=True)):
         points = moved(pose, (rays * depth[..., None]).reshape(-1, 3))
         states[t] = 2 * _seen(points, cameras["source"][t], lenses["source"], depths["source"][t])
-        owner = views["target"][t].bodies.reshape(-1)
+        owner = views["target"].bodies[t].reshape(-1)
         for before in range(t - 1, -1, -1):
             still = np.abs(bodies[before : t + 1] - bodies[t]).max((0, 2, 3)) <= _STANDS_M  # [B]
             asked = np.flatnonzero((states[t] == 0) & still[owner])

@@ -32,7 +32,7 @@ from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.frozen import freeze
-from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.renderer import Renderer, Rendering, stacked
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, agree, scene_world
 
 _ABANDONED_S = 3600.0  # no shard takes so long
@@ -108,19 +108,18 @@ def write_shard(out: Path, world: World, seeds: range) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def _strips(views: dict[str, list[Rendering]], *, classes: bool) -> Iterator[tuple[str, NDArray[Any]]]:
-    for camera, frames in views.items():
-        depth = np.concatenate([frame.depth for frame in frames])
-        yield f"{camera}.rgb", np.concatenate([frame.rgb for frame in frames])[..., ::-1]
-        yield f"{camera}.depth", np.rint(depth / DEPTH_UNIT_M).clip(0, 65535).astype(np.uint16)
-        yield f"{camera}.instances", np.concatenate([frame.instances for frame in frames])
+def _strips(views: dict[str, Rendering], *, classes: bool) -> Iterator[tuple[str, NDArray[Any]]]:
+    for camera, view in views.items():
+        depth = np.rint(view.depth / DEPTH_UNIT_M).clip(0, 65535).astype(np.uint16)
+        strips = {"rgb": view.rgb[..., ::-1], "depth": depth, "instances": view.instances}
         if classes:
-            yield f"{camera}.classes", np.concatenate([frame.classes for frame in frames])
+            strips["classes"] = view.classes
+        yield from ((f"{camera}.{kind}", strip.reshape(-1, *strip.shape[2:])) for kind, strip in strips.items())
 
 
 def _drawn_clips(
     renderer: Renderer, world: World, scene_seed: int, seeds: list[int]
-) -> Iterator[tuple[int, dict[str, Any], dict[str, list[Rendering]]]]:
+) -> Iterator[tuple[int, dict[str, Any], dict[str, Rendering]]]:
     """Number, metadata and views of clips of a scene, in one pass: their time steps follow each other, so it is
     simulated and sent to the renderer once.
 
@@ -144,9 +143,7 @@ def _drawn_clips(
     with closing(renderer.views(cut, cameras)) as drawn:
         for clip, seed in enumerate(seeds):
             steps = slice(clip * world.frames, (clip + 1) * world.frames)
-            views: dict[str, list[Rendering]] = {name: [] for name in cameras}
-            for _, name, view in islice(drawn, len(cameras) * world.frames):
-                views[name].append(view)
+            views = stacked(islice(drawn, len(cameras) * world.frames))
             poses = {name: np.round(rows[steps], 6).tolist() for name, rows in cameras.items()}
             facts: dict[str, Any] = {"facts": {**scene.facts, "hfov_deg": cut.hfov_deg}, "world_from_camera": poses}
             if draws:

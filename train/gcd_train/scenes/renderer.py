@@ -5,8 +5,8 @@ one call per way of painting (`shaders`), which is a handful. Works on software 
 """
 
 import math
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, Self
 
@@ -74,7 +74,7 @@ class Rendering:
     """One view of one time step.
 
     rgb: u8 [H, W, 3]. depth: f32 [H, W], metres along the optical axis, 0 where there is only sky.
-    classes, instances, bodies: u8 [H, W]; bodies index `Scene.poses`.
+    classes, instances, bodies: u8 [H, W]; bodies index `Scene.poses`. Of several time steps all are [T, ...].
     """
 
     rgb: NDArray[np.uint8]
@@ -148,12 +148,9 @@ class Renderer:
 
     def render(
         self, scene: FrozenScene, cameras: Mapping[str, Doubles], hfov_deg: Mapping[str, float] | None = None
-    ) -> dict[str, list[Rendering]]:
-        """All views of every camera, see `views`."""
-        made: dict[str, list[Rendering]] = {name: [] for name in cameras}
-        for _, name, view in self.views(scene, cameras, hfov_deg):
-            made[name].append(view)
-        return made
+    ) -> dict[str, Rendering]:
+        """Every camera's views of all time steps, [T, ...]; see `views`."""
+        return stacked(self.views(scene, cameras, hfov_deg))
 
     def _program(self, vertex: str, fragment: str) -> Any:
         program = self._context.program(vertex_shader=vertex, fragment_shader=fragment)
@@ -231,6 +228,18 @@ class Renderer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def stacked(views: Iterable[tuple[int, str, Rendering]]) -> dict[str, Rendering]:
+    """Each camera's views in their order as one, [T, ...], of what `Renderer.views` gives."""
+    each: dict[str, list[Rendering]] = {}
+    for _, name, view in views:
+        each.setdefault(name, []).append(view)
+    names = [field.name for field in fields(Rendering)]
+    return {
+        camera: Rendering(**{name: np.stack([getattr(view, name) for view in some]) for name in names})
+        for camera, some in each.items()
+    }
 
 
 @cache
