@@ -17,13 +17,13 @@ from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.worlds import (
     SCENE_WORLDS,
     CameraWay,
-    PairForm,
+    SceneFormat,
     agree,
     pair_world,
 )
 from gcd_train.training.setup import family_of, model_config
 
-FORM = PairForm(width=48, height=32, frames=3, oversample=1)
+FORM = SceneFormat(width=48, height=32, frames=3, oversample=1)
 
 
 def folder(place: Path, path: CameraWay, first_seed: int = 0) -> Path:

@@ -29,8 +29,8 @@ from gcd_train.scenes import scene_writer
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import FrozenScene
 from gcd_train.scenes.renderer import Renderer, Rendering
-from gcd_train.scenes.scene_writer import GIVE_UP_AFTER, SceneFormat, generate_scenes, write_scene
-from gcd_train.scenes.worlds import SCENE_WORLDS
+from gcd_train.scenes.scene_writer import GIVE_UP_AFTER, generate_scenes, write_scene
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)
 

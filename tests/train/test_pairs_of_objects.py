@@ -26,7 +26,7 @@ from gcd_train.scenes.description import Scene
 from gcd_train.scenes.pair_writer import orbit_draw, write_shard
 from gcd_train.scenes.worlds import (
     SCENE_WORLDS,
-    PairForm,
+    SceneFormat,
     World,
     agree,
     pair_world,
@@ -42,7 +42,7 @@ def stage(seed: int, frames: int) -> Scene:
 
 
 STAGE = replace(FAST_STAGE, make=stage)
-TINY = PairForm(width=48, height=32, frames=3, oversample=1)
+TINY = SceneFormat(width=48, height=32, frames=3, oversample=1)
 ORBITS = pair_world(STAGE, TINY)
 
 
@@ -217,8 +217,8 @@ def with_thing(scene: Scene, at: tuple[float, float, float], side: float = 2.0) 
 
 def test_worlds_that_give_no_such_clips_are_refused() -> None:
     with pytest.raises(RecipeError, match="up to 30"):
-        pair_world(STAGE, PairForm(frames=40))
-    assert pair_world(STAGE, PairForm(frames=30)).frames == 30
+        pair_world(STAGE, SceneFormat(frames=40))
+    assert pair_world(STAGE, SceneFormat(frames=30)).frames == 30
 
 
 def test_a_world_that_is_none_is_refused() -> None:
@@ -243,9 +243,9 @@ def test_the_command_makes_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_folder_of_another_edition_has_another_origin(tmp_path: Path) -> None:
-    agree(tmp_path, pair_world(SCENE_WORLDS["driving"], PairForm()))
+    agree(tmp_path, pair_world(SCENE_WORLDS["driving"], SceneFormat()))
     world = read_world(tmp_path)
-    assert world == pair_world(SCENE_WORLDS["driving"], PairForm())
+    assert world == pair_world(SCENE_WORLDS["driving"], SceneFormat())
     clips = PairedClips((world,), ((tmp_path, "00000000"),))
     assert (clips.camera, clips.mount, clips.scene(0)) == ("none", CameraMount(), ("driving", 0))
     grown = PairedClips((msgspec.structs.replace(world, edition=world.edition + 1),), clips.places)

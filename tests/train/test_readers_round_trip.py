@@ -20,8 +20,8 @@ from gcd_train.scenes.driving.classes import class_ids
 from gcd_train.scenes.driving.world import driving_drive
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
-from gcd_train.scenes.scene_writer import SceneFormat, write_scene
-from gcd_train.scenes.worlds import SCENE_WORLDS
+from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 SEED, FRAMES, WIDTH, HEIGHT = 3, 2, 48, 36
 CLIP = FrameSampling(clip=2, reach_last=True)

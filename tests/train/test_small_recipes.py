@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 from gcd_model import load_synthesizer
 from gcd_train.cli.main import app
 from gcd_train.recipe_files import load_recipe, packaged_recipes
-from gcd_train.scenes.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.worlds import SceneFormat
 
 TINY: dict[str, object] = {
     "model.frames": 3,

@@ -10,11 +10,11 @@ from gcd_train.cli.common import Ray, errors_shown, progress_bar, say, stop_as_b
 from gcd_train.errors import RecipeError
 from gcd_train.live.filming import LIVE_SCENES, WORLDS, LiveWorld, TargetPath, generate_live
 from gcd_train.scenes.pair_writer import generate
-from gcd_train.scenes.scene_writer import SceneFormat, SceneRun, generate_scenes
+from gcd_train.scenes.scene_writer import SceneRun, generate_scenes
 from gcd_train.scenes.worlds import (
     SCENE_WORLDS,
     CameraWay,
-    PairForm,
+    SceneFormat,
     SceneWorld,
     WorldOptions,
     pair_world,
@@ -93,8 +93,8 @@ def _add(world: SceneWorld, about: str, *, clips_a_scene: int, clips_a_shard: in
                 raise RecipeError(
                     "--scenes and --compact make whole scenes; --clips, --pairs, a mount and a path pairs; give one"
                 )
-            pair = PairForm(clips_per_shard=clips_per_shard, **given)
-            made = pair_world(world, pair, mount=mount, path=path, clips_per_scene=clips_per_scene)
+            shards = {"clips_per_scene": clips_per_scene, "clips_per_shard": clips_per_shard}
+            made = pair_world(world, SceneFormat(**given), mount=mount, path=path, **shards)
             first = first_seed * made.clips_per_scene
             seeds = range(first, first + (clips or 100))
             with progress_bar("clips", len(seeds), keep=True) as show:

@@ -28,21 +28,10 @@ from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, require_drawing
-from gcd_train.scenes.worlds import SceneWorld
+from gcd_train.scenes.worlds import SceneFormat, SceneWorld
 
 GIVE_UP_AFTER = 5
 """Failures in a row after which a run stops: the disk is full, or nothing can be drawn."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneFormat:
-    """How scenes are drawn and stored. oversample: see `Renderer`. compact: WebP and depth codes."""
-
-    width: int
-    height: int
-    frames: int
-    oversample: int = 2
-    compact: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -3,7 +3,7 @@ about itself, and how its clips are numbered.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -74,6 +74,20 @@ def scene_world(name: str) -> SceneWorld:
     if name not in SCENE_WORLDS:
         raise RecipeError(f"there is no world {name!r}; choose one of {', '.join(SCENE_WORLDS)}")
     return SCENE_WORLDS[name]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneFormat:
+    """How scenes and pairs are drawn and stored; by default as pairs are.
+
+    width, height: pixels. oversample: see `Renderer`. compact: of scenes, WebP and depth codes.
+    """
+
+    width: int = 192
+    height: int = 128
+    frames: int = 14
+    oversample: int = 2
+    compact: bool = False
 
 
 # pairs of clips
@@ -148,21 +162,11 @@ class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return seed // self.clips_per_scene
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PairForm:
-    """How pairs of clips are drawn and stored. width, height: pixels. oversample: see Renderer."""
-
-    width: int = 192
-    height: int = 128
-    frames: int = 14
-    oversample: int = 2
-    clips_per_shard: int = 8
-
-
 def pair_world(
     scenes: SceneWorld,
-    form: PairForm,
+    form: SceneFormat,
     *,
+    clips_per_shard: int = 8,
     mount: WorldOptions = _MOUNT,
     path: CameraWay = "gradual",
     clips_per_scene: int = 3,
@@ -177,7 +181,8 @@ def pair_world(
         PoseError: that is no mount.
         RecipeError: the scenes are too short for such clips.
     """
-    shared: dict[str, Any] = {"name": scenes.name, "edition": scenes.edition, **asdict(form)}
+    shared: dict[str, Any] = {"name": scenes.name, "edition": scenes.edition, "clips_per_shard": clips_per_shard}
+    shared |= {name: getattr(form, name) for name in ("width", "height", "frames", "oversample")}
     if scenes.layout == "parallel_domain4d":
         CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
         return World(**shared, fps=scenes.fps, hfov_deg=DRIVING_HFOV_DEG, options=mount, path=path)
