@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -83,7 +83,7 @@ def _add(world: SceneWorld, about: str, *, clips_a_scene: int, clips_a_shard: in
                 raise RecipeError("a pair of driving has a simulation of its own; leave out --clips-per-scene")
             stop_as_by_ctrl_c()
             size = {"width": width, "height": height, "frames": frames, "oversample": oversample}
-            given = {name: number for name, number in size.items() if number is not None}
+            given: dict[str, Any] = {name: number for name, number in size.items() if number is not None}
             if not (pairs or mounted or clips is not None):
                 published = {"width": world.width, "height": world.height, "frames": world.frames}
                 form = SceneFormat(compact=compact, **{**published, **given})
