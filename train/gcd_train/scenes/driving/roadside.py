@@ -90,9 +90,7 @@ class Plot:
     street: Street
     cameras: Doubles
     things: list[tuple[Part, ...]] = field(default_factory=list[tuple[Part, ...]])
-    lamps: list[tuple[tuple[float, float, float], float]] = field(
-        default_factory=list[tuple[tuple[float, float, float], float]]
-    )
+    lamps: list[tuple[float, float, float, float]] = field(default_factory=list[tuple[float, float, float, float]])
     _taken: list[Footprints] = field(default_factory=list[Footprints])
     _roads: Footprints = field(init=False)
     _lanes: Footprints = field(init=False)
@@ -143,11 +141,11 @@ def furnish(plot: Plot, district: District, paved: bool, lit: bool, green: bool,
     """
     grey = tone(random, (0.33, 0.35, 0.36), 0.3)
     if random.random() >= 0.25:
-        signals = [(road, crossing) for road in plot.street.roads for crossing in road.crossings]
-        for road, crossing, side, kerb in ((*each, *side) for each in signals for side in each[0].sides):
-            at = crossing.at_m + side * (crossing.half_m + _CLEAR_M + 3.2)
-            shown = things.signal(green if road is plot.street.main else not green, grey)
-            plot.put(road.put(shown, at, side * (kerb + 0.6), 0.0 if side < 0 else np.pi), on_pavement=True)
+        for road, crossing in [(each, crossing) for each in plot.street.roads for crossing in each.crossings]:
+            for side, kerb in road.sides:
+                at = crossing.at_m + side * (crossing.half_m + _CLEAR_M + 3.2)
+                shown = things.signal(green if road is plot.street.main else not green, grey)
+                plot.put(road.put(shown, at, side * (kerb + 0.6), 0.0 if side < 0 else np.pi), on_pavement=True)
     sides = [(road, side, kerb) for road in plot.street.roads for side, kerb in road.sides]
     for road, side, kerb in sides:
         every, height = random.uniform(22, 38), random.uniform(5.8, 8.5)
@@ -156,7 +154,7 @@ def furnish(plot: Plot, district: District, paved: bool, lit: bool, green: bool,
             lamp = road.put(things.street_lamp(height, side, grey, lit), s, side * (kerb + 0.5))
             # its arm reaches over the road
             if road.is_free(s, _CLEAR_M + 1.0) and plot.put(lamp, on_pavement=True, on_foot=True):
-                plot.lamps.append((road.at(s, side * (kerb + 0.5 - 2.0)), s))
+                plot.lamps.append((*road.at(s, side * (kerb + 0.5 - 2.0)), s))
     for side in sides:
         _houses(plot, side, district, paved, lit, random)
     for side in sides:

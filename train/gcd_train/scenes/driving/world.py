@@ -135,7 +135,7 @@ def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
     asphalt = next(sheet.paint.colour for sheet in sheets if sheet.label == Label.ROAD)
     parts = [_SKY, *(part for thing in plot.things for part in thing)]
     if weather.dark:
-        spots = [spot for spot, s in plot.lamps if abs(s) < _POOLS_M]
+        spots = [(x, y, heading) for x, y, heading, s in plot.lamps if abs(s) < _POOLS_M]
         sheets += lamp_pools(spots, asphalt, 0.9 if weather.kind == "night" else 0.3)
         parts += [part for thing in plot.things for part in lit_windows(thing, standing)]
     users, bodies = _users(crowd.users)
