@@ -205,30 +205,38 @@ class SceneObject(Thing):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Scene:
-    """One clip's world.
+class Staging:
+    """What the renderer needs of a scene beside what there is.
 
-    parts, sheets: what there is. poses: [T, B, 3, 4], world_from_body of each body at each time step; body 0 stands at
-    the origin (see `upright`). focus: [T, 3], the point around which shadows are cast. cameras: name ->
-    world_from_camera [T, 4, 4] (x right, y down, z ahead). hfov_deg: of every camera. objects: what more is told of
-    things, where a world knows more. facts: what the metadata says about the whole scene.
+    poses: [T, B, 3, 4], world_from_body of each body at each time step; body 0 stands at the origin (see `upright`).
+    focus: [T, 3], the point around which shadows are cast. hfov_deg: of every camera.
     """
 
-    parts: tuple[Part, ...]
-    sheets: tuple[Sheet, ...]
     poses: Floats
     focus: Floats
-    cameras: dict[str, Doubles]
     hfov_deg: float
     light: Light
-    facts: dict[str, float | str] = field(default_factory=dict[str, float | str])
-    objects: tuple[SceneObject, ...] = ()
     extent: Extent = STREET
 
     @property
     def frames(self) -> int:
         """T."""
         return self.poses.shape[0]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Scene(Staging):
+    """One clip's world.
+
+    parts, sheets: what there is. cameras: name -> world_from_camera [T, 4, 4] (x right, y down, z ahead). objects: what
+    more is told of things, where a world knows more. facts: what the metadata says about the whole scene.
+    """
+
+    parts: tuple[Part, ...]
+    sheets: tuple[Sheet, ...]
+    cameras: dict[str, Doubles]
+    facts: dict[str, float | str] = field(default_factory=dict[str, float | str])
+    objects: tuple[SceneObject, ...] = ()
 
     def clear_of_things(self, eyes: Doubles, steps: Sequence[int]) -> bool:
         """Whether cameras at `eyes` [C, S, 3] at time steps [S] keep a unit away from the sphere about any thing.

@@ -5,7 +5,7 @@ anything again.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import groupby, pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -20,14 +20,13 @@ from gcd_train.data.files import read_npz
 from gcd_train.errors import DataError
 from gcd_train.scenes.description import (
     DOMES,
-    STREET,
     Extent,
-    Floats,
     Light,
     Paint,
     Part,
     Pattern,
     Scene,
+    Staging,
     rotations,
     upright,
 )
@@ -55,23 +54,10 @@ class _Facts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class FrozenScene:
-    """What the renderer needs.
-
-    vertices: [N] of `VERTEX`, three in a row are a triangle, in their bodies' frames. The rest as in `Scene`.
-    """
+class FrozenScene(Staging):
+    """What the renderer needs. vertices: [N] of `VERTEX`, three in a row are a triangle, in their bodies' frames."""
 
     vertices: Vertices
-    poses: Floats
-    focus: Floats
-    hfov_deg: float
-    light: Light
-    extent: Extent = STREET
-
-    @property
-    def frames(self) -> int:
-        """T."""
-        return self.poses.shape[0]
 
     def save(self, file: BinaryIO) -> None:
         """Write it as a compressed npz."""
@@ -102,14 +88,8 @@ class FrozenScene:
 
 def freeze(scene: Scene) -> FrozenScene:
     """A scene's triangles and motion, without its cameras."""
-    return FrozenScene(
-        vertices=vertices_of(scene),
-        poses=scene.poses,
-        focus=scene.focus,
-        hfov_deg=scene.hfov_deg,
-        light=scene.light,
-        extent=scene.extent,
-    )
+    staging = {each.name: getattr(scene, each.name) for each in fields(Staging)}
+    return FrozenScene(vertices=vertices_of(scene), **staging)
 
 
 def vertices_of(scene: Scene) -> Vertices:
