@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gcd_model.geometry import Intrinsics
@@ -26,7 +26,6 @@ from gcd_model.loading import default_precision
 from gcd_train.data.sample import to_network
 from gcd_train.evaluation.metrics import class_iou
 from gcd_train.live.clips import Cameras, LiveClip, TrainingClips, decode_depth, evenly, read_clip, tensor_of
-from gcd_train.training.loop import Task
 
 Random = np.random.Generator
 Record = TypeVar("Record")
@@ -305,11 +304,3 @@ def joined(parts: Sequence[Record]) -> Record:
 def some_of(batch: Record, cut: slice) -> Record:
     """Some pictures of a record of them."""
     return _mapped(itemgetter(cut), batch)
-
-
-class LiveTask(Task):
-    """What all stages' tasks have in common."""
-
-    def __init__(self, net: nn.Module, config: LiveConfig) -> None:
-        super().__init__(net)
-        self._config, self._device = config, next(net.parameters()).device

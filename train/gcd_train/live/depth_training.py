@@ -15,7 +15,6 @@ from gcd_train.evaluation.metrics import confusion_matrix
 from gcd_train.live.batches import (
     PART_SEED,
     FrameBatches,
-    LiveTask,
     Pictures,
     autocast,
     class_figures,
@@ -28,7 +27,7 @@ from gcd_train.live.batches import (
 )
 from gcd_train.live.clips import TrainingClips, evenly, read_clip
 from gcd_train.live.recipe import LiveStage
-from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.monitor import write_sheet
 
 _CLASS_POWER = -0.25
@@ -41,7 +40,7 @@ THIN = ("person", "pole", "cyclist", "object")
 _MEASURED_FRAMES, _JUMP = (3, 10), 0.15
 
 
-class DepthTask(LiveTask):
+class DepthTask(Task):
     """Trains a DepthNet on single frames."""
 
     def __init__(
@@ -53,7 +52,8 @@ class DepthTask(LiveTask):
         stage: LiveStage,
         seed: int,
     ) -> None:
-        super().__init__(net, config)
+        super().__init__(net)
+        self._config, self._device = config, next(net.parameters()).device
         self._net, self._held_out, self._small_share = net, held_out, stage.small_share
         self._batches = [FrameBatches(clips, stage.batch, seed + part * PART_SEED) for part in range(stage.parts)]
         self._class_weights = class_weights(clips.paths, config, _CLASS_POWER).to(self._device)

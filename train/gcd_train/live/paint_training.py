@@ -21,10 +21,10 @@ from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.painter import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import LiveTask, Random, autocast, class_figures, class_weights, generator_on, on
+from gcd_train.live.batches import Random, autocast, class_figures, class_weights, generator_on, on
 from gcd_train.live.clips import STATES
 from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of
-from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.losses import gradient_l1, ssim
 from gcd_train.training.monitor import write_sheet
 from gcd_train.training.optimiser import ParameterGroup
@@ -46,11 +46,12 @@ _FEATURES, _CRITIC, _ENERGY, _KEEP, _CLOSE = 1.0, 0.1, 0.5, 1.0, 0.3
 _CRITIC_WIDTHS = (32, 64, 96)
 
 
-class _ViewTask(LiveTask):
+class _ViewTask(Task):
     """Trains some weights of a PaintNet, which is measured on held-out views without what was painted before."""
 
     def __init__(self, net: PaintNet, trained: nn.Module, config: LiveConfig, held_out: "HeldOutViews") -> None:
-        super().__init__(trained, config)
+        super().__init__(trained)
+        self._config, self._device = config, next(trained.parameters()).device
         self._net, self._held_out = net, held_out
         self._movable = movable_classes(config).to(self._device)
 
