@@ -27,7 +27,7 @@ MOST = [
     ("tests/model", 42, 6_826),
     ("gcd_node", 59, 13_502),
     ("tests/node", 41, 12_332),
-    ("train/gcd_train", 115, 25_951),
+    ("train/gcd_train", 115, 25_929),
     ("tests/train", 76, 13_879),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
