@@ -26,8 +26,8 @@ MOST = [
     ("tests/model", 33, 6_561),
     ("gcd_node", 59, 13_501),
     ("tests/node", 37, 10_716),
-    ("train/gcd_train", 116, 27_033),
-    ("tests/train", 77, 13_948),
+    ("train/gcd_train", 115, 25_935),
+    ("tests/train", 76, 13_875),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 MOST_DOCS, MOST_README = (14, 1_900), 90

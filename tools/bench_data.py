@@ -23,8 +23,8 @@ from gcd_train.data.paths import DRIVING, MAX90
 from gcd_train.data.pictures import ViewPairs
 from gcd_train.parallel import one_thread_each
 from gcd_train.pointcloud import published_picture
-from gcd_train.scenes.scene_writer import SceneFormat, write_scene
-from gcd_train.scenes.worlds import SCENE_WORLDS
+from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 PROCESS = psutil.Process()
 FIRST_SEED = 3_000_000  # in no data set

@@ -17,7 +17,7 @@ from gcd_model.live.eyes import Eyes
 from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_train.data.sample import to_network
 from gcd_train.live.clips import clip_paths, evenly, read_clip
-from gcd_train.live.measure import live_model
+from gcd_train.live.training import live_model
 from gcd_train.look.gallery import WindowChoice, find_videos, read_windows
 
 _ASSUMED_HFOV_DEG = 70.0

@@ -7,16 +7,23 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from headless import needs_egl
+from headless import drawn, needs_egl
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
 from gcd_train.scenes.description import Part, Scene, Tracks, rotations
-from gcd_train.scenes.drop import FPS, HFOV_DEG, DropLabel, drop_scene, orbit_cameras, world
-from gcd_train.scenes.drop.things import KINDS, bounds, outline, random_paint, random_thing
-from gcd_train.scenes.drop.world import DOME_M, UnsoundSceneError, require_sound
+from gcd_train.scenes.drop import world
+from gcd_train.scenes.drop.things import KINDS, DropLabel, bounds, outline, random_paint, random_thing
+from gcd_train.scenes.drop.world import (
+    DOME_M,
+    FPS,
+    HFOV_DEG,
+    UnsoundSceneError,
+    drop_scene,
+    orbit_cameras,
+    require_sound,
+)
 from gcd_train.scenes.primitives import CONVEX
-from gcd_train.scenes.renderer import Renderer
 
 FRAMES = 18
 SEEDS = (2, 7)
@@ -268,10 +275,8 @@ def test_every_pixel_is_a_thing_the_floor_or_the_dome_at_its_true_depth(scene: S
     columns, rows = np.meshgrid(np.arange(72) + 0.5, np.arange(48) + 0.5)
     rays = np.stack([(columns - lens.cx) / lens.fx, (rows - lens.cy) / lens.fy, np.ones((48, 72))], -1)
     one = replace(scene, poses=scene.poses[:1], focus=scene.focus[:1])
-    with Renderer(72, 48, oversample=1) as renderer:
-        views = {name: made[0] for name, made in renderer.render(one).items()}
     seen: set[int] = set()
-    for name, view in views.items():
+    for name, view in drawn(one, 72, 48).items():
         pose = scene.cameras[name][0]
         points = (view.depth[..., None] * rays) @ pose[:3, :3].T + pose[:3, 3]
         assert (view.depth > 0).all()

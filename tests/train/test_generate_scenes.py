@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import pytest
 from box_world import box_scene, box_world, checked, odd_box_scene
-from headless import needs_egl
+from headless import drawn, needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
@@ -29,8 +29,8 @@ from gcd_train.scenes import scene_writer
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import FrozenScene
 from gcd_train.scenes.renderer import Renderer, Rendering
-from gcd_train.scenes.scene_writer import GIVE_UP_AFTER, SceneFormat, generate_scenes, write_scene
-from gcd_train.scenes.worlds import SCENE_WORLDS
+from gcd_train.scenes.scene_writer import GIVE_UP_AFTER, generate_scenes, write_scene
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)
 
@@ -130,14 +130,14 @@ class TestWriteScene:
 
     def test_pictures_are_those_of_the_renderer_and_of_the_kept_geometry(self, tmp_path: Path) -> None:
         folder, cameras = write_scene(tmp_path, box_world(), FORM, 0).folder, box_scene(0, 2).cameras
+        picture = drawn(box_scene(0, 2), 48, 32)["view1"]
         with Renderer(48, 32, oversample=1) as renderer:
-            drawn = renderer.render(box_scene(0, 2))["view1"][1]
             again = [view for _, _, view in renderer.views(FrozenScene.load(folder / GEOMETRY), cameras)][-1]
         rgba = cv2.imread(str(kubric4d.frame_path(folder, "view1", "rgba", 1)), cv2.IMREAD_UNCHANGED)
         assert rgba is not None
-        np.testing.assert_array_equal(rgba[..., 2::-1], drawn.rgb)
-        np.testing.assert_array_equal(again.rgb, drawn.rgb)
-        assert {0, 4, 9} == set(np.unique(drawn.instances).tolist()), "the picture shows ground, both boxes"
+        np.testing.assert_array_equal(rgba[..., 2::-1], picture.rgb[1])
+        np.testing.assert_array_equal(again.rgb, picture.rgb[1])
+        assert {0, 4, 9} == set(np.unique(picture.instances[1]).tolist()), "the picture shows ground, both boxes"
 
     def test_a_scene_that_is_there_is_kept_and_one_of_another_kind_refused(self, tmp_path: Path) -> None:
         manifest = write_scene(tmp_path, box_world(), FORM, 0).folder / MANIFEST

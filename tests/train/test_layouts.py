@@ -35,8 +35,7 @@ from gcd_train.data.kubric4d import (
 from gcd_train.data.parallel_domain4d import ParallelDomain4DWriter, calibration, ontology
 from gcd_train.errors import DataError
 from gcd_train.scenes.description import rotations
-from gcd_train.scenes.driving import ONTOLOGY
-from gcd_train.scenes.driving.classes import Label
+from gcd_train.scenes.driving.classes import ONTOLOGY, Label
 from gcd_train.scenes.renderer import Rendering
 
 LENS = Intrinsics.from_hfov(HFOV_DEG, 48, 32)

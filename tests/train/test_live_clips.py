@@ -13,7 +13,7 @@ from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError
 from gcd_train.live.clips import SKY_M, clip_paths, decode_depth, encode_depth, read_clip, tensor_of
 from gcd_train.live.filming import generate_live, live_scene, visibility
-from gcd_train.scenes.renderer import Rendering
+from gcd_train.scenes.renderer import Rendering, stacked
 
 
 @given(st.floats(0.03, 900.0))
@@ -30,8 +30,8 @@ def rendering(pose: np.ndarray) -> Rendering:
 
 
 def states(sources: list[np.ndarray], targets: list[np.ndarray], bodies: np.ndarray | None = None) -> np.ndarray:
-    views = {"source": [rendering(p) for p in sources], "target": [rendering(p) for p in targets]}
     cameras = {"source": np.stack(sources), "target": np.stack(targets)}
+    views = stacked((0, name, rendering(p)) for name, some in cameras.items() for p in some)
     still = np.broadcast_to(np.eye(4)[:3], (len(sources), 1, 3, 4)) if bodies is None else bodies
     lenses = dict.fromkeys(views, Intrinsics.from_hfov(HFOV_DEG, WIDTH, HEIGHT))
     return visibility(views, cameras, lenses, still, SKY_M)

@@ -22,24 +22,14 @@ from gcd_model.live.synthesizer import save_live
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError
 from gcd_train.evaluation.metrics import gradient_map
-from gcd_train.live import measure
-from gcd_train.live.clips import LiveClip
-from gcd_train.live.figures import (
-    BEFORE,
-    NEVER,
-    NOW,
-    MethodViews,
-    SpreadHistogram,
-    Tally,
-    Truth,
-    cells,
-    fit_spread,
-    frechet_distance,
-    surface_motion,
-)
+from gcd_train.live.calibration import SpreadHistogram, fit_spread
+from gcd_train.live.clips import BEFORE, NEVER, NOW
+from gcd_train.live.training import live_model
 
 sys.path.append(str(Path(__file__).parents[2] / "tools"))
-live_variants, other_world = import_module("live_variants"), import_module("other_world")
+figure, measure, other_world = (import_module(name) for name in ("live_figures", "live_measure", "other_world"))
+MethodViews, Tally, Truth = figure.MethodViews, figure.Tally, figure.Truth
+cells, frechet_distance, surface_motion = figure.cells, figure.frechet_distance, figure.surface_motion
 FRAMES, HEIGHT, WIDTH = 4, 64, 96
 LENS = Intrinsics.from_hfov(70.0, WIDTH, HEIGHT)
 
@@ -154,65 +144,14 @@ def test_frechet_distance_is_that_of_the_means_where_the_spread_is_the_same() ->
     assert math.isnan(frechet_distance(features[:100], features))
 
 
-def turned_clip() -> LiveClip:
-    """A smooth wall filmed by a camera and by one turned away from it by some degrees, as seen through a homography."""
-    turn = math.radians(4.0)
-    target = np.eye(4)
-    target[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
-    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.stack([(u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones_like(u)], axis=-1)
-    there = rays @ target[:3, :3].T
-    pictures = {"source": _painted(rays), "target": _painted(there)}
-    edge = math.tan(math.radians(35.0))
-    seen = (np.abs(there[..., 0] / there[..., 2]) < edge) & (
-        np.abs(there[..., 1] / there[..., 2]) < edge * HEIGHT / WIDTH
-    )
-    arrays = {
-        **{f"{name}.rgb": np.repeat(picture[None], 2, axis=0) for name, picture in pictures.items()},
-        **{f"{name}.labels": np.zeros((2, HEIGHT, WIDTH), np.uint8) for name in pictures},
-        "source.pose": np.tile(np.eye(4), (2, 1, 1)),
-        "target.pose": np.tile(target, (2, 1, 1)),
-        "target.depth": np.full((2, HEIGHT, WIDTH), 30000, np.uint16),
-        "target.visibility": np.where(seen, NOW, NEVER).astype(np.uint8)[None].repeat(2, axis=0),
-    }
-    return LiveClip(name="wall/0-0", arrays=arrays, facts={"source_hfov_deg": 70.0, "target_hfov_deg": 70.0})
-
-
-def _painted(rays: np.ndarray) -> np.ndarray:
-    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    waves = [np.sin(9 * x + k) * np.cos(7 * y - k) for k in range(3)]
-    return (127.5 + 100 * np.stack(waves, axis=-1)).round().astype(np.uint8)
-
-
-def test_the_homography_of_a_turn_is_exact() -> None:
-    clip = turned_clip()
-    views = live_variants.BestHomography().views(clip)
-    seen = torch.from_numpy(clip.arrays["target.visibility"] == NOW)
-    error = (views.video * 255 - torch.from_numpy(clip.arrays["target.rgb"]).permute(0, 3, 1, 2)).abs()
-    assert float(error.permute(0, 2, 3, 1)[seen].mean()) < 1.0
-
-
-def test_reports_hold_every_method_and_the_lead_of_the_live_one() -> None:
-    tallies = {name: Tally(LiveConfig().classes) for name in ("live", "old")}
-    for scene in ("a", "b", "c"):
-        of = truth(ord(scene))
-        tallies["live"].add(scene, of, perfect(of), of.video)
-        tallies["old"].add(scene, of, MethodViews(video=of.video * 0.9), of.video)
-    result = measure.SetResult(name="tiny", clips=3, tallies=tallies)
-    lead = measure.differences(result)["live - old"]
-    assert 10 < lead["low"] <= lead["psnr"] <= lead["high"]
-    assert "| old |" in measure.to_markdown([result])
-    assert set(json.loads(json.dumps(measure.to_json([result])))["tiny"]["methods"]) == {"live", "old"}
-
-
 def test_unknown_methods_and_other_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         measure.chosen_methods(["telepathy"], [measure.ExactSplat(training=tmp_path)])
     save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError):
-        measure.live_model(str(tmp_path / "other.safetensors"))
+        live_model(str(tmp_path / "other.safetensors"))
     with pytest.raises(DataError, match="is no live model"):
-        measure.live_model("random:driving")
+        live_model("random:driving")
 
 
 # how unlike its training a camera looks to the live model
@@ -249,9 +188,9 @@ def test_clips_are_measured_and_videos_scored_by_the_commands(tmp_path: Path) ->
     weights = ("--weights", tmp_path / "tiny.safetensors")
     save_live(tmp_path / "tiny.safetensors", LiveNetworks(TINY), "tiny")
     told = ("--heldout", tmp_path / "sets", "--training", tmp_path / "data", "--sets", "one", "--out", tmp_path)
-    measure.main([str(each) for each in (*told, *weights)])
+    measure.main([str(each) for each in (*told, *weights, "--methods", "live,homography")])
     report = json.loads((tmp_path / "report.json").read_text())["one"]
-    assert (report["clips"], set(report["methods"])) == (1, {"splat", "live"})
+    assert (report["clips"], set(report["methods"])) == (1, {"splat", "live", "homography"})
     assert (tmp_path / "one.png").stat().st_size > 1000
     writer = cv2.VideoWriter(str(tmp_path / "real.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
     for value in range(20):

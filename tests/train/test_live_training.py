@@ -31,15 +31,15 @@ from gcd_model.live.depth_net import (
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.networks import LiveNetworks
 from gcd_train.data.open import DataPlaces
+from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, Interrupted, RecipeError
 from gcd_train.live.batches import FrameBatches, pictures_of
+from gcd_train.live.calibration import SpreadHistogram, calibrate, floors_of, frames_of
 from gcd_train.live.clips import Shelf, TrainingClips, read_clip, training_paths
 from gcd_train.live.depth_training import DepthTask, edge_matches, measure_depth
-from gcd_train.live.figures import SpreadHistogram, truth_of
-from gcd_train.live.measure import LiveModel
 from gcd_train.live.paint_training import HeldOutViews, PaintTask
-from gcd_train.live.recipe import LiveRecipe, LiveStage, load_live_recipe
-from gcd_train.live.training import calibrate, train_live
+from gcd_train.live.recipe import LiveRecipe, LiveStage, live_recipe
+from gcd_train.live.training import train_live
 from gcd_train.live.views import (
     InputShelf,
     ViewBatches,
@@ -216,7 +216,7 @@ def test_an_unknown_key_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "live.toml"
     path.write_text('kind = "live"\nname = "x"\nspeed = 1\n')
     with pytest.raises(RecipeError, match="speed"):
-        load_live_recipe(str(path))
+        live_recipe(str(path))
 
 
 def test_batches_follow_from_the_update_alone(data: Path) -> None:
@@ -421,11 +421,10 @@ def test_calibration_makes_the_interval_hold_and_takes_back_what_rare_classes_go
     calibrate(networks, [path], [path], views, weights, torch.ones_like(weights))
     assert float(biases[rare]) <= 10.0
     inside, clip = SpreadHistogram(), read_clip(path)
-    made = LiveModel(networks=networks).views(clip)
-    assert made.log_variance is not None
-    assert made.visibility is not None
-    error = (made.video - truth_of(clip).video)[1:]
-    inside.add(error, made.log_variance[1:], made.visibility[1:])
+    source, truth = pictures_of(clip), (to_network(clip.arrays["target.rgb"]) + 1) / 2
+    for frame, true in zip(frames_of(networks, clip, source, floors_of(source))[1:], truth[1:], strict=True):
+        error = (frame.picture.clamp(-1, 1) + 1) / 2 - true
+        inside.add(error[None], frame.log_variance[None], frame.visibility[None])
     shares = [share for share in inside.coverage if share == share]
     assert shares
     assert all(0.89 < share < 0.91 for share in shares)

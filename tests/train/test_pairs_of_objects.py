@@ -8,10 +8,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from box_world import STAGE as FAST_STAGE
 from box_world import box_object
-from headless import needs_egl
-from stage_world import STAGE as FAST_STAGE
-from stage_world import stage as fast_stage
+from box_world import stage as fast_stage
+from headless import drawn, needs_egl
 from tiny_world import TinyOrbits
 from typer.testing import CliRunner
 
@@ -24,15 +24,12 @@ from gcd_train.data.splits import require_apart
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.pair_writer import orbit_draw, write_shard
-from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.worlds import (
     SCENE_WORLDS,
-    PairForm,
+    SceneFormat,
     World,
-    WorldOptions,
     agree,
-    driving_world,
-    orbit_world,
+    pair_world,
     read_world,
     scene_world,
 )
@@ -45,8 +42,8 @@ def stage(seed: int, frames: int) -> Scene:
 
 
 STAGE = replace(FAST_STAGE, make=stage)
-TINY = PairForm(width=48, height=32, frames=3, oversample=1)
-ORBITS = orbit_world(STAGE, TINY)
+TINY = SceneFormat(width=48, height=32, frames=3, oversample=1)
+ORBITS = pair_world(STAGE, TINY)
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +83,8 @@ def test_a_clip_shows_its_time_steps_from_its_cameras(folder: Path) -> None:
     clip, numbers = clips[4], list(clips.orbit(4).frame_numbers)
     scene = stage(1, STAGE.frames)
     cut = replace(scene, poses=scene.poses[numbers], focus=scene.focus[numbers], cameras=told(clips, 4))
-    with Renderer(48, 32, oversample=1) as renderer:
-        drawn = renderer.render(cut)
-    for name, frames in drawn.items():
-        apart = getattr(clip, name).astype(int) - np.stack([frame.rgb for frame in frames])
+    for name, view in drawn(cut, 48, 32).items():
+        apart = getattr(clip, name).astype(int) - view.rgb
         assert np.abs(apart).mean() < 0.05  # poses on disk are rounded
         assert getattr(clip, f"{name}_instances").max() == 7
         assert not getattr(clip, f"{name}_classes").any()
@@ -134,7 +129,7 @@ def test_paths_take_every_second_frame_and_differ_between_worlds() -> None:
 @needs_egl
 def test_no_scene_is_on_both_sides_of_a_split(folder: Path, tmp_path: Path) -> None:
     training = PairedClips.open(folder)
-    fewer = orbit_world(STAGE, TINY, clips_per_scene=1)
+    fewer = pair_world(STAGE, TINY, clips_per_scene=1)
     for name, world, seeds, shared in (
         ("same scene, another clip", ORBITS, range(5, 6), True),
         ("cut otherwise", fewer, range(1, 2), True),
@@ -181,7 +176,7 @@ def test_a_folder_of_folders_is_all_of_them(folder: Path, tmp_path: Path) -> Non
 
 @needs_egl
 def test_folders_that_differ_do_not_go_together(folder: Path, tmp_path: Path) -> None:
-    wider = orbit_world(STAGE, replace(TINY, width=64))
+    wider = pair_world(STAGE, replace(TINY, width=64))
     written(tmp_path / "wider", wider, range(1))
     with pytest.raises(DataError, match="do not go together"):
         PairedClips.open([folder, tmp_path / "wider"])
@@ -189,7 +184,7 @@ def test_folders_that_differ_do_not_go_together(folder: Path, tmp_path: Path) ->
 
 @needs_egl
 def test_painted_clips_show_classes_where_others_show_colours(tmp_path: Path) -> None:
-    clips = PairedClips.open(written(tmp_path, driving_world(TINY, WorldOptions()), range(1)))
+    clips = PairedClips.open(written(tmp_path, pair_world(SCENE_WORLDS["driving"], TINY), range(1)))
     painted = painted_clips(clips)
     with pytest.raises(DataError, match="need"):
         painted_clips(TinyOrbits())
@@ -220,11 +215,10 @@ def with_thing(scene: Scene, at: tuple[float, float, float], side: float = 2.0) 
     )
 
 
-@pytest.mark.parametrize(("world", "frames", "said"), [("driving", 14, "no stage"), ("stage", 40, "up to 30")])
-def test_worlds_that_give_no_such_clips_are_refused(world: str, frames: int, said: str) -> None:
-    with pytest.raises(RecipeError, match=said):
-        orbit_world(scene_world(world), PairForm(frames=frames))
-    assert orbit_world(STAGE, PairForm(frames=30)).frames == 30
+def test_worlds_that_give_no_such_clips_are_refused() -> None:
+    with pytest.raises(RecipeError, match="up to 30"):
+        pair_world(STAGE, SceneFormat(frames=40))
+    assert pair_world(STAGE, SceneFormat(frames=30)).frames == 30
 
 
 def test_a_world_that_is_none_is_refused() -> None:
@@ -249,9 +243,9 @@ def test_the_command_makes_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_folder_of_another_edition_has_another_origin(tmp_path: Path) -> None:
-    agree(tmp_path, driving_world(PairForm(), WorldOptions()))
+    agree(tmp_path, pair_world(SCENE_WORLDS["driving"], SceneFormat()))
     world = read_world(tmp_path)
-    assert world == driving_world(PairForm(), WorldOptions())
+    assert world == pair_world(SCENE_WORLDS["driving"], SceneFormat())
     clips = PairedClips((world,), ((tmp_path, "00000000"),))
     assert (clips.camera, clips.mount, clips.scene(0)) == ("none", CameraMount(), ("driving", 0))
     grown = PairedClips((msgspec.structs.replace(world, edition=world.edition + 1),), clips.places)
@@ -263,7 +257,7 @@ def test_a_folder_of_another_edition_has_another_origin(tmp_path: Path) -> None:
 @pytest.mark.parametrize("world", ["drop", "tabletop"])
 def test_real_scenes_show_their_things_to_both_cameras(world: str, tmp_path: Path) -> None:
     """Simulates, which takes a second or two: things are in both views, and no camera stands in one or below ground."""
-    pairs = orbit_world(scene_world(world), replace(TINY, frames=14))
+    pairs = pair_world(scene_world(world), replace(TINY, frames=14))
     clips = PairedClips.open(written(tmp_path, pairs, range(3)))
     for number in range(3):
         clip, poses = clips[number], told(clips, number)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_world import STAGE, stage
 from headless import needs_egl
-from stage_world import STAGE, stage
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.encodings import SKY_M
@@ -16,11 +16,12 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.errors import DataError
-from gcd_train.scenes.driving import class_ids, driving_drive
+from gcd_train.scenes.driving.classes import class_ids
+from gcd_train.scenes.driving.world import driving_drive
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
-from gcd_train.scenes.scene_writer import SceneFormat, write_scene
-from gcd_train.scenes.worlds import SCENE_WORLDS
+from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 SEED, FRAMES, WIDTH, HEIGHT = 3, 2, 48, 36
 CLIP = FrameSampling(clip=2, reach_last=True)

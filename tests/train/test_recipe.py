@@ -11,7 +11,7 @@ from tiny_world import RECIPE, tiny_recipe
 from gcd_train.data.open import sampling_of
 from gcd_train.data.paths import DRIVING, MAX90, MAX180
 from gcd_train.errors import RecipeError, RunError
-from gcd_train.live.recipe import LiveRecipe, live_recipes, load_live_recipe
+from gcd_train.live.recipe import LiveRecipe, live_recipe, live_recipes
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe, merged, on_top, packaged_recipes, to_toml
 from gcd_train.training.monitor import RunFolder
@@ -184,7 +184,7 @@ def test_a_run_folder_whose_files_lead_elsewhere_is_refused(tmp_path: Path, name
 
 @pytest.mark.parametrize("name", live_recipes())
 def test_a_live_recipe_is_kept_too(tmp_path: Path, name: str) -> None:
-    recipe = load_live_recipe(f"package:{name}")
+    recipe = live_recipe(f"package:{name}")
     with RunFolder(tmp_path).begun(recipe, "gcd-train train"):
         pass
     assert msgspec.convert(tomllib.loads((tmp_path / "recipe.toml").read_text()), LiveRecipe) == recipe

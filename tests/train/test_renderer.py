@@ -1,14 +1,14 @@
 """The renderer against geometry worked out by hand: places, depths, labels, hidden surfaces, light."""
 
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from headless import needs_egl
-from stage_world import LIGHT
+from box_world import LIGHT
+from headless import drawn, needs_egl
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
@@ -49,9 +49,12 @@ def scene(
     )
 
 
+def only(views: dict[str, Rendering]) -> Rendering:
+    return Rendering(**{each.name: getattr(views["camera"], each.name)[0] for each in fields(Rendering)})
+
+
 def draw(parts: list[Part], width: int = 96, height: int = 64, oversample: int = 1, **stage: Any) -> Rendering:
-    with Renderer(width, height, oversample=oversample) as renderer:
-        return renderer.render(scene(parts, **stage))["camera"][0]
+    return only(drawn(scene(parts, **stage), width, height, oversample))
 
 
 def faces(corners: np.ndarray) -> np.ndarray:
@@ -168,8 +171,7 @@ def test_a_bowl_is_hollow() -> None:
 def test_a_floor_alone_is_a_scene() -> None:
     corners = np.array([[(1, -50, 0), (90, 50, 0), (1, 50, 0)], [(1, -50, 0), (90, -50, 0), (90, 50, 0)]], np.float32)
     floor = Sheet(corners, GREY, 4)
-    with Renderer(96, 64, oversample=1) as renderer:
-        shown = renderer.render(replace(scene([]), sheets=(floor,)))["camera"][0]
+    shown = only(drawn(replace(scene([]), sheets=(floor,)), 96, 64))
     assert (shown.classes[40:] == 4).all()
     np.testing.assert_allclose(shown.depth[40:, 48], 1.5 * 48 / (np.arange(40, 64) + 0.5 - 32), rtol=1e-4)
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from headless import needs_egl
+from headless import drawn, needs_egl
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError
-from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.pair_writer import generate, shard_path, write_shard
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.worlds import World, read_world
@@ -28,18 +28,13 @@ def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
     list(generate(tmp_path, TINY, range(3), workers=2))
     clips = PairedClips.open(tmp_path)
     assert (len(clips), clips.frames, clips.height, clips.width, clips.fps) == (3, 2, 32, 48, 10.0)
-    with Renderer(48, 32, oversample=1) as renderer:
-        drawn = renderer.render(driving_scene(2, frames=2))
     clip = clips[2]
     assert clip.seed == 2
-    for name, frames in drawn.items():
-        np.testing.assert_array_equal(getattr(clip, name), np.stack([frame.rgb for frame in frames]))
-        np.testing.assert_array_equal(getattr(clip, f"{name}_classes"), np.stack([frame.classes for frame in frames]))
-        np.testing.assert_array_equal(
-            getattr(clip, f"{name}_instances"), np.stack([frame.instances for frame in frames])
-        )
-        depth = np.stack([frame.depth for frame in frames])
-        np.testing.assert_allclose(getattr(clip, f"{name}_depth"), depth.clip(0, 255.99), atol=1 / 256)
+    for name, view in drawn(driving_scene(2, frames=2), 48, 32).items():
+        np.testing.assert_array_equal(getattr(clip, name), view.rgb)
+        np.testing.assert_array_equal(getattr(clip, f"{name}_classes"), view.classes)
+        np.testing.assert_array_equal(getattr(clip, f"{name}_instances"), view.instances)
+        np.testing.assert_allclose(getattr(clip, f"{name}_depth"), view.depth.clip(0, 255.99), atol=1 / 256)
 
 
 @needs_egl
@@ -130,10 +125,10 @@ def test_sigterm_stops_the_workers_and_keeps_whole_shards(tmp_path: Path) -> Non
 
 @needs_egl
 def test_a_failing_scene_leaves_no_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: Renderer, scene: object) -> None:
+    def broken(*_: object) -> None:
         raise RuntimeError("driver lost")
 
-    monkeypatch.setattr(Renderer, "render", broken)
+    monkeypatch.setattr(Renderer, "views", broken)
     with pytest.raises(RuntimeError, match="driver lost"):
         write_shard(tmp_path, TINY, range(2))
     assert list(tmp_path.iterdir()) == []

@@ -9,9 +9,8 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from box_world import box_scene
+from box_world import STAGE, box_scene
 from headless import needs_egl
-from stage_world import STAGE
 from tiny_scenes4d import write_driving, write_kubric
 from typer.testing import CliRunner
 
@@ -21,8 +20,8 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.look.sheet import SKY_M, UNSEEN, Footage
 from gcd_train.look.show import ShowOptions, open_scene
 from gcd_train.scenes.frozen import freeze
-from gcd_train.scenes.scene_writer import SceneFormat, write_scene
-from gcd_train.scenes.worlds import DEPTH_UNIT_M, World
+from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.worlds import DEPTH_UNIT_M, SceneFormat, World
 
 FRAMES = 4
 

@@ -4,15 +4,16 @@ import json
 from pathlib import Path
 
 import pytest
+from box_world import STAGE
 from headless import needs_egl
-from stage_world import STAGE
 from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
 from gcd_train.cli.main import app
 from gcd_train.recipe_files import load_recipe, packaged_recipes
-from gcd_train.scenes.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.worlds import SceneFormat
 
 TINY: dict[str, object] = {
     "model.frames": 3,

@@ -11,7 +11,8 @@ from gcd_train.cli.main import app
 from gcd_train.data import kubric4d
 from gcd_train.data.files import MANIFEST
 from gcd_train.errors import DataError
-from gcd_train.scenes.scene_writer import SceneFormat, write_scene
+from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.worlds import SceneFormat
 
 
 def verified(*places: Path) -> Result:

@@ -201,7 +201,7 @@ def calibrate_command(
         model = load_synthesizer(weights, device=device, dtype=dtype)
         if model.traits.live:
             raise RecipeError(
-                f"{model.traits.name} states its own spread; gcd_train.live.measure says how well it holds"
+                f"{model.traits.name} states its own spread; tools/live_measure.py says how well it holds"
             )
         clips, notes = open_clips(ClipOptions(data=data, split=split, limit=limit, seed=seed), model.traits)
         for line in notes:

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -10,15 +10,14 @@ from gcd_train.cli.common import Ray, errors_shown, progress_bar, say, stop_as_b
 from gcd_train.errors import RecipeError
 from gcd_train.live.filming import LIVE_SCENES, WORLDS, LiveWorld, TargetPath, generate_live
 from gcd_train.scenes.pair_writer import generate
-from gcd_train.scenes.scene_writer import SceneFormat, SceneRun, generate_scenes
+from gcd_train.scenes.scene_writer import SceneRun, generate_scenes
 from gcd_train.scenes.worlds import (
     SCENE_WORLDS,
     CameraWay,
-    PairForm,
+    SceneFormat,
     SceneWorld,
     WorldOptions,
-    driving_world,
-    orbit_world,
+    pair_world,
 )
 
 app = typer.Typer(no_args_is_help=True, help="Make training data with a procedural world (extra `scenes`).")
@@ -84,7 +83,7 @@ def _add(world: SceneWorld, about: str, *, clips_a_scene: int, clips_a_shard: in
                 raise RecipeError("a pair of driving has a simulation of its own; leave out --clips-per-scene")
             stop_as_by_ctrl_c()
             size = {"width": width, "height": height, "frames": frames, "oversample": oversample}
-            given = {name: number for name, number in size.items() if number is not None}
+            given: dict[str, Any] = {name: number for name, number in size.items() if number is not None}
             if not (pairs or mounted or clips is not None):
                 published = {"width": world.width, "height": world.height, "frames": world.frames}
                 form = SceneFormat(compact=compact, **{**published, **given})
@@ -94,12 +93,10 @@ def _add(world: SceneWorld, about: str, *, clips_a_scene: int, clips_a_shard: in
                 raise RecipeError(
                     "--scenes and --compact make whole scenes; --clips, --pairs, a mount and a path pairs; give one"
                 )
-            pair = PairForm(clips_per_shard=clips_per_shard, **given)
-            if on_road:
-                made = driving_world(pair, mount, path)
-            else:
-                made = orbit_world(world, pair, clips_per_scene=clips_per_scene)
-            seeds = made.seeds_of(first_seed, clips or 100)
+            shards = {"clips_per_scene": clips_per_scene, "clips_per_shard": clips_per_shard}
+            made = pair_world(world, SceneFormat(**given), mount=mount, path=path, **shards)
+            first = first_seed * made.clips_per_scene
+            seeds = range(first, first + (clips or 100))
             with progress_bar("clips", len(seeds), keep=True) as show:
                 for done in generate(place, made, seeds, processes, ray):
                     show(done)

@@ -21,7 +21,7 @@ from gcd_model.weights.families import FAMILIES, Family
 from gcd_model.weights.load import load_adapted, read_adapter, save_weights
 from gcd_model.weights.save import write_published
 from gcd_train.cli.common import Dtype, command_line, errors_shown, say
-from gcd_train.live.recipe import LiveRecipe, is_live, live_recipes, live_toml, load_live_recipe
+from gcd_train.live.recipe import LiveRecipe, live_recipe, live_recipes
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, StageName
 from gcd_train.recipe_files import load_recipe, packaged_recipes, to_toml
@@ -69,8 +69,8 @@ def train(
         from gcd_train.data.open import DataPlaces
 
         places = DataPlaces(data=data, valid=valid)
-        if is_live(recipe):
-            live = load_live_recipe(recipe)
+        live = live_recipe(recipe)
+        if live is not None:
             with _in_processes(ComputeRecipe(device=live.device, parallel="ddp")) as processes:
                 _train_live(live, places, out, processes)
             return
@@ -142,20 +142,17 @@ def recipes(
     """List the recipes that ship, or show one whole: on its bases, with every default."""
     console = Console(highlight=False, soft_wrap=True)
     with errors_shown():
-        if recipe is not None and is_live(recipe):
-            console.print(live_toml(recipe), markup=False, end="")
-            return
         if recipe is not None:
-            whole = to_toml(load_recipe(recipe, small=small, changes=changes or ()))
-            console.print(whole, markup=False, end="")
+            whole = live_recipe(recipe) or load_recipe(recipe, small=small, changes=changes or ())
+            console.print(to_toml(whole), markup=False, end="")
             return
         table = Table(box=SIMPLE, pad_edge=False, padding=(0, 0))
         for column in ("recipe", "data", "model", "updates", "clips an update", "starts from"):
             table.add_column(column, no_wrap=True)
         for name in packaged_recipes():
             table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
-        for name in live_recipes():
-            table.add_row(f"package:{name}", *_row(load_live_recipe(f"package:{name}")))
+        for name, live in live_recipes().items():
+            table.add_row(f"package:{name}", *_row(live))
         # a name that is cut off cannot be given to `train`: a narrow terminal breaks lines instead
         widest = console.measure(table, options=console.options.update(max_width=1000)).maximum
         console.width = max(console.width, widest)

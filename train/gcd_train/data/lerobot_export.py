@@ -20,10 +20,11 @@ from gcd_model.geometry import Intrinsics
 from gcd_train.data.lerobot import CAMERA_FILE, CHUNK, CameraCalibration, CameraFile, extra
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.files import new_folder
-from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
+from gcd_train.scenes.drop.world import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer
-from gcd_train.scenes.tabletop import FPS, UNITS_A_METRE, Episode, tabletop_episode, upright_base
+from gcd_train.scenes.tabletop.scene import UNITS_A_METRE, Episode, tabletop_episode, upright_base
+from gcd_train.scenes.tabletop.simulation import FPS
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]

@@ -46,7 +46,7 @@ from gcd_train.data.sample import SceneView
 from gcd_train.errors import DataError
 
 if TYPE_CHECKING:
-    from gcd_train.scenes.driving import OntologyItem
+    from gcd_train.scenes.driving.classes import OntologyItem
     from gcd_train.scenes.renderer import Rendering
 
 _LOG = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gcd_model.geometry import Intrinsics
@@ -24,8 +24,8 @@ from gcd_model.live.depth_net import plane_depth, plane_sweep
 from gcd_model.live.eyes import LONGEST, References
 from gcd_model.loading import default_precision
 from gcd_train.data.sample import to_network
-from gcd_train.live.clips import Camera, LiveClip, Poses, TrainingClips, decode_depth, evenly, read_clip, tensor_of
-from gcd_train.training.loop import Task
+from gcd_train.evaluation.metrics import class_iou
+from gcd_train.live.clips import Cameras, LiveClip, TrainingClips, decode_depth, evenly, read_clip, tensor_of
 
 Random = np.random.Generator
 Record = TypeVar("Record")
@@ -102,9 +102,7 @@ def on_device(array: NDArray[Any] | Sequence[float], like: Tensor) -> Tensor:
     return torch.from_numpy(np.asarray(array)).to(like)
 
 
-@lru_cache(maxsize=4096)
-def _rays(lens: Intrinsics, device: torch.device) -> Tensor:
-    return lens.rays(device)
+_rays = lru_cache(maxsize=4096)(Intrinsics.rays)
 
 
 def rays_of(lenses: Sequence[Intrinsics], device: torch.device) -> Tensor:
@@ -115,21 +113,20 @@ def rays_of(lenses: Sequence[Intrinsics], device: torch.device) -> Tensor:
 def pictures_of(clip: LiveClip) -> Pictures:
     """All source frames that were read of a clip, without earlier ones."""
     arrays = {name: tensor_of(array) for name, array in clip.arrays.items() if name.startswith("source")}
-    poses = clip.arrays["source.pose"]
-    return _pictures(arrays, "source", [clip.camera("source")] * len(poses), poses)
+    return _pictures(arrays, "source", clip.cameras("source"))
 
 
-def _pictures(arrays: dict[str, Tensor], name: str, cameras: Sequence[Camera], poses: Poses) -> Pictures:
-    """arrays: as a clip has them, of frames of N cameras that stand at `poses`, [N, 4, 4]."""
+def _pictures(arrays: dict[str, Tensor], name: str, cameras: Cameras) -> Pictures:
+    """arrays: as a clip has them, of frames of N cameras."""
     video = to_network(arrays[f"{name}.rgb"])
     return Pictures(
         video=video,
         metres=decode_depth(arrays[f"{name}.depth"]),
         labels=arrays[f"{name}.labels"].long(),
         moves=arrays[f"{name}.moves"].float(),
-        lenses=tuple(camera.lens for camera in cameras),
-        ups=on_device(poses[:, 2, :3].copy(), video),
-        heights_m=on_device([camera.height_m(pose) for camera, pose in zip(cameras, poses, strict=True)], video),
+        lenses=cameras.lenses,
+        ups=on_device(cameras.poses[:, 2, :3].copy(), video),
+        heights_m=on_device(cameras.heights_m, video),
         earlier=video,
         earlier_from_camera=torch.eye(4, dtype=torch.float64, device=video.device).expand(len(video), 4, 4),
         compared=torch.zeros(len(video), dtype=torch.bool, device=video.device),
@@ -171,14 +168,16 @@ class FrameBatches:
         before = frames - random.integers(1, _MOST_GAP + 1, size=count)
         compared = (before >= 0) & (random.random(count) < _REFERENCE_SHARE)
         before = before.clip(0)
-        poses, poses_before = (self._clips.poses(name, chosen, times) for times in (frames, before))
+        now, then = (self._clips.cameras(name, chosen, times) for times in (frames, before))
         names = [f"{name}.{array}" for array in ("rgb", "depth", "labels", "moves")]
-        pictures = _pictures(self._clips.take(chosen, frames, names), name, self._clips.cameras(name, chosen), poses)
+        pictures = _pictures(self._clips.take(chosen, frames, names), name, now)
         far = torch.where(pictures.metres < SKY_M, pictures.metres, torch.nan).flatten(1)
         median = far.nanmedian(dim=1).values.nan_to_num(0.0).double()
-        moves = on_device(np.linalg.inv(poses_before) @ poses, median)
+        moves = on_device(np.linalg.inv(then.poses) @ now.poses, median)
         near = moves[:, :3, 3].norm(dim=1) <= 2 * LONGEST * median
-        turned = _slightly_turned(random, count, median)
+        x, y, z = random.normal(size=(3, count)) * np.radians(_TURN_NOISE_DEG)
+        one = np.ones(count)  # angles are so small that their first order is enough
+        turned = on_device(np.array([[one, -z, y], [z, one, -x], [-y, x, one]]).transpose(2, 0, 1), median)
         shifted = on_device(random.normal(size=(count, 3)) * _MOVE_NOISE, median) * median[:, None]
         moves[:, :3] = torch.cat([moves[:, :3, :3] @ turned, moves[:, :3, 3:] + shifted[..., None]], dim=2)
         return replace(
@@ -187,13 +186,6 @@ class FrameBatches:
             earlier_from_camera=moves,
             compared=on_device(compared, near) & near,
         )
-
-
-def _slightly_turned(random: Random, n: int, like: Tensor) -> Tensor:
-    """Rotations by angles so small that their first order is enough: [N, 3, 3]."""
-    x, y, z = random.normal(size=(3, n)) * np.radians(_TURN_NOISE_DEG)
-    one = np.ones(n)
-    return on_device(np.array([[one, -z, y], [z, one, -x], [-y, x, one]]).transpose(2, 0, 1), like)
 
 
 def augmented(pictures: Pictures, random: Random) -> Pictures:
@@ -257,6 +249,12 @@ def class_weights(paths: Sequence[Path], config: LiveConfig, power: float) -> Te
     return weights / (weights * shares).sum()
 
 
+def class_figures(confusion: Tensor, names: Sequence[str], shown: Sequence[int]) -> dict[str, float]:
+    """Mean IoU of the classes that occur in the truth, and that of some of them."""
+    iou, occurs = class_iou(confusion), confusion.sum(1) > 0
+    return {"miou": float(iou[occurs].mean()), **{f"iou_{names[k]}": float(iou[k]) for k in shown if occurs[k]}}
+
+
 def autocast(device: torch.device) -> torch.autocast:
     """bfloat16 where the device is fast at it; other processors take seven times as long by it."""
     fast = default_precision(device, live=True) == "bfloat16"
@@ -306,11 +304,3 @@ def joined(parts: Sequence[Record]) -> Record:
 def some_of(batch: Record, cut: slice) -> Record:
     """Some pictures of a record of them."""
     return _mapped(itemgetter(cut), batch)
-
-
-class LiveTask(Task):
-    """What all stages' tasks have in common."""
-
-    def __init__(self, net: nn.Module, config: LiveConfig) -> None:
-        super().__init__(net)
-        self._config, self._device = config, next(net.parameters()).device

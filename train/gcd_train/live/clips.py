@@ -30,6 +30,9 @@ from gcd_train.errors import DataError
 
 _log = logging.getLogger(__name__)
 CAMERAS: tuple[str, ...] = ("source", "target")
+NEVER, BEFORE, NOW = 0, 1, 2
+STATES = ("painted", "before", "now")
+"""Values of the visibility, and what views call them."""
 _HELD_OUT_SEED = 1_000_000
 """Scenes from here on are not learned from."""
 _NEAREST_M, _CODES = 0.02, 65534
@@ -41,6 +44,7 @@ Poses = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Item = TypeVar("Item")
 Read = Callable[[Path, slice, Sequence[str]], dict[str, Array]]
+"""Some frames of some arrays of a file."""
 Room = Callable[[int], int]
 """How many files of so many bytes are kept."""
 
@@ -64,16 +68,12 @@ def decode_depth(code: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Camera:
-    """A clip's "source" or "target". poses: world_from_camera [T, 4, 4], metres. floor_z_m: of its world."""
+class Cameras:
+    """N cameras. poses: world_from_camera [N, 4, 4], metres. heights_m: [N], over the floor, at least 5 cm."""
 
-    lens: Intrinsics
+    lenses: tuple[Intrinsics, ...]
     poses: Poses
-    floor_z_m: float
-
-    def height_m(self, pose: Poses) -> float:
-        """Over the floor, at a pose [4, 4]; at least 5 cm."""
-        return max(float(pose[2, 3]) - self.floor_z_m, 0.05)
+    heights_m: Poses
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -90,10 +90,11 @@ class LiveClip:
         height, width = pictures.shape[1:3]
         return Intrinsics.from_hfov(float(self.facts[f"{camera}_hfov_deg"]), width, height)
 
-    def camera(self, name: str) -> Camera:
-        """ "source" or "target", as `lens`."""
-        poses, floor_z_m = self.arrays[f"{name}.pose"], float(self.facts["floor_z_m"])
-        return Camera(lens=self.lens(name), poses=poses, floor_z_m=floor_z_m)
+    def cameras(self, name: str) -> Cameras:
+        """ "source" or "target" in every frame, as `lens`."""
+        poses = self.arrays[f"{name}.pose"]
+        heights_m = np.maximum(poses[:, 2, 3] - float(self.facts["floor_z_m"]), 0.05)
+        return Cameras(lenses=(self.lens(name),) * len(poses), poses=poses, heights_m=heights_m)
 
     def poses(self, camera: str) -> Tensor:
         """world_from_camera, float64 [T, 4, 4]."""
@@ -159,7 +160,7 @@ class Shelf:
     """
 
     def __init__(self, read: Read, names: Sequence[str], device: torch.device, room: Room | None) -> None:
-        """read: some frames of some arrays of a file. names: of all that will be asked for. room: None to keep none."""
+        """names: of all that will be asked for. room: None to keep none."""
         self._read, self._names, self._device, self._room = read, names, device, room
         self._paths: list[Path] = []
         self._kept: dict[str, Tensor] = {}
@@ -205,7 +206,7 @@ class TrainingClips:
         self._shelf = Shelf(read, [*names, "target.visibility"], device, room_on(device))
         self.take = self._shelf.take
         self.paths: list[Path] = []
-        self._cameras: list[dict[str, Camera]] = []
+        self._cameras: list[dict[str, Cameras]] = []
         self.grow()
 
     def grow(self) -> None:
@@ -220,7 +221,7 @@ class TrainingClips:
                 continue
             clip = read_clip(path, names=[f"{name}.pose" for name in CAMERAS])
             clip.arrays.update(read_clip(path, slice(0, 1), [f"{name}.labels" for name in CAMERAS]).arrays)
-            self._cameras.append({name: clip.camera(name) for name in CAMERAS})
+            self._cameras.append({name: clip.cameras(name) for name in CAMERAS})
             self.paths.append(path)
 
     def __len__(self) -> int:
@@ -231,10 +232,11 @@ class TrainingClips:
         """T."""
         return len(self._cameras[0]["source"].poses)
 
-    def cameras(self, name: str, clips: Numbers) -> list[Camera]:
-        """ "source" or "target" of each of N clips."""
-        return [self._cameras[i][name] for i in clips]
-
-    def poses(self, name: str, clips: Numbers, frames: Numbers) -> Poses:
-        """Of a camera of each of N clips, each at a frame: [N, 4, 4]."""
-        return np.stack([camera.poses[t] for camera, t in zip(self.cameras(name, clips), frames, strict=True)])
+    def cameras(self, name: str, clips: Numbers, frames: Numbers) -> Cameras:
+        """ "source" or "target" of each of N clips, each at a frame."""
+        some = [(self._cameras[i][name], t) for i, t in zip(clips, frames, strict=True)]
+        return Cameras(
+            lenses=tuple(each.lenses[t] for each, t in some),
+            poses=np.stack([each.poses[t] for each, t in some]),
+            heights_m=np.array([each.heights_m[t] for each, t in some]),
+        )

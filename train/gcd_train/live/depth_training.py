@@ -11,13 +11,13 @@ from torch import Tensor
 from gcd_model.clip import palette
 from gcd_model.live.config import LiveConfig
 from gcd_model.live.depth_net import SKY_M, DepthNet, DepthOutput, bin_width, depth_inputs, first_bin, read_depth
-from gcd_train.evaluation.metrics import class_iou, confusion_matrix
+from gcd_train.evaluation.metrics import confusion_matrix
 from gcd_train.live.batches import (
     PART_SEED,
     FrameBatches,
-    LiveTask,
     Pictures,
     autocast,
+    class_figures,
     class_weights,
     generator_on,
     halved,
@@ -27,7 +27,7 @@ from gcd_train.live.batches import (
 )
 from gcd_train.live.clips import TrainingClips, evenly, read_clip
 from gcd_train.live.recipe import LiveStage
-from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.monitor import write_sheet
 
 _CLASS_POWER = -0.25
@@ -40,7 +40,7 @@ THIN = ("person", "pole", "cyclist", "object")
 _MEASURED_FRAMES, _JUMP = (3, 10), 0.15
 
 
-class DepthTask(LiveTask):
+class DepthTask(Task):
     """Trains a DepthNet on single frames."""
 
     def __init__(
@@ -52,7 +52,8 @@ class DepthTask(LiveTask):
         stage: LiveStage,
         seed: int,
     ) -> None:
-        super().__init__(net, config)
+        super().__init__(net)
+        self._config, self._device = config, next(net.parameters()).device
         self._net, self._held_out, self._small_share = net, held_out, stage.small_share
         self._batches = [FrameBatches(clips, stage.batch, seed + part * PART_SEED) for part in range(stage.parts)]
         self._class_weights = class_weights(clips.paths, config, _CLASS_POWER).to(self._device)
@@ -71,9 +72,11 @@ class DepthTask(LiveTask):
             pictures, ground = halved(pictures), ground[:, ::2, ::2]
         self._net.train()
         inputs = depth_inputs(pictures.video, pictures.rays, ground)
-        weights = self._pixel_weights(pictures).flatten(1)  # [N, H * W]
-        generator = generator_on(self._device, random)
-        pixels = torch.multinomial(weights, int(weights.shape[1] * _PIXEL_SHARE), True, generator=generator)
+        log = pictures.metres.log()[:, None]  # edges and thin things are drawn more often
+        edge = ((F.max_pool2d(log, 3, 1, 1) + F.max_pool2d(-log, 3, 1, 1))[:, 0] > 2 * _EDGE).float()
+        weights = 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()  # [N, H, W]
+        count, generator = int(weights[0].numel() * _PIXEL_SHARE), generator_on(self._device, random)
+        pixels = torch.multinomial(weights.flatten(1), count, True, generator=generator)
         sweeps = pictures.sweeps(self._config.depth)
         with autocast(self._device):
             output = self.network(inputs, sweeps, pixels)
@@ -103,12 +106,6 @@ class DepthTask(LiveTask):
         classes = F.cross_entropy(output.classes, labels, self._class_weights)
         moves = F.binary_cross_entropy_with_logits(output.moves, at(pictures.moves))
         return {"bin": bin_loss, "offset": offset, "class": classes, "moves": moves}
-
-    def _pixel_weights(self, pictures: Pictures) -> Tensor:
-        """How often a pixel is drawn, beside others: edges and thin things more often; [N, H, W]."""
-        log = pictures.metres.log()[:, None]
-        edge = ((F.max_pool2d(log, 3, 1, 1) + F.max_pool2d(-log, 3, 1, 1))[:, 0] > 2 * _EDGE).float()
-        return 1 + _EDGE_WEIGHT * edge + _THIN_WEIGHT * self._thin[pictures.labels].float()
 
     def measure(self, picture: Path) -> dict[str, float]:
         """Of held-out clips, see `measure_depth`."""
@@ -149,14 +146,12 @@ def measure_depth(
     together, small = torch.cat(errors), torch.cat(thin)
     if sheet is not None:
         write_sheet(sheet, evenly(rows, 8))
-    iou, occurs = class_iou(confusion), confusion.sum(1) > 0
     return {
         "mean_relative": float(together.mean()),
         "median_relative": float(together.median()),
         "thin_within_10": float((small < 0.1).float().mean()) if len(small) else float("nan"),
         "edge_f1": float(2 * edges[0] / (edges[1] + edges[2]).clamp(min=1)),
-        "miou": float(iou[occurs].mean()),
-        **{f"iou_{names[k]}": float(iou[k]) for k in (8, 10, 11, 7, 16) if occurs[k]},
+        **class_figures(confusion, names, (8, 10, 11, 7, 16)),
     }
 
 
@@ -170,12 +165,11 @@ def edge_matches(metres: Tensor, true: Tensor) -> Tensor:
 
     An edge is a pixel from which depth jumps by more than 15 % to the right or down.
     """
-    made, wanted = (_edges(each.log()) for each in (metres, true))
-    near_made, near_wanted = (F.max_pool2d(each[:, None].float(), 3, 1, 1)[:, 0] > 0 for each in (made, wanted))
-    matched = ((made & near_wanted).sum() + (wanted & near_made).sum()) / 2
-    return torch.stack([matched, made.sum(), wanted.sum()]).float()
-
-
-def _edges(log: Tensor) -> Tensor:
-    right, down = (F.pad(log.diff(dim=axis).abs() > _JUMP, pad) for axis, pad in ((-1, (0, 1)), (-2, (0, 0, 0, 1))))
-    return right | down
+    slack: list[Tensor] = []
+    edges: list[Tensor] = []
+    for log in (metres.log(), true.log()):
+        right, down = (F.pad(log.diff(dim=d).abs() > _JUMP, pad) for d, pad in ((-1, (0, 1)), (-2, (0, 0, 0, 1))))
+        edges.append(right | down)
+        slack.append(F.max_pool2d(edges[-1][:, None].float(), 3, 1, 1)[:, 0] > 0)
+    matched = ((edges[0] & slack[1]).sum() + (edges[1] & slack[0]).sum()) / 2
+    return torch.stack([matched, edges[0].sum(), edges[1].sum()]).float()

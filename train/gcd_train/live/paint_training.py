@@ -4,7 +4,7 @@ In the detail stage a critic looks at patches of whole pictures and learns to te
 head learns to pass. It alone learns there, on features that are held fixed: all else stays as it was, to the last bit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -21,9 +21,10 @@ from gcd_model.live.depth_net import DepthNet, depth_inputs
 from gcd_model.live.paint_net import SIGMA_DATA, Painted, PaintNet, Seen, filled
 from gcd_model.live.synthesizer import movable_classes
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import LiveTask, Random, autocast, class_weights, generator_on, on
+from gcd_train.live.batches import Random, autocast, class_figures, class_weights, generator_on, on
+from gcd_train.live.clips import STATES
 from gcd_train.live.views import ViewBatches, Views, carried_through, halved_views, mirrored, views_of
-from gcd_train.training.loop import Progress, StepLoss
+from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.losses import gradient_l1, ssim
 from gcd_train.training.monitor import write_sheet
 from gcd_train.training.optimiser import ParameterGroup
@@ -45,13 +46,26 @@ _FEATURES, _CRITIC, _ENERGY, _KEEP, _CLOSE = 1.0, 0.1, 0.5, 1.0, 0.3
 _CRITIC_WIDTHS = (32, 64, 96)
 
 
-class _ViewTask(LiveTask):
+class _ViewTask(Task):
     """Trains some weights of a PaintNet, which is measured on held-out views without what was painted before."""
 
     def __init__(self, net: PaintNet, trained: nn.Module, config: LiveConfig, held_out: "HeldOutViews") -> None:
-        super().__init__(trained, config)
+        super().__init__(trained)
+        self._config, self._device = config, next(trained.parameters()).device
         self._net, self._held_out = net, held_out
         self._movable = movable_classes(config).to(self._device)
+
+    def _views(
+        self, batches: ViewBatches, update: int, first_step: Callable[[Seen], Painted] | None, *, small: bool = False
+    ) -> tuple[Views, Random]:
+        """A batch, mirrored or not. first_step: what is painted by it before is carried along."""
+        before, now, random = batches.batch(update)
+        if small:
+            before, now = tuple(map(halved_views, before)), halved_views(now)
+        if first_step is not None:
+            now = carried_through(first_step, before, now, self._movable, random)
+        self._net.train()
+        return mirrored(now) if random.random() < 0.5 else now, random
 
     def measure(self, picture: Path) -> dict[str, float]:
         """See `HeldOutViews.measure`."""
@@ -83,15 +97,9 @@ class PaintTask(_ViewTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of one batch of views."""
-        before, now, random = self._batches[progress.part].batch(progress.updates)
-        if progress.share < self._small_share:
-            before, now = tuple(map(halved_views, before)), halved_views(now)
-        later = progress.share >= _MEAN_ALONE
-        if later:
-            now = carried_through(partial(self._first_step, network=self._net), before, now, self._movable, random)
-        if random.random() < 0.5:
-            now = mirrored(now)
-        self._net.train()
+        later, small = progress.share >= _MEAN_ALONE, progress.share < self._small_share
+        carry = partial(self._first_step, network=self._net) if later else None
+        now, random = self._views(self._batches[progress.part], progress.updates, carry, small=small)
         # the same for all parts of an update: processes average what they log by name
         if later and np.random.default_rng([_DRAWS, progress.updates]).random() < _DENOISING_SHARE:
             parts = {"denoising": self._denoising(now, random)}
@@ -195,11 +203,7 @@ class DetailTask(_ViewTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of the detail against the critic, and of the critic: their gradients do not meet."""
-        before, now, random = self._batches.batch(progress.updates)
-        now = carried_through(self._first_step, before, now, self._movable, random)
-        if random.random() < 0.5:
-            now = mirrored(now)
-        self._net.train()
+        now, _ = self._views(self._batches, progress.updates, self._first_step)
         made = self._first_step(now.seen)
         parts = self._losses(made, now)
         return StepLoss(total=torch.stack(list(parts.values())).sum(), parts=parts, frames=len(now.poses))
@@ -269,7 +273,9 @@ class HeldOutViews:
             there = on(device, views)
             base = filled(there.seen)
             made, base = on(cpu, net.first_step(there.seen, base, config.sigma_max)), base.cpu()
-            of_base, square = (_square_error(each, views.target) for each in (base, made.mean))
+            of_base, square = (
+                ((each.clamp(-1, 1) - views.target) / 2).square().mean(dim=1) for each in (base, made.mean)
+            )
             never = views.visibility == 0
             for each, values in zip(errors.values(), (of_base, square, square[~never], square[never]), strict=True):
                 each.append(values.flatten())
@@ -278,19 +284,12 @@ class HeldOutViews:
             if i % max(len(self.views) // 10, 1) == 0:
                 rows.append([x[0] for x in (views.seen.colour, base, made.mean, made.picture, views.target)])
         write_sheet(sheet, rows)
-        iou, occurs, state_iou = class_iou(confusion), confusion.sum(1) > 0, class_iou(states)
         names = [entry.name for entry in config.classes]
         return {
             **{name: _psnr(torch.cat(each)) for name, each in errors.items()},
-            "miou": float(iou[occurs].mean()),
-            **{f"iou_{names[c]}": float(iou[c]) for c in (7, 8, 10, 11) if occurs[c]},
-            **{f"iou_{name}": float(state_iou[s]) for s, name in enumerate(("painted", "before", "now"))},
+            **class_figures(confusion, names, (7, 8, 10, 11)),
+            **{f"iou_{name}": float(iou) for name, iou in zip(STATES, class_iou(states), strict=True)},
         }
-
-
-def _square_error(made: Tensor, true: Tensor) -> Tensor:
-    """Of pictures in [0, 1], mean over colours: [N, H, W]."""
-    return ((made.clamp(-1, 1) - true) / 2).square().mean(dim=1)
 
 
 def _psnr(squares: Tensor) -> float:

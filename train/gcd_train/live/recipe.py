@@ -1,5 +1,6 @@
 """What a live model is trained from and for how long: `kind = "live"` in a TOML file."""
 
+import re
 from typing import Annotated, Literal
 
 import msgspec
@@ -7,7 +8,6 @@ from msgspec import Meta
 
 from gcd_model import explain_settings_error
 from gcd_model.live.config import LiveConfig
-from gcd_model.small_files import read_small
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe
 from gcd_train.recipe_data import Budget, LiveStageName, LogRecipe
@@ -60,34 +60,24 @@ class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             raise RecipeError(f"the detail stage takes one batch an update, got detail.parts = {self.detail.parts}")
 
 
-def is_live(source: str) -> bool:
-    """Whether a recipe, by `package:NAME` or path, is a live model's."""
-    try:
-        return read_merged(place_of(_placed(source)))[0].get("kind") == "live"
+def live_recipe(source: str) -> LiveRecipe | None:
+    """A live model's recipe by `package:NAME` or path; None for what is none, or cannot be read at all.
+
+    Raises RecipeError for one that has unknown keys or values out of range.
+    """
+    try:  # what ships lies in a folder of its own
+        table, (place, *_) = read_merged(place_of(re.sub("^package:", "package:live/", source)))
     except RecipeError:
-        return False
-
-
-def load_live_recipe(source: str) -> LiveRecipe:
-    """A recipe by `package:NAME` or path. Raises RecipeError for one that cannot be read or has unknown keys."""
-    table, (place, *_) = read_merged(place_of(_placed(source)))
+        return None
+    if table.get("kind") != "live":
+        return None
     try:
         return msgspec.convert(table, LiveRecipe)
     except msgspec.ValidationError as error:
         raise RecipeError(f"{place}: {explain_settings_error(str(error), LiveRecipe)}") from error
 
 
-def live_recipes() -> list[str]:
-    """Names of those that ship."""
-    return sorted(path.stem for path in (PACKAGED / "live").glob("*.toml"))
-
-
-def live_toml(source: str) -> str:
-    """The recipe's text, once it was found to be sound. Raises RecipeError."""
-    load_live_recipe(source)
-    return read_small(place_of(_placed(source)))
-
-
-def _placed(source: str) -> str:
-    """What ships lies in a folder of its own."""
-    return source.replace("package:", "package:live/", 1) if source.startswith("package:") else source
+def live_recipes() -> dict[str, LiveRecipe]:
+    """Those that ship, by name."""
+    found = {path.stem: live_recipe(f"package:{path.stem}") for path in sorted((PACKAGED / "live").glob("*.toml"))}
+    return {name: recipe for name, recipe in found.items() if recipe is not None}

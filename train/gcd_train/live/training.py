@@ -4,31 +4,25 @@ clips -> depth network -> what it shows of every target (inputs) -> paint networ
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from threading import Event
 
-import msgspec
-import numpy as np
 import torch
-from torch import Tensor, nn
 
 from gcd_model.live.blocks import layout
-from gcd_model.live.depth_net import DepthNet, DepthOutput, depth_inputs, read_depth
-from gcd_model.live.paint_net import filled
-from gcd_model.live.synthesizer import save_live
+from gcd_model.live.depth_net import DepthNet
+from gcd_model.live.synthesizer import LiveSynthesizer, save_live
+from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks, weights_digest
 from gcd_train.data.open import DataPlaces
-from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import PART_SEED, some_of, with_true_references
+from gcd_train.live.batches import PART_SEED
+from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import TrainingClips, clip_paths, read_clip, training_paths
 from gcd_train.live.depth_training import DepthTask
-from gcd_train.live.figures import SpreadHistogram, fit_spread
-from gcd_train.live.measure import LiveModel, live_model
 from gcd_train.live.paint_training import DetailTask, HeldOutViews, PaintTask
 from gcd_train.live.recipe import LiveRecipe, LiveStage
 from gcd_train.live.views import InputShelf, ViewBatches, make_inputs
@@ -46,12 +40,6 @@ _CARRIED = {"paint": 0.35, "detail": 0.6}
 """Share of the views that see what was painted a frame before, of a model that carries that."""
 _CLIPS_A_TURN = 4
 """Clips whose inputs a process works out at a time."""
-_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-_FRAMES = slice(1, 14, 4)
-_FAMILIAR = 400
-"""So many clips of the training say what is familiar."""
-_DOUBT = 1.1
-"""A source counts as another world's from so many times the highest score of a held-out clip."""
 
 
 def valid_folder(data: DataPlaces) -> Path:
@@ -83,19 +71,21 @@ def train_live(
     model, seed, out = recipe.model, recipe.seed, folder.path
     alone = partial(processes.by_the_first, stop=stop)
 
-    def save(path: Path) -> None:
-        alone(lambda: save_live(path, networks, recipe.name, overwrite=True))
-
-    def run(name: LiveStageName, stage: LiveStage, task: Task, processes: Processes) -> None:
-        """Train a stage, whose weights are then in a file of their own; one to be kept is kept."""
+    def run(name: LiveStageName, task: Task, processes: Processes) -> None:
+        """Train a stage, whose weights are then averaged and in a file of their own; one to be kept is kept."""
         if name not in recipe.keep:
-            _train(recipe, folder, stop, name, stage, task, processes)
-            save(out / f"{recipe.name}-{name}.safetensors")
+            _train(recipe, name, task, folder, stop, processes)
+            path = out / f"{recipe.name}-{name}.safetensors"
+            alone(lambda: save_live(path, networks, recipe.name, overwrite=True))
         task.module.eval().requires_grad_(False)
 
     depth = DepthTask(networks.depth, model, clips, measured, recipe.depth, seed)
-    run("depth", recipe.depth, depth, processes)
-    exact, learned, shown = _input_folders(out / "inputs", recipe, networks.depth)
+    run("depth", depth, processes)
+    # inputs by exact depth, by learned depth, and of held-out clips; named by all that decides what is seen
+    memory = digest_of(model.memory, model.memory_frames, seed)
+    by_net = f"{memory}-{weights_digest(networks.depth.state_dict())}"
+    exact = out / "inputs" / "exact" / memory
+    learned, shown = (out / "inputs" / name / by_net for name in ("learned", "held-out"))
     make = partial(_make_all_inputs, recipe=recipe, stop=stop, workers=max(recipe.workers, processes.count))
     alone(lambda: make(exact, clips.paths[:: recipe.exact_every], None))
     alone(lambda: make(learned, clips.paths[:: recipe.learned_every], networks.depth))
@@ -107,12 +97,12 @@ def train_live(
         for part in range(recipe.paint.parts)
     ]
     paint = PaintTask(networks.paint, model, batches, clips.paths, views, recipe.paint.small_share)
-    run("paint", recipe.paint, paint, processes)
+    run("paint", paint, processes)
     path = out / f"{recipe.name}.safetensors"
 
     def finish() -> None:
         seen = ViewBatches(clips, inputs, model, recipe.detail.batch, seed + 1, carried["detail"])
-        run("detail", recipe.detail, DetailTask(networks.paint, networks.depth, model, seen, views), ALONE)
+        run("detail", DetailTask(networks.paint, networks.depth, model, seen, views), ALONE)
         calibrate(networks.cpu(), clips.paths, held_out, views, depth.class_weights, paint.class_weights)
         save_live(path, networks, recipe.name, overwrite=True)
         _log.info("wrote %s", path)
@@ -121,11 +111,32 @@ def train_live(
     return path
 
 
-def _input_folders(out: Path, recipe: LiveRecipe, depth: DepthNet) -> tuple[Path, Path, Path]:
-    """Of inputs by exact depth, by learned depth, and of held-out clips; named by all that decides what is seen."""
-    memory = digest_of(recipe.model.memory, recipe.model.memory_frames, recipe.seed)
-    by_net = f"{memory}-{weights_digest(depth.state_dict())}"
-    return out / "exact" / memory, out / "learned" / by_net, out / "held-out" / by_net
+def _train(
+    recipe: LiveRecipe, name: LiveStageName, task: Task, folder: RunFolder, stop: Event, processes: Processes
+) -> None:
+    """Train a stage to the end of its budget; its module then has the averaged weights."""
+    stage: LiveStage = getattr(recipe, name)
+    options = LoopOptions(
+        stage=name,
+        identity=digest_of(recipe.model.depth, recipe.model.paint, recipe.seed, name),
+        table=stage,
+        log=recipe.log,
+        stop=stop,
+        frames_per_clip=recipe.model.frames,
+        parts=stage.parts,
+        engine=Engine(processes=processes, compute=ComputeRecipe(parallel="ddp")),
+    )
+    loop = Loop(task, folder, options)
+    loop.run()
+    loop.adopt_average()
+
+
+def live_model(weights: str, *, device: str = "auto", dtype: str | None = None) -> LiveSynthesizer:
+    """A live model. Raises DataError for weights of another."""
+    loaded = load_synthesizer(weights, device=device, dtype=dtype)
+    if not isinstance(loaded, LiveSynthesizer):
+        raise DataError(f"{weights} is no live model; give the weights of one")
+    return loaded
 
 
 def _networks(recipe: LiveRecipe) -> LiveNetworks:
@@ -154,31 +165,6 @@ def _require_fit(recipe: LiveRecipe, learned: Sequence[Path], held_out: Sequence
             raise DataError(f"the recipe's model takes clips of [T, H, W] {wanted}, {path} has {found}")
 
 
-def _train(
-    recipe: LiveRecipe,
-    folder: RunFolder,
-    stop: Event,
-    name: LiveStageName,
-    stage: LiveStage,
-    task: Task,
-    processes: Processes,
-) -> None:
-    """Train a stage to the end of its budget; its module then has the averaged weights."""
-    options = LoopOptions(
-        stage=name,
-        identity=digest_of(recipe.model.depth, recipe.model.paint, recipe.seed, name),
-        table=stage,
-        log=recipe.log,
-        stop=stop,
-        frames_per_clip=recipe.model.frames,
-        parts=stage.parts,
-        engine=Engine(processes=processes, compute=ComputeRecipe(parallel="ddp")),
-    )
-    loop = Loop(task, folder, options)
-    loop.run()
-    loop.adopt_average()
-
-
 def _make_all_inputs(
     out: Path, paths: Sequence[Path], net: DepthNet | None, recipe: LiveRecipe, stop: Event, workers: int
 ) -> None:
@@ -204,106 +190,3 @@ def _inputs_of(out: Path, net: DepthNet | None, recipe: LiveRecipe, paths: list[
         make_inputs(out, paths, net, recipe.model, recipe.seed)
     finally:
         torch.set_num_threads(threads)
-
-
-# --- calibration -----------------------------------------------------------------------------------------------------
-
-
-@torch.no_grad()
-def calibrate(
-    networks: LiveNetworks,
-    learned: Sequence[Path],
-    paths: Sequence[Path],
-    views: HeldOutViews,
-    depth_weights: Tensor,
-    paint_weights: Tensor,
-) -> None:
-    """After the last stage, on the CPU: how likely a class is, how wide the spread, and what is another world's.
-
-    The losses make rare classes count for more, so their logits are too high by the logarithm of that; a share of it is
-    taken back. All is read off held-out clips, and written into the class biases of both networks and into the config.
-
-    learned: clips of the training. paths, views: of held-out clips. depth_weights, paint_weights: [K], how much the
-    losses made of each class.
-    """
-    networks.eval()
-    config = networks.config
-    depth_head, paint_head = networks.depth.head.out, networks.paint.head.out
-    _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, lambda: _source_classes(networks, paths))
-    _take_back(paint_head, 3, paint_weights, lambda: _view_classes(networks, views))
-    _learn_familiar(networks, learned, np.random.default_rng(0))
-    networks.config = msgspec.structs.replace(
-        config, spread_shift=_spread_shift(networks, paths), ood_threshold=_threshold(networks, paths)
-    )
-
-
-def _take_back(
-    head: nn.Conv2d, first: int, weights: Tensor, classes: Callable[[], Iterator[tuple[Tensor, Tensor]]]
-) -> None:
-    """Lower the biases of the classes, which begin at `first`, by that share of the weights with the best mean IoU.
-
-    classes: pairs of logits [N, K, H, W] and labels [N, H, W].
-    """
-    assert head.bias is not None
-    count, excess = len(weights), weights.log().cpu()  # of a training on the GPU
-    confusions = torch.zeros(len(_SHARES), count, count, dtype=torch.int64)
-    for logits, labels in classes():
-        for confusion, share in zip(confusions, _SHARES, strict=True):
-            confusion += confusion_matrix((logits - share * excess[:, None, None]).argmax(1), labels, count)
-    means = [class_iou(each)[each.sum(1) > 0].mean() for each in confusions]
-    best = _SHARES[int(torch.stack(means).argmax())]
-    head.bias[first : first + count] -= (best * excess).to(head.bias)
-
-
-def _source_classes(networks: LiveNetworks, paths: Sequence[Path]) -> Iterator[tuple[Tensor, Tensor]]:
-    for path in paths:
-        source = with_true_references(read_clip(path))
-        inputs = depth_inputs(source.video, source.rays, source.ground())
-        output = networks.depth(inputs, source.sweeps(networks.config.depth))
-        yield output.classes[_FRAMES], source.labels[_FRAMES]
-
-
-def _view_classes(networks: LiveNetworks, held_out: HeldOutViews) -> Iterator[tuple[Tensor, Tensor]]:
-    for views in held_out.views:
-        made = networks.paint.first_step(views.seen, filled(views.seen), networks.config.sigma_max, detail=False)
-        yield made.classes, views.labels
-
-
-def _spread_shift(networks: LiveNetworks, paths: Sequence[Path]) -> tuple[float, float, float]:
-    """Of painted, seen before and seen now, so that the 90 % interval holds 90 %."""
-    networks.config = msgspec.structs.replace(networks.config, spread_shift=(0.0, 0.0, 0.0))
-    model, histogram = LiveModel(networks=networks), SpreadHistogram()
-    for path in paths:
-        clip = read_clip(path)
-        views, truth = model.views(clip), (to_network(clip.arrays["target.rgb"]) + 1) / 2
-        assert views.log_variance is not None
-        assert views.visibility is not None
-        histogram.add((views.video - truth)[1:], views.log_variance[1:], views.visibility[1:])
-    return fit_spread(histogram)
-
-
-def _threshold(networks: LiveNetworks, paths: Sequence[Path]) -> float:
-    def score(output: DepthOutput) -> float:
-        return float(networks.familiarity.score(output.summary, read_depth(output, networks.config.depth).entropy))
-
-    frames = range(14)[_FRAMES]
-    means = [
-        np.mean([[score(output) for output in _outputs(networks, path, t)] for t in frames], axis=0).max()
-        for path in paths
-    ]
-    return min(_DOUBT * float(max(means)), 1.0)
-
-
-def _learn_familiar(networks: LiveNetworks, paths: Sequence[Path], random: np.random.Generator) -> None:
-    """From a frame of each of some clips that were learned from."""
-    some = [paths[i] for i in random.permutation(len(paths))[:_FAMILIAR]]
-    outputs = (each for path in some for each in _outputs(networks, path, int(random.integers(14))))
-    networks.familiarity.fit(torch.cat([each.summary for each in outputs]))
-
-
-def _outputs(networks: LiveNetworks, path: Path, t: int) -> Iterator[DepthOutput]:
-    """Of a frame of a clip's source: with its mount and an earlier frame, and without."""
-    frame = some_of(with_true_references(read_clip(path, slice(t + 1))), slice(-1, None))
-    ground = frame.ground()
-    yield networks.depth(depth_inputs(frame.video, frame.rays, ground), frame.sweeps(networks.config.depth))
-    yield networks.depth(depth_inputs(frame.video, frame.rays, torch.zeros_like(ground)))

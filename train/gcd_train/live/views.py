@@ -37,7 +37,7 @@ from gcd_train.live.batches import (
 from gcd_train.live.clips import (
     CAMERAS,
     Array,
-    Camera,
+    Cameras,
     LiveClip,
     Numbers,
     Poses,
@@ -61,27 +61,8 @@ _DRIFT = 0.15
 """Largest standard deviation of the colours' drift, for colours in [-1, 1]."""
 
 
-@torch.inference_mode()
-def learned_geometry(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Pictures:
-    """Source frames with depth, classes and motion as the depth network has them, computed where that is."""
-    device = next(net.parameters()).device
-    there = on(device, source)
-    with autocast(device):
-        output = net(depth_inputs(there.video, there.rays, ground.to(device)), there.sweeps(config.depth))
-    made = {"labels": output.classes.argmax(1), "moves": (output.moves >= 0).float()}
-    return on(torch.device("cpu"), replace(there, metres=read_depth(output, config.depth).metres, **made))
-
-
-def roughened(source: Pictures, random: Random) -> Pictures:
-    """Source frames whose depth is off by a few per cent in wide patches, as depth from anywhere is."""
-    metres = source.metres
-    rough = torch.from_numpy(random.normal(size=(len(metres), 1, 4, 6)) * _DEPTH_NOISE).float()
-    smooth = interpolate(rough, size=metres.shape[-2:], mode="bilinear")[:, 0]
-    return replace(source, metres=torch.where(metres < SKY_M, metres * smooth.exp(), metres))
-
-
 def splats_of(clip: LiveClip, source: Pictures, config: LiveConfig) -> list[Splat]:
-    """What the target camera of every frame sees of what the source has shown so far. source: see the two above."""
+    """What the target camera of every frame sees of what the source has shown so far, by the depth of `source`."""
     world, lens = SeenWorld(config), clip.lens("target")
     labels, static = source.labels.to(torch.uint8), source.moves < 0.5
     made: list[Splat] = []
@@ -122,11 +103,25 @@ def make_inputs(out: Path, paths: Sequence[Path], net: DepthNet | None, config: 
     for path in paths:
         clip = read_clip(path)
         source, random = with_true_references(clip), np.random.default_rng([seed, int(path.stem.replace("-", ""))])
-        if net is None:
-            source = roughened(source, random)
+        if net is None:  # off by a few per cent in wide patches, as depth from anywhere is
+            metres = source.metres
+            rough = torch.from_numpy(random.normal(size=(len(metres), 1, 4, 6)) * _DEPTH_NOISE).float()
+            smooth = interpolate(rough, size=metres.shape[-2:], mode="bilinear")[:, 0]
+            source = replace(source, metres=torch.where(metres < SKY_M, metres * smooth.exp(), metres))
         else:
-            source = learned_geometry(net, config, source, source.ground(random, whole=True))
+            source = _as_learned(net, config, source, source.ground(random, whole=True))
         write_inputs(out / path.parent.name / path.name, splats_of(clip, source, config))
+
+
+@torch.inference_mode()
+def _as_learned(net: DepthNet, config: LiveConfig, source: Pictures, ground: Tensor) -> Pictures:
+    """Source frames with depth, classes and motion as the depth network has them, computed where that is."""
+    device = next(net.parameters()).device
+    there = on(device, source)
+    with autocast(device):
+        output = net(depth_inputs(there.video, there.rays, ground.to(device)), there.sweeps(config.depth))
+    made = {"labels": output.classes.argmax(1), "moves": (output.moves >= 0).float()}
+    return on(torch.device("cpu"), replace(there, metres=read_depth(output, config.depth).metres, **made))
 
 
 def read_inputs(path: Path, frames: slice, names: Sequence[str] = INPUTS) -> dict[str, Array]:
@@ -156,21 +151,17 @@ def views_of(path: Path, inputs: Path, frames: slice) -> Views:
     """Some frames of a clip, with what is seen of them as it is stored there, and with a declared floor."""
     clip = read_clip(path, frames, [*(f"{name}.pose" for name in CAMERAS), *PIXELS])
     arrays = {name: tensor_of(array) for name, array in (clip.arrays | read_inputs(inputs, frames)).items()}
-    sources, targets = (clip.arrays[f"{name}.pose"] for name in CAMERAS)
-    n = len(targets)
-    return _views(arrays, [clip.camera("target")] * n, sources, targets, np.full(n, True))
+    targets = clip.cameras("target")
+    return _views(arrays, clip.arrays["source.pose"], targets, np.full(len(targets.poses), True))
 
 
-def _views(
-    arrays: dict[str, Tensor], cameras: Sequence[Camera], sources: Poses, targets: Poses, ground: Array
-) -> Views:
-    """arrays: as clips and inputs have them, of N frames. cameras: the targets'; their poses and the sources',
-    [N, 4, 4]. ground: bool [N], where it is told.
+def _views(arrays: dict[str, Tensor], sources: Poses, cameras: Cameras, ground: Array) -> Views:
+    """arrays: as clips and inputs have them, of N frames. sources: poses [N, 4, 4]; cameras: the targets'. ground:
+    bool [N], where it is told.
     """
-    target, lenses = to_network(arrays["target.rgb"]), tuple(camera.lens for camera in cameras)
-    heights = [camera.height_m(pose) for camera, pose in zip(cameras, targets, strict=True)]
-    rays = rays_of(lenses, target.device)
-    floor = plane_depth(rays, on_device(targets[:, 2, :3].copy(), target), on_device(heights, target))
+    target, poses = to_network(arrays["target.rgb"]), cameras.poses
+    rays = rays_of(cameras.lenses, target.device)
+    floor = plane_depth(rays, on_device(poses[:, 2, :3].copy(), target), on_device(cameras.heights_m, target))
     coverage = arrays["coverage"].float() / 255
     covered = coverage > 0
     share = (arrays["label_share"].float() / 255 * covered)[:, None]
@@ -186,7 +177,7 @@ def _views(
         painted_coverage=torch.zeros_like(coverage),
         rays=rays,
         ground_m=floor * on_device(ground, target)[:, None, None],
-        camera=camera_features(torch.from_numpy(np.linalg.inv(sources) @ targets)).to(target.device),
+        camera=camera_features(torch.from_numpy(np.linalg.inv(sources) @ poses)).to(target.device),
     )
     return Views(
         seen=seen,
@@ -194,8 +185,8 @@ def _views(
         labels=arrays["target.labels"].long(),
         log_depth=decode_depth(arrays["target.depth"]).log(),
         visibility=arrays["target.visibility"].long(),
-        poses=torch.from_numpy(targets),
-        lenses=lenses,
+        poses=torch.from_numpy(poses),
+        lenses=cameras.lenses,
     )
 
 
@@ -257,8 +248,8 @@ class ViewBatches:
             """The first so many, some frames earlier."""
             times, some = frames[:count] - back, clips[:count]
             arrays = self._clips.take(some, times, PIXELS) | self._inputs.take(inputs[:count], times, INPUTS)
-            sources, targets = (self._clips.poses(name, some, times) for name in CAMERAS)
-            return look(_views(arrays, self._clips.cameras("target", some), sources, targets, ground[:count]))
+            sources, targets = (self._clips.cameras(name, some, times) for name in CAMERAS)
+            return look(_views(arrays, sources.poses, targets, ground[:count]))
 
         return tuple(views(back, carried) for back in range(run, 0, -1)), views(0, self._size), random
 
@@ -288,14 +279,8 @@ def mirrored(views: Views) -> Views:
     turned = {f.name: getattr(seen, f.name).flip(-1) for f in fields(seen) if f.name not in fixed}
     # x becomes -x in both cameras: rotation entries that mix x with another axis change sign, and so does the move in x
     signs = torch.tensor([1.0, -1, -1, -1, 1, 1, -1, 1, 1, -1, 1, 1], device=seen.camera.device)
-    return replace(
-        views,
-        seen=replace(seen, **turned, camera=seen.camera * signs),
-        target=views.target.flip(-1),
-        labels=views.labels.flip(-1),
-        log_depth=views.log_depth.flip(-1),
-        visibility=views.visibility.flip(-1),
-    )
+    truth = {name: getattr(views, name).flip(-1) for name in ("target", "labels", "log_depth", "visibility")}
+    return replace(views, seen=replace(seen, **turned, camera=seen.camera * signs), **truth)
 
 
 @torch.no_grad()

@@ -6,7 +6,7 @@ writers know nothing else.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from typing import Any, Self, TypeVar
 
@@ -181,75 +181,62 @@ class Tracks:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class SceneObject:
-    """What is known of a thing beyond its picture: as the metadata of Kubric-4D tells it.
+class SceneObject(Thing):
+    """What is known of a thing in a scene beyond its picture: as the metadata of Kubric-4D tells it.
 
-    name: which asset it is. instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id.
-    size, middle, dynamic: as in `Thing`. positions, quaternions, velocities, angular_velocities: [T, 3 or 4], as in
-    `Tracks`.
+    instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id. positions, quaternions,
+    velocities, angular_velocities: [T, 3 or 4], as in `Tracks`.
     """
 
-    name: str
     instance: int
     body: int
     label: int
-    size: Point
-    dynamic: bool
-    mass_kg: float
-    friction: float
-    restitution: float
     positions: Doubles
     quaternions: Doubles
     velocities: Doubles
     angular_velocities: Doubles
-    middle: Point = (0.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, thing: Thing, tracks: Tracks, number: int, *, instance: int, body: int, label: int) -> Self:
         """A thing whose motion is number so-and-so of the tracks."""
-        return cls(
-            name=thing.name,
-            instance=instance,
-            body=body,
-            label=label,
-            size=thing.size,
-            middle=thing.middle,
-            dynamic=thing.dynamic,
-            mass_kg=thing.mass_kg,
-            friction=thing.friction,
-            restitution=thing.restitution,
-            positions=tracks.positions[:, number],
-            quaternions=tracks.quaternions[:, number],
-            velocities=tracks.velocities[:, number],
-            angular_velocities=tracks.angular_velocities[:, number],
-        )
+        known = {each.name: getattr(thing, each.name) for each in fields(Thing)}
+        motion = {each.name: getattr(tracks, each.name)[:, number] for each in fields(Tracks)}
+        return cls(**known, **motion, instance=instance, body=body, label=label)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Scene:
-    """One clip's world.
+class Staging:
+    """What the renderer needs of a scene beside what there is.
 
-    parts, sheets: what there is. poses: [T, B, 3, 4], world_from_body of each body at each time step; body 0 stands at
-    the origin (see `upright`). focus: [T, 3], the point around which shadows are cast. cameras: name ->
-    world_from_camera [T, 4, 4] (x right, y down, z ahead). hfov_deg: of every camera. objects: what more is told of
-    things, where a world knows more. facts: what the metadata says about the whole scene.
+    poses: [T, B, 3, 4], world_from_body of each body at each time step; body 0 stands at the origin (see `upright`).
+    focus: [T, 3], the point around which shadows are cast. hfov_deg: of every camera.
     """
 
-    parts: tuple[Part, ...]
-    sheets: tuple[Sheet, ...]
     poses: Floats
     focus: Floats
-    cameras: dict[str, Doubles]
     hfov_deg: float
     light: Light
-    facts: dict[str, float | str] = field(default_factory=dict[str, float | str])
-    objects: tuple[SceneObject, ...] = ()
     extent: Extent = STREET
 
     @property
     def frames(self) -> int:
         """T."""
         return self.poses.shape[0]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Scene(Staging):
+    """One clip's world.
+
+    parts, sheets: what there is. cameras: name -> world_from_camera [T, 4, 4] (x right, y down, z ahead). objects: what
+    more is told of things, where a world knows more. facts: what the metadata says about the whole scene.
+    """
+
+    parts: tuple[Part, ...]
+    sheets: tuple[Sheet, ...]
+    cameras: dict[str, Doubles]
+    facts: dict[str, float | str] = field(default_factory=dict[str, float | str])
+    objects: tuple[SceneObject, ...] = ()
 
     def clear_of_things(self, eyes: Doubles, steps: Sequence[int]) -> bool:
         """Whether cameras at `eyes` [C, S, 3] at time steps [S] keep a unit away from the sphere about any thing.
@@ -284,6 +271,11 @@ def rotations(quaternions: NDArray[Any]) -> NDArray[Any]:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def moved(a_from_b: NDArray[Any], points: NDArray[Any]) -> NDArray[Any]:
+    """Points [..., 3] of one frame in another, by a rigid transform [4, 4]."""
+    return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
 def with_world(turns: Doubles, positions: Doubles) -> Floats:

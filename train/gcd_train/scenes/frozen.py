@@ -5,7 +5,7 @@ anything again.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import groupby, pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -20,15 +20,13 @@ from gcd_train.data.files import read_npz
 from gcd_train.errors import DataError
 from gcd_train.scenes.description import (
     DOMES,
-    STREET,
     Extent,
-    Floats,
     Light,
     Paint,
     Part,
     Pattern,
     Scene,
-    Sheet,
+    Staging,
     rotations,
     upright,
 )
@@ -56,23 +54,10 @@ class _Facts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class FrozenScene:
-    """What the renderer needs.
-
-    vertices: [N] of `VERTEX`, three in a row are a triangle, in their bodies' frames. The rest as in `Scene`.
-    """
+class FrozenScene(Staging):
+    """What the renderer needs. vertices: [N] of `VERTEX`, three in a row are a triangle, in their bodies' frames."""
 
     vertices: Vertices
-    poses: Floats
-    focus: Floats
-    hfov_deg: float
-    light: Light
-    extent: Extent = STREET
-
-    @property
-    def frames(self) -> int:
-        """T."""
-        return self.poses.shape[0]
 
     def save(self, file: BinaryIO) -> None:
         """Write it as a compressed npz."""
@@ -103,14 +88,8 @@ class FrozenScene:
 
 def freeze(scene: Scene) -> FrozenScene:
     """A scene's triangles and motion, without its cameras."""
-    return FrozenScene(
-        vertices=vertices_of(scene),
-        poses=scene.poses,
-        focus=scene.focus,
-        hfov_deg=scene.hfov_deg,
-        light=scene.light,
-        extent=scene.extent,
-    )
+    staging = {each.name: getattr(scene, each.name) for each in fields(Staging)}
+    return FrozenScene(vertices=vertices_of(scene), **staging)
 
 
 def vertices_of(scene: Scene) -> Vertices:
@@ -127,8 +106,12 @@ def vertices_of(scene: Scene) -> Vertices:
     place, tags = standing["position"][:, 0], standing["tags"][:, 0]
     away = np.where(tags[:, 2] > 0, 0.0, np.hypot(place[:, 0], place[:, 1]))
     standing = standing[np.lexsort((away, _paint(tags[:, 3], standing["colour"][:, 0, 3])))]
-    lying = [_of_sheet(sheet).reshape(-1, 3) for sheet in reversed(scene.sheets)]
-    return np.concatenate([standing, *lying, parts[is_sky]]).reshape(-1)
+    lying = [np.empty((len(sheet.corners), 3), VERTEX) for sheet in scene.sheets]
+    for made, sheet in zip(lying, scene.sheets, strict=True):
+        made["position"], made["normal"] = sheet.corners, (0.0, 0.0, 1.0)
+        made["colour"], made["accent"] = _bytes(sheet.paint)
+        made["tags"] = (sheet.label, 0, 0, sheet.paint.pattern)
+    return np.concatenate([standing, *reversed(lying), parts[is_sky]]).reshape(-1)
 
 
 def _paint(pattern: NDArray[np.uint8], gloss: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -153,15 +136,6 @@ def _of_parts(name: str, parts: list[Part]) -> Vertices:
     made["colour"], made["accent"] = paints[:, :1], paints[:, 1:]
     made["tags"] = np.array([(p.label, p.instance, p.body, p.paint.pattern) for p in parts], np.uint8)[:, None]
     return made.reshape(-1)
-
-
-def _of_sheet(sheet: Sheet) -> Vertices:
-    made = np.empty(sheet.corners.shape[0] * 3, VERTEX)
-    made["position"] = sheet.corners.reshape(-1, 3)
-    made["normal"] = (0.0, 0.0, 1.0)
-    made["colour"], made["accent"] = _bytes(sheet.paint)
-    made["tags"] = (sheet.label, 0, 0, sheet.paint.pattern)
-    return made
 
 
 def _bytes(paint: Paint) -> list[tuple[int, ...]]:

@@ -12,10 +12,11 @@ import re
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
 from functools import partial
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -29,26 +30,13 @@ from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RenderError
 from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.driving import driving_scene
+from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.frozen import freeze
-from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.renderer import Renderer, Rendering, stacked
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, agree, scene_world
 
 _ABANDONED_S = 3600.0  # no shard takes so long
 _ATTEMPTS = 100
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DrawnClip:
-    """facts: of the scene and its lens. cameras: "source" and "target", world_from_camera [T, 4, 4]. orbit: None in
-    driving.
-    """
-
-    seed: int
-    facts: dict[str, float | str]
-    cameras: dict[str, NDArray[np.float64]]
-    views: dict[str, list[Rendering]]
-    orbit: Orbit | None = None
 
 
 def generate(out: Path, world: World, seeds: range, workers: int, ray_address: str | None = None) -> Iterator[int]:
@@ -109,79 +97,58 @@ def write_shard(out: Path, world: World, seeds: range) -> None:
             Renderer(world.width, world.height, oversample=world.oversample) as renderer,
             zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as archive,
         ):
-            for clip in drawn_clips(renderer, world, seeds):
-                _store(archive, clip)
+            for scene_seed, group in groupby(seeds, key=world.scene_of):
+                for seed, facts, views in _drawn_clips(renderer, world, scene_seed, list(group)):
+                    archive.writestr(f"{seed:08d}/scene.json", json.dumps(facts))
+                    for name, strip in _strips(views, classes=world.camera == "fixed"):
+                        _, data = cv2.imencode(".png", strip, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                        archive.writestr(f"{seed:08d}/{name}.png", data.tobytes())
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
 
 
-def _store(archive: zipfile.ZipFile, clip: DrawnClip) -> None:
-    name = f"{clip.seed:08d}"
-    poses = {camera: np.round(poses, 6).tolist() for camera, poses in clip.cameras.items()}
-    scene: dict[str, Any] = {"facts": clip.facts, "world_from_camera": poses}
-    if clip.orbit is not None:
-        scene["orbit"] = msgspec.to_builtins(clip.orbit)
-    archive.writestr(f"{name}/scene.json", json.dumps(scene))
-    for camera, frames in clip.views.items():
-        depth = np.concatenate([frame.depth for frame in frames])
-        strips: dict[str, NDArray[Any]] = {
-            "rgb": np.concatenate([frame.rgb for frame in frames])[..., ::-1],
-            "depth": np.rint(depth / DEPTH_UNIT_M).clip(0, 65535).astype(np.uint16),
-            "instances": np.concatenate([frame.instances for frame in frames]),
-        }
-        if clip.orbit is None:
-            strips["classes"] = np.concatenate([frame.classes for frame in frames])
-        for kind, strip in strips.items():
-            _, data = cv2.imencode(".png", strip, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-            archive.writestr(f"{name}/{camera}.{kind}.png", data.tobytes())
+def _strips(views: dict[str, Rendering], *, classes: bool) -> Iterator[tuple[str, NDArray[Any]]]:
+    for camera, view in views.items():
+        depth = np.rint(view.depth / DEPTH_UNIT_M).clip(0, 65535).astype(np.uint16)
+        strips = {"rgb": view.rgb[..., ::-1], "depth": depth, "instances": view.instances}
+        if classes:
+            strips["classes"] = view.classes
+        yield from ((f"{camera}.{kind}", strip.reshape(-1, *strip.shape[2:])) for kind, strip in strips.items())
 
 
-def drawn_clips(renderer: Renderer, world: World, seeds: Sequence[int]) -> Iterator[DrawnClip]:
-    """Clips by number, each scene simulated once for those of its clips that follow each other.
+def _drawn_clips(
+    renderer: Renderer, world: World, scene_seed: int, seeds: list[int]
+) -> Iterator[tuple[int, dict[str, Any], dict[str, Rendering]]]:
+    """Number, metadata and views of clips of a scene, in one pass: their time steps follow each other, so it is
+    simulated and sent to the renderer once.
 
-    Raises:
-        RenderError: a scene cannot be simulated or drawn, or leaves no room for a camera.
+    Raises: RenderError: the scene cannot be simulated or drawn, or leaves no room for a camera.
     """
-    for scene_seed, group in groupby(seeds, key=world.scene_of):
-        if world.camera == "fixed":
-            yield from (_fixed(renderer, world, seed) for seed in group)
-        else:
-            yield from _orbits(renderer, world, scene_seed, list(group))
-
-
-def _fixed(renderer: Renderer, world: World, seed: int) -> DrawnClip:
-    mount = CameraMount(height_m=world.options.height_m, tilt_deg=world.options.tilt_deg)
-    scene = driving_scene(seed, frames=world.frames, mount=mount, move_time=world.move_time)
-    facts = {**scene.facts, "hfov_deg": scene.hfov_deg}
-    return DrawnClip(seed=seed, facts=facts, cameras=scene.cameras, views=renderer.render(scene))
-
-
-def _orbits(renderer: Renderer, world: World, scene_seed: int, seeds: list[int]) -> Iterator[DrawnClip]:
-    """All clips of a scene in one pass: their time steps follow each other, so it is sent to the renderer once."""
-    published = scene_world(world.name)
-    scene = published.make(scene_seed, published.frames)
-    draws = [orbit_draw(scene, world, seed) for seed in seeds]
-    numbers = np.concatenate([draw.frame_numbers for draw in draws])
-    cameras = {
-        "source": np.concatenate([np.tile(draw.world_from_source, (world.frames, 1, 1)) for draw in draws]),
-        "target": np.concatenate([draw.world_from_target for draw in draws]),
-    }
-    cut = replace(freeze(scene), poses=scene.poses[numbers], focus=scene.focus[numbers], hfov_deg=world.hfov_deg)
-    views: dict[str, list[Rendering]] = {name: [] for name in cameras}
-    for step, name, view in renderer.views(cut, cameras):
-        views[name].append(view)
-        clip, frame = divmod(step, world.frames)
-        if name == "target" and frame == world.frames - 1:
+    draws: list[Draw] = []
+    if world.camera == "fixed":
+        mount = CameraMount(height_m=world.options.height_m, tilt_deg=world.options.tilt_deg)
+        scene = driving_scene(scene_seed, frames=world.frames, mount=mount, move_time=world.move_time)
+        cut, cameras = freeze(scene), scene.cameras
+    else:
+        published = scene_world(world.name)
+        scene = published.make(scene_seed, published.frames)
+        draws = [orbit_draw(scene, world, seed) for seed in seeds]
+        numbers = np.concatenate([draw.frame_numbers for draw in draws])
+        cameras = {
+            "source": np.concatenate([np.tile(draw.world_from_source, (world.frames, 1, 1)) for draw in draws]),
+            "target": np.concatenate([draw.world_from_target for draw in draws]),
+        }
+        cut = replace(freeze(scene), poses=scene.poses[numbers], focus=scene.focus[numbers], hfov_deg=world.hfov_deg)
+    with closing(renderer.views(cut, cameras)) as drawn:
+        for clip, seed in enumerate(seeds):
             steps = slice(clip * world.frames, (clip + 1) * world.frames)
-            yield DrawnClip(
-                seed=seeds[clip],
-                facts={**scene.facts, "hfov_deg": world.hfov_deg},
-                cameras={name: poses[steps] for name, poses in cameras.items()},
-                views=views,
-                orbit=_orbit(draws[clip]),
-            )
-            views = {name: [] for name in cameras}
+            views = stacked(islice(drawn, len(cameras) * world.frames))
+            poses = {name: np.round(rows[steps], 6).tolist() for name, rows in cameras.items()}
+            facts: dict[str, Any] = {"facts": {**scene.facts, "hfov_deg": cut.hfov_deg}, "world_from_camera": poses}
+            if draws:
+                facts["orbit"] = msgspec.to_builtins(_orbit(draws[clip]))
+            yield seed, facts, views
 
 
 def orbit_draw(scene: Scene, world: World, seed: int) -> Draw:
@@ -204,9 +171,5 @@ def orbit_draw(scene: Scene, world: World, seed: int) -> Draw:
 def _orbit(draw: Draw) -> Orbit:
     assert draw.start is not None
     assert draw.deltas is not None
-    azimuth_deg, elevation_deg, radius_m = draw.deltas[-1].tolist()
-    return Orbit(
-        start=(draw.start.azimuth_deg, draw.start.elevation_deg, draw.start.radius_m),
-        change=(azimuth_deg, elevation_deg, radius_m),
-        frame_numbers=draw.frame_numbers,
-    )
+    start = (draw.start.azimuth_deg, draw.start.elevation_deg, draw.start.radius_m)
+    return Orbit(start=start, change=tuple(draw.deltas[-1].tolist()), frame_numbers=draw.frame_numbers)

@@ -122,15 +122,6 @@ def _arc(centre: tuple[float, float], radius: float, start_deg: float, end_deg: 
     return [(max(centre[0] + radius * float(np.cos(a)), 0.0), centre[1] + radius * float(np.sin(a))) for a in angles]
 
 
-def _outward(triangles: Triangles) -> Triangles:
-    """The triangles wound so that, seen from outside, their corners run anticlockwise (the shapes are convex)."""
-    corners, normals = triangles
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = (face * corners.mean(1)).sum(-1) < 0
-    corners[inward], normals[inward] = corners[inward][:, ::-1], normals[inward][:, ::-1]
-    return corners, normals
-
-
 @cache
 def shape(name: str) -> Triangles:
     """Corners and normals of a unit shape, cached.
@@ -140,8 +131,13 @@ def shape(name: str) -> Triangles:
     size (2 r, 2 r, length) wants a length of 4 r for round ends), icosahedron. Convex too: barrel. Concave:
     torus (0.28 thick), tube, bottle (0.36 wide), bowl (0.48 high), vase (0.58 wide), spool, pot.
     """
-    made = _MADE[name]() if name in _MADE else _revolved(_PROFILES[name], closed=name in ("torus", "tube"))
-    return _outward(made) if name in CONVEX else made
+    closed = name in ("torus", "tube")
+    corners, normals = _MADE[name]() if name in _MADE else _revolved(_PROFILES[name], closed=closed)
+    if name in CONVEX:  # wound so that, seen from outside, the corners of triangles run anticlockwise
+        face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        inward = (face * corners.mean(1)).sum(-1) < 0
+        corners[inward], normals[inward] = corners[inward][:, ::-1], normals[inward][:, ::-1]
+    return corners, normals
 
 
 _MADE: dict[str, Callable[[], Triangles]] = {

@@ -5,10 +5,9 @@ one call per way of painting (`shaders`), which is a handful. Works on software 
 """
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import cache
-from types import TracebackType
 from typing import Any, Self
 
 import cv2
@@ -16,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.description import Extent, Floats, Light, Scene
-from gcd_train.scenes.frozen import VERTEX, FrozenScene, Run, freeze, indexed, runs_of
+from gcd_train.scenes.description import Doubles, Extent, Floats
+from gcd_train.scenes.frozen import VERTEX, FrozenScene, Run, indexed, runs_of
 from gcd_train.scenes.shaders import SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
 
 
-def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> NDArray[np.float64]:
+def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> Doubles:
     """From camera axes (x right, y down, z ahead) to OpenGL's clip space: [4, 4]. aspect: width over height."""
     near, far = extent.near_m, extent.far_m
     focal = 1 / math.tan(math.radians(hfov_deg) / 2)
@@ -34,7 +33,7 @@ def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> NDArray[
     return matrix
 
 
-def sunlight_from_world(sun_to: NDArray[np.float64], focus: NDArray[np.float64], extent: Extent) -> NDArray[np.float64]:
+def sunlight_from_world(sun_to: Doubles, focus: Doubles, extent: Extent) -> Doubles:
     """Orthographic view along the sunlight around `focus`, snapped to whole shadow pixels against flicker: [4, 4].
 
     sun_to: [3], unit vector. focus: [3], metres.
@@ -75,7 +74,7 @@ class Rendering:
     """One view of one time step.
 
     rgb: u8 [H, W, 3]. depth: f32 [H, W], metres along the optical axis, 0 where there is only sky.
-    classes, instances, bodies: u8 [H, W]; bodies index `Scene.poses`.
+    classes, instances, bodies: u8 [H, W]; bodies index `Scene.poses`. Of several time steps all are [T, ...].
     """
 
     rgb: NDArray[np.uint8]
@@ -83,15 +82,6 @@ class Rendering:
     classes: NDArray[np.uint8]
     instances: NDArray[np.uint8]
     bodies: NDArray[np.uint8]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Uploaded:
-    """A scene in the context's memory: its triangles as each way of painting reads them, and as the shadow map does."""
-
-    buffers: tuple[Any, Any]
-    runs: tuple[tuple[Run, Any], ...]
-    shadow: Any
 
 
 class Renderer:
@@ -102,11 +92,10 @@ class Renderer:
     """
 
     def __init__(self, width: int, height: int, *, oversample: int = 2) -> None:
-        self._width, self._height, self._oversample = width, height, oversample
+        self._oversample, self._size = oversample, (width * oversample, height * oversample)
         self._context = _context()
         self._shadow_program = self._program(SHADOW_VERTEX, SHADOW_FRAGMENT)
         self._programs: dict[tuple[int, bool], Any] = {}
-        self._size = (width * oversample, height * oversample)
         colour = self._context.renderbuffer(self._size, 4)
         facts = self._context.renderbuffer(self._size, 2, dtype="f4")
         self._target = self._context.framebuffer([colour, facts], self._context.depth_renderbuffer(self._size))
@@ -116,57 +105,52 @@ class Renderer:
         self._frame = np.zeros((), _Frame)
         self._frame_block = self._context.buffer(reserve=_Frame.itemsize, dynamic=True)
 
-    def render(self, scene: Scene) -> dict[str, list[Rendering]]:
-        """Every camera of a scene, at every time step.
-
-        Raises: RenderError if there are more bodies than the renderer can move.
-        """
-        made: dict[str, list[Rendering]] = {name: [] for name in scene.cameras}
-        for _, name, view in self.views(freeze(scene), scene.cameras):
-            made[name].append(view)
-        return made
-
     def views(
-        self,
-        scene: FrozenScene,
-        cameras: Mapping[str, NDArray[np.float64]],
-        hfov_deg: Mapping[str, float] | None = None,
-    ) -> Iterator[tuple[int, str, Rendering]]:
+        self, scene: FrozenScene, cameras: Mapping[str, Doubles], hfov_deg: Mapping[str, float] | None = None
+    ) -> Generator[tuple[int, str, Rendering], None, None]:
         """Time step, camera and view, one after the other, so that a long scene needs no memory for all.
 
         cameras: name -> world_from_camera [T, 4, 4]. All cameras of a time step follow each other.
         hfov_deg: name -> horizontal field of view; by default every camera has the scene's.
         Raises: RenderError if there are more bodies than the renderer can move.
         """
-        if scene.poses.shape[1] > _BODIES:
-            raise RenderError(f"a scene may have {_BODIES} bodies, got {scene.poses.shape[1]}; split it")
-        with self._context:  # the one in use may be another renderer's
-            drawn = self._uploaded(scene)
-            self._set_scene(scene.light, scene.extent)
+        bodies = scene.poses.shape[1]
+        if bodies > _BODIES:
+            raise RenderError(f"a scene may have {_BODIES} bodies, got {bodies}; split it")
+        context, pixels = self._context, (scene.extent.shadow_pixels, scene.extent.shadow_pixels)
+        with context:  # the one in use may be another renderer's
+            corners, indices = indexed(scene.vertices)
+            buffer, index = context.buffer(corners.tobytes()), context.buffer(indices.tobytes())
+            drawn = [(run, self._array(buffer, index, run)) for run in runs_of(scene.vertices)]
+            casting = context.vertex_array(self._shadow_program, [_taking(buffer, "position", "tags")], index)
+            for name in _LIGHTS:
+                self._frame[name] = (*getattr(scene.light, name), 0.0)
+            for name in _NUMBERS:
+                self._frame[name] = getattr(scene.light, name)
+            self._frame["shadow_lift"] = _LIFT * scene.extent.shadow_radius_m
+            if self._shadow is None or self._shadow.size != pixels:
+                self._shadow = context.depth_texture(pixels)
+                self._shadow.compare_func = "<="
+                self._shadow_target = context.framebuffer(depth_attachment=self._shadow)
         try:
             for step in range(scene.frames):
-                with self._context:
-                    self._move(scene.poses[step])
-                    self._cast(scene, step, drawn)
+                with context:
+                    self._move(scene, step, casting)
                 for name, poses in cameras.items():
-                    with self._context:
-                        lens_deg = scene.hfov_deg if hfov_deg is None else hfov_deg[name]
+                    lens_deg = scene.hfov_deg if hfov_deg is None else hfov_deg[name]
+                    with context:
                         view = self._view(poses[step], lens_deg, scene.extent, drawn)
                     yield step, name, view
         finally:
-            with self._context:
-                for resource in (*(array for _, array in drawn.runs), drawn.shadow, *drawn.buffers):
+            with context:
+                for resource in (*(array for _, array in drawn), casting, buffer, index):
                     resource.release()
 
-    def _uploaded(self, scene: FrozenScene) -> "_Uploaded":
-        runs = runs_of(scene.vertices)
-        corners, indices = indexed(scene.vertices)
-        buffer, index = self._context.buffer(corners.tobytes()), self._context.buffer(indices.tobytes())
-        return _Uploaded(
-            buffers=(buffer, index),
-            runs=tuple((run, self._array(buffer, index, run)) for run in runs),
-            shadow=self._context.vertex_array(self._shadow_program, [_taking(buffer, "position", "tags")], index),
-        )
+    def render(
+        self, scene: FrozenScene, cameras: Mapping[str, Doubles], hfov_deg: Mapping[str, float] | None = None
+    ) -> dict[str, Rendering]:
+        """Every camera's views of all time steps, [T, ...]; see `views`."""
+        return stacked(self.views(scene, cameras, hfov_deg))
 
     def _program(self, vertex: str, fragment: str) -> Any:
         program = self._context.program(vertex_shader=vertex, fragment_shader=fragment)
@@ -185,65 +169,50 @@ class Renderer:
         wanted = [name for name in _FIELDS if name in program]
         return self._context.vertex_array(program, [_taking(buffer, *wanted)], index)
 
-    def _set_scene(self, light: Light, extent: Extent) -> None:
-        for name in _LIGHTS:
-            self._frame[name] = (*getattr(light, name), 0.0)
-        for name in _NUMBERS:
-            self._frame[name] = getattr(light, name)
-        self._frame["shadow_lift"] = _LIFT * extent.shadow_radius_m
-        pixels = (extent.shadow_pixels, extent.shadow_pixels)
-        if self._shadow is None or self._shadow.size != pixels:
-            self._shadow = self._context.depth_texture(pixels)
-            self._shadow.compare_func = "<="
-            self._shadow_target = self._context.framebuffer(depth_attachment=self._shadow)
-
-    def _move(self, poses: Floats) -> None:
+    def _move(self, scene: FrozenScene, step: int, casting: Any) -> None:
+        """Put bodies where they are at a time step, and draw the shadow map."""
         rows = np.zeros((_BODIES, 3, 4), np.float32)
-        rows[: len(poses)] = poses
+        rows[: scene.poses.shape[1]] = scene.poses[step]
         self._bodies.write(rows.tobytes())
         self._bodies.use(0)
-
-    def _cast(self, scene: FrozenScene, step: int, drawn: _Uploaded) -> None:
         sun_to, focus = np.asarray(scene.light.sun_to), scene.focus[step].astype(np.float64)
-        light_from_world = sunlight_from_world(sun_to, focus, scene.extent)
-        self._frame["light_from_world"] = light_from_world.T.ravel()
+        self._frame["light_from_world"] = sunlight_from_world(sun_to, focus, scene.extent).T.ravel()
         self._use_frame()
         self._shadow_target.use()
         self._context.enable_only(self._context.DEPTH_TEST)
         self._shadow_target.clear(depth=1.0)
-        drawn.shadow.render()
+        casting.render()
 
     def _use_frame(self) -> None:
         self._frame_block.write(self._frame.tobytes())
         self._frame_block.bind_to_uniform_block(0)
 
     def _view(
-        self, world_from_camera: NDArray[np.float64], hfov_deg: float, extent: Extent, drawn: _Uploaded
+        self, world_from_camera: Doubles, hfov_deg: float, extent: Extent, drawn: Sequence[tuple[Run, Any]]
     ) -> Rendering:
         self._target.use()
         self._context.enable_only(self._context.DEPTH_TEST | self._context.CULL_FACE)
         self._target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         self._shadow.use(1)
-        lens = clip_from_camera(hfov_deg, self._width / self._height, extent)
-        clip_from_world = lens @ np.linalg.inv(world_from_camera)
-        self._frame["clip_from_world"] = clip_from_world.T.ravel()
+        n, (wide, high) = self._oversample, self._size
+        lens = clip_from_camera(hfov_deg, wide / high, extent)
+        self._frame["clip_from_world"] = (lens @ np.linalg.inv(world_from_camera)).T.ravel()
         self._frame["eye"][:3] = world_from_camera[:3, 3]
         self._frame["ahead"][:3] = world_from_camera[:3, 2]
         self._use_frame()
-        for run, array in drawn.runs:
+        for run, array in drawn:
             array.render(vertices=run.count, first=run.first)
-        return self._read()
-
-    def _read(self) -> Rendering:
-        n = self._oversample
-        wide, high = self._size
         # four components and whole pixels are copied as they are; any other choice is converted one by one
         colour = np.frombuffer(self._target.read(components=4, attachment=0), np.uint8).reshape(high, wide, 4)
         facts = np.frombuffer(self._target.read(components=2, attachment=1, dtype="f4"), np.uint64)
         picked = facts.reshape(high, wide)[::-1][n // 2 :: n, n // 2 :: n].copy().view(np.float32)
         labels = picked[:, 1::2].astype(np.uint32)  # below 2^24, exact in float32
+        rgb = np.asarray(cv2.flip(cv2.cvtColor(colour, cv2.COLOR_RGBA2RGB), 0), np.uint8)
+        if n > 1:
+            mean = cv2.resize(rgb.astype(np.float32), (wide // n, high // n), interpolation=cv2.INTER_AREA)
+            rgb = np.rint(mean).astype(np.uint8)
         return Rendering(
-            rgb=_averaged(colour, n),
+            rgb=rgb,
             depth=np.ascontiguousarray(picked[:, ::2]),
             classes=(labels & 255).astype(np.uint8),
             instances=(labels >> 8 & 255).astype(np.uint8),
@@ -257,10 +226,20 @@ class Renderer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def stacked(views: Iterable[tuple[int, str, Rendering]]) -> dict[str, Rendering]:
+    """Each camera's views in their order as one, [T, ...], of what `Renderer.views` gives."""
+    each: dict[str, list[Rendering]] = {}
+    for _, name, view in views:
+        each.setdefault(name, []).append(view)
+    names = [field.name for field in fields(Rendering)]
+    return {
+        camera: Rendering(**{name: np.stack([getattr(view, name) for view in some]) for name in names})
+        for camera, some in each.items()
+    }
 
 
 @cache
@@ -286,13 +265,3 @@ def _taking(buffer: Any, *names: str) -> tuple[Any, ...]:
     """A vertex buffer with the fields that a program wants; the others are stepped over."""
     layout = [_FIELDS[name] if name in names else f"{VERTEX[name].itemsize}x" for name in _FIELDS]
     return (buffer, " ".join(layout), *names)
-
-
-def _averaged(colour: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
-    """The picture as OpenGL has it, the right way up, n x n pixels averaged: u8 [H * n, W * n, 4] as [H, W, 3]."""
-    opaque = np.asarray(cv2.flip(cv2.cvtColor(colour, cv2.COLOR_RGBA2RGB), 0), np.uint8)
-    if n == 1:
-        return opaque
-    size = (colour.shape[1] // n, colour.shape[0] // n)
-    averaged = cv2.resize(opaque.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return np.rint(averaged).astype(np.uint8)

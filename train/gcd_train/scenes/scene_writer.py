@@ -3,7 +3,7 @@
 import io
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.files import (
     GEOMETRY,
     MANIFEST,
-    Matrix,
     SceneFiles,
     SceneManifest,
     package_version,
@@ -23,31 +23,15 @@ from gcd_train.data.files import (
 )
 from gcd_train.data.kubric4d import Kubric4DWriter
 from gcd_train.data.parallel_domain4d import ParallelDomain4DWriter
-from gcd_train.errors import DataError, RecipeError, TrainError
+from gcd_train.errors import DataError, TrainError
 from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
-from gcd_train.scenes.description import Scene
 from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, require_drawing
-from gcd_train.scenes.worlds import SceneWorld
+from gcd_train.scenes.worlds import SceneFormat, SceneWorld
 
 GIVE_UP_AFTER = 5
 """Failures in a row after which a run stops: the disk is full, or nothing can be drawn."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneFormat:
-    """How scenes are drawn and stored. oversample: see `Renderer`. compact: WebP and depth codes."""
-
-    width: int
-    height: int
-    frames: int
-    oversample: int = 2
-    compact: bool = False
-
-    def __post_init__(self) -> None:
-        if min(self.width, self.height, self.frames, self.oversample) < 1:
-            raise RecipeError(f"sizes, frames and oversampling must be at least 1, got {self}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -68,8 +52,16 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
         RenderError: nothing can be drawn on this machine.
         OSError: the disk is full, or cannot be written.
     """
-    place = root / world.scene_name(seed)
-    header = _header(world, form, seed)
+    names = kubric4d if world.layout == "kubric4d" else parallel_domain4d
+    place = root / names.scene_name(seed)
+    header: dict[str, Any] = {
+        "layout": world.layout,
+        "world": world.name,
+        "seed": seed,
+        "edition": world.edition,
+        "fps": world.fps,
+        **asdict(form),
+    }
     if place.exists():
         there = read_manifest(place)
         for name, wanted in header.items():
@@ -83,13 +75,16 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
     require_drawing()  # before a simulation of many seconds
     scene = world.make(seed, form.frames)
     with new_folder(root, place.name) as folder:
-        files = SceneFiles(folder)
+        files, vehicle = SceneFiles(folder), None
         lens = Intrinsics.from_hfov(scene.hfov_deg, form.width, form.height)
         if world.vehicle_from_camera is None:
             writer = Kubric4DWriter(files, scene, lens, seed=seed, fps=world.fps, compact=form.compact)
         else:
             rig = world.vehicle_from_camera()
             writer = ParallelDomain4DWriter(files, lens, rig, world.classes, compact=form.compact)
+            camera, pose = next(iter(rig.items()))
+            poses = (scene.cameras[camera] @ np.linalg.inv(pose)).tolist()
+            vehicle = tuple(tuple(map(tuple, rows)) for rows in poses)
         frozen = freeze(scene)
         with Renderer(form.width, form.height, oversample=form.oversample) as renderer:
             for step, camera, drawn in renderer.views(frozen, scene.cameras):
@@ -104,34 +99,11 @@ def write_scene(root: Path, world: SceneWorld, form: SceneFormat, seed: int) -> 
             hfov_deg=scene.hfov_deg,
             cameras=tuple(scene.cameras),
             files=dict(sorted(files.checksums.items())),
-            world_from_vehicle=_vehicle_path(world, scene),
+            world_from_vehicle=vehicle,
             facts=scene.facts,
         )
         files.write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
     return SceneMade(folder=place, made=True, size=files.size, cpu_s=time.process_time() - started)
-
-
-def _header(world: SceneWorld, form: SceneFormat, seed: int) -> dict[str, Any]:
-    """What a manifest says of a scene before it is simulated."""
-    return {
-        "layout": world.layout,
-        "world": world.name,
-        "seed": seed,
-        "edition": world.edition,
-        "frames": form.frames,
-        "fps": world.fps,
-        "width": form.width,
-        "height": form.height,
-        "oversample": form.oversample,
-        "compact": form.compact,
-    }
-
-
-def _vehicle_path(world: SceneWorld, scene: Scene) -> tuple[Matrix, ...] | None:
-    if world.vehicle_from_camera is None:
-        return None
-    camera, pose = next(iter(world.vehicle_from_camera().items()))
-    return tuple(tuple(map(tuple, rows)) for rows in (scene.cameras[camera] @ np.linalg.inv(pose)).tolist())
 
 
 @dataclass(slots=True)

@@ -3,9 +3,9 @@ about itself, and how its clips are numbered.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
@@ -20,11 +20,12 @@ from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.files import write_whole
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.driving import EDITION, ONTOLOGY, OntologyItem, driving_drive, vehicle_from_camera
-from gcd_train.scenes.driving import HFOV_DEG as DRIVING_HFOV_DEG
-from gcd_train.scenes.drop import HFOV_DEG as STAGE_HFOV_DEG
-from gcd_train.scenes.drop import drop_scene
-from gcd_train.scenes.tabletop import tabletop_scene
+from gcd_train.scenes.driving.classes import ONTOLOGY, OntologyItem
+from gcd_train.scenes.driving.world import EDITION, driving_drive, vehicle_from_camera
+from gcd_train.scenes.driving.world import HFOV_DEG as DRIVING_HFOV_DEG
+from gcd_train.scenes.drop.world import HFOV_DEG as STAGE_HFOV_DEG
+from gcd_train.scenes.drop.world import drop_scene
+from gcd_train.scenes.tabletop.scene import tabletop_scene
 
 Layout = Literal["kubric4d", "parallel_domain4d"]
 
@@ -48,11 +49,6 @@ class SceneWorld:
     height: int = kubric4d.HEIGHT
     classes: tuple[OntologyItem, ...] = ()
     vehicle_from_camera: Callable[[], dict[str, NDArray[np.float64]]] | None = None
-
-    def scene_name(self, seed: int) -> str:
-        """The folder in which the scene of a seed lies: its number is the seed."""
-        names = kubric4d if self.layout == "kubric4d" else parallel_domain4d
-        return names.scene_name(seed)
 
 
 SCENE_WORLDS: dict[str, SceneWorld] = {
@@ -80,6 +76,20 @@ def scene_world(name: str) -> SceneWorld:
     return SCENE_WORLDS[name]
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneFormat:
+    """How scenes and pairs are drawn and stored; by default as pairs are.
+
+    width, height: pixels. oversample: see `Renderer`. compact: of scenes, WebP and depth codes.
+    """
+
+    width: int = 192
+    height: int = 128
+    frames: int = 14
+    oversample: int = 2
+    compact: bool = False
+
+
 # pairs of clips
 
 DEPTH_UNIT_M = 1 / 256
@@ -95,6 +105,11 @@ class WorldOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     height_m: float = CameraMount().height_m
     tilt_deg: float = CameraMount().tilt_deg
+
+
+_MOUNT = WorldOptions()
+_STRIDE = 2
+"""Time steps of a stage from one frame of a clip to the next."""
 
 
 class Orbit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -146,65 +161,44 @@ class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """The seed of the scene that a clip was cut from."""
         return seed // self.clips_per_scene
 
-    def seeds_of(self, first_scene: int, clips: int) -> range:
-        """Numbers of so many clips, from the first one of a scene on."""
-        first = first_scene * self.clips_per_scene
-        return range(first, first + clips)
 
+def pair_world(
+    scenes: SceneWorld,
+    form: SceneFormat,
+    *,
+    clips_per_shard: int = 8,
+    mount: WorldOptions = _MOUNT,
+    path: CameraWay = "gradual",
+    clips_per_scene: int = 3,
+) -> World:
+    """Pairs of clips of a world: of driving the forward camera and the path to the view from above, of a world on
+    Kubric-4D's stage a source that stands and a target that goes over the sphere.
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PairForm:
-    """How pairs of clips are drawn and stored. width, height: pixels. oversample: see Renderer."""
-
-    width: int = 192
-    height: int = 128
-    frames: int = 14
-    oversample: int = 2
-    clips_per_shard: int = 8
-
-
-def driving_world(form: PairForm, mount: WorldOptions, path: CameraWay = "gradual") -> World:
-    """Pairs of the forward camera and the path to the view from above.
-
-    mount: where the source camera really sits. path: how the target camera gets there.
-    Raises: PoseError if that is no mount.
-    """
-    CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
-    drive = SCENE_WORLDS["driving"]
-    return World(
-        name=drive.name,
-        **asdict(form),
-        fps=drive.fps,
-        hfov_deg=DRIVING_HFOV_DEG,
-        options=mount,
-        edition=drive.edition,
-        path=path,
-    )
-
-
-def orbit_world(scenes: SceneWorld, form: PairForm, *, stride: int = 2, clips_per_scene: int = 3) -> World:
-    """Pairs of clips of a world on Kubric-4D's stage: the source stands, the target goes over the sphere.
+    mount, path: of driving, where the source camera really sits, and how the target camera gets to its goal.
+    clips_per_scene: of a stage.
 
     Raises:
-        RecipeError: this world has no stage, or its scenes are too short for such clips.
+        PoseError: that is no mount.
+        RecipeError: the scenes are too short for such clips.
     """
-    if scenes.layout != "kubric4d":
-        raise RecipeError(f"the world {scenes.name} has no stage to go round; choose drop or tabletop")
-    if (form.frames - 1) * stride + 2 > scenes.frames:  # its last frame stays out of reach, see `FrameSampling`
+    shared: dict[str, Any] = {"name": scenes.name, "edition": scenes.edition, "clips_per_shard": clips_per_shard}
+    shared |= {name: getattr(form, name) for name in ("width", "height", "frames", "oversample")}
+    if scenes.layout == "parallel_domain4d":
+        CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
+        return World(**shared, fps=scenes.fps, hfov_deg=DRIVING_HFOV_DEG, options=mount, path=path)
+    if (form.frames - 1) * _STRIDE + 2 > scenes.frames:  # its last frame stays out of reach, see `FrameSampling`
         raise RecipeError(
             f"a {scenes.name} scene has {scenes.frames} time steps, too few for {form.frames} frames at stride "
-            f"{stride}; ask for up to {(scenes.frames - 2) // stride + 1}"
+            f"{_STRIDE}; ask for up to {(scenes.frames - 2) // _STRIDE + 1}"
         )
     return World(
-        name=scenes.name,
-        **asdict(form),
-        fps=scenes.fps / stride,
+        **shared,
+        fps=scenes.fps / _STRIDE,
         hfov_deg=STAGE_HFOV_DEG,
         classes=(),
         camera="orbit",
         clips_per_scene=clips_per_scene,
-        edition=scenes.edition,
-        stride=stride,
+        stride=_STRIDE,
     )
 
 

@@ -26,14 +26,23 @@ def ground_sheets(street: Street, wetness: float, paved: bool, random: np.random
     paving: Colour = (grey, grey * random.uniform(0.92, 1.0), grey * random.uniform(0.84, 1.0))
     grass: Colour = (random.uniform(0.24, 0.4), random.uniform(0.38, 0.48), random.uniform(0.16, 0.26))
     dry: Colour = (random.uniform(0.5, 0.62), random.uniform(0.46, 0.54), random.uniform(0.32, 0.4))
-    sheets = [_terrain(grass if random.random() < 0.75 else dry, 0.3 * wetness)]
+    terrain, main = grass if random.random() < 0.75 else dry, street.main
+    cell = 200.0  # a square of cells just below all roads; split, so that interpolation stays exact far away
+    x, y = np.meshgrid(np.arange(-800.0, 800.0, cell), np.arange(-800.0, 800.0, cell))
+    low = np.stack([x.reshape(-1), y.reshape(-1), np.full(x.size, -0.06)], -1)
+    cells = quads(low, *(low + np.array([a, b, 0.0]) for a, b in ((cell, 0.0), (cell, cell), (0.0, cell))))
+    sheets = [_flat(cells, terrain, Label.TERRAIN, Pattern.SPECKLE, 0.3 * wetness)]
     if paved:
         court = [piece for road in street.roads for piece in _beside(road, 1.0, road.pavement_m + 16.0, _COURT_M)]
         sheets.append(_flat(np.concatenate(court), shaded(paving, 0.86), Label.PAVEMENT, Pattern.SPECKLE, wetness))
     sheets.append(_flat(_asphalt(street), asphalt, Label.ROAD, Pattern.SPECKLE, wetness))
-    sheets.append(_flat(_repairs(street.main, random), shaded(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
+    count = int(random.integers(4, 16))  # darker patches where the road was mended
+    s, lateral = random.uniform(-40, 130, count), random.uniform(-main.right_m, main.left_m - 1.5, count)
+    ends = s + random.uniform(1, 9, count), lateral, lateral + random.uniform(0.6, 1.5, count)
+    mended = patches(main, np.stack([s, *ends], -1), PATCH_M)
+    sheets.append(_flat(mended, shaded(asphalt, 0.8), Label.ROAD, Pattern.SPECKLE, wetness))
     if wetness > 0:
-        sheets.append(_flat(_puddles(street.main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
+        sheets.append(_flat(_puddles(main, random), (0.07, 0.075, 0.08), Label.ROAD, wetness=1.0))
     stone = [piece for road in street.roads for piece in _beside(road, 0.0, road.pavement_m, PAVEMENT_M)]
     for middle, first, second in _quadrants(street):
         stone.append(fan(np.append(middle, PAVEMENT_M), _rim(middle, first, second, _CORNER_M, PAVEMENT_M)))
@@ -52,18 +61,9 @@ def _flat(
     return Sheet(upward, Paint(dark, pattern=pattern, gloss=wetness), label)
 
 
-def _terrain(colour: Colour, wetness: float) -> Sheet:
-    """A square of cells just below all roads; split, so that interpolation stays exact far away."""
-    cell = 200.0
-    x, y = np.meshgrid(np.arange(-800.0, 800.0, cell), np.arange(-800.0, 800.0, cell))
-    low = np.stack([x.reshape(-1), y.reshape(-1), np.full(x.size, -0.06)], -1)
-    corners = quads(low, *(low + np.array([a, b, 0.0]) for a, b in ((cell, 0.0), (cell, cell), (0.0, cell))))
-    return _flat(corners, colour, Label.TERRAIN, Pattern.SPECKLE, wetness)
-
-
 def _asphalt(street: Street) -> Floats:
     """The lanes, and what lies under and before the rounded corners."""
-    pieces = [ribbon(road, -road.right_m, road.left_m, ROAD_M) for road in street.roads]
+    pieces = [ribbon(road, (-road.right_m, ROAD_M), (road.left_m, ROAD_M)) for road in street.roads]
     reach = _CORNER_M * 1.05
     for middle, first, second in _quadrants(street):
         square = [middle, middle + first * reach, middle + (first + second) * reach, middle + second * reach]
@@ -74,14 +74,10 @@ def _asphalt(street: Street) -> Floats:
 
 def _beside(road: Road, near_m: float, far_m: float, near_z: float, far_z: float | None = None) -> Iterator[Floats]:
     """Strips on both sides, between two distances from the kerb, that stop before the junctions' corners."""
-    far_z = near_z if far_z is None else far_z
     spans = road.free_spans(_CORNER_M)
     for side, kerb in road.sides:
-        near, far = side * (kerb + near_m), side * (kerb + far_m)
-        if side > 0:
-            yield ribbon(road, near, far, (near_z, far_z), spans)
-        else:
-            yield ribbon(road, far, near, (far_z, near_z), spans)
+        near, far = (side * (kerb + near_m), near_z), (side * (kerb + far_m), near_z if far_z is None else far_z)
+        yield ribbon(road, *((near, far) if side > 0 else (far, near)), spans)
 
 
 def _kerbs(street: Street) -> Floats:
@@ -90,11 +86,9 @@ def _kerbs(street: Street) -> Floats:
     for road in street.roads:
         pieces += _beside(road, _KERB_SLOPE_M, _KERB_WIDE_M, top)
         pieces += _beside(road, 0.0, _KERB_SLOPE_M, ROAD_M, top)
-    for middle, first, second in _quadrants(street):
-        low, edge, inner = (
-            _rim(middle, first, second, _CORNER_M - away, z)
-            for away, z in ((0.0, ROAD_M), (_KERB_SLOPE_M, top), (_KERB_WIDE_M, top))
-        )
+    for corner in _quadrants(street):
+        edges = ((0.0, ROAD_M), (_KERB_SLOPE_M, top), (_KERB_WIDE_M, top))
+        low, edge, inner = (_rim(*corner, _CORNER_M - away, z) for away, z in edges)
         pieces += [quads(low[:-1], low[1:], edge[1:], edge[:-1]), quads(edge[:-1], edge[1:], inner[1:], inner[:-1])]
     return np.concatenate(pieces)
 
@@ -116,20 +110,12 @@ def _rim(middle: Doubles, first: Doubles, second: Doubles, radius: float, z: flo
     return np.append(rim, np.full((6, 1), z), 1)
 
 
-def _repairs(road: Road, random: np.random.Generator) -> Floats:
-    """Darker patches where the road was mended."""
-    count = int(random.integers(4, 16))
-    s, y = random.uniform(-40, 130, count), random.uniform(-road.right_m, road.left_m - 1.5, count)
-    rows = np.stack([s, s + random.uniform(1, 9, count), y, y + random.uniform(0.6, 1.5, count)], -1)
-    return patches(road, rows, PATCH_M)
-
-
 def _puddles(road: Road, random: np.random.Generator) -> Floats:
     pieces: list[Floats] = []
     for _ in range(24):
-        x, y, _ = road.at(float(random.uniform(-30, 110)), float(random.uniform(-road.right_m, road.left_m)))
+        x, y, _ = road.at(random.uniform(-30, 110), random.uniform(-road.right_m, road.left_m))
         turn = np.linspace(0, 2 * np.pi, 11)
-        radius = float(random.uniform(0.5, 1.8)) * random.uniform(0.75, 1.0, 11)
+        radius = random.uniform(0.5, 1.8) * random.uniform(0.75, 1.0, 11)
         radius[-1] = radius[0]
         rim = np.stack([x + radius * np.cos(turn), y + radius * np.sin(turn), np.full(11, PATCH_M + 0.003)], -1)
         pieces.append(fan(np.array([x, y, PATCH_M + 0.003]), rim))
@@ -137,19 +123,27 @@ def _puddles(road: Road, random: np.random.Generator) -> Floats:
 
 
 def _marks(street: Street, wetness: float, random: np.random.Generator) -> list[Sheet]:
-    white = float(random.uniform(0.78, 0.95))
-    paint: Colour = (white, white, white * float(random.uniform(0.93, 1.0)))
+    """Lane lines, centre lines, zebras and stop lines."""
+    white = random.uniform(0.78, 0.95)
+    paint: Colour = (white, white, white * random.uniform(0.93, 1.0))
     middle: Colour = paint if random.random() < 0.6 else (white, 0.72 * white, 0.12)
-    width = float(random.uniform(0.12, 0.18))
-    dash = (float(random.uniform(2.5, 4.5)), float(random.uniform(4.0, 8.0)))
+    width = random.uniform(0.12, 0.18)
+    dash = (random.uniform(2.5, 4.5), random.uniform(4.0, 8.0))
     edged, solid = random.random() < 0.6, random.random() < 0.5
     none = [np.zeros((0, 3, 3), np.float32)]
     lanes, centre, zebras, stops = [*none], [*none], [*none], [*none]
     for road in street.roads:
         lanes += _lane_lines(road, width, dash, edged)
         centre.append(_dashes(road, 0.0, width, None if solid else dash))
-        zebras += [patches(road, _zebra(road, crossing), MARK_M) for crossing in road.crossings]
-        stops += [patches(road, _stop_lines(road, crossing), MARK_M) for crossing in road.crossings]
+        stripes = np.arange(-road.right_m + 0.5, road.left_m - 0.6, 1.0)
+        right, left = -road.lanes_right * road.lane_m, road.lanes_left * road.lane_m
+        for crossing in road.crossings:
+            at, (near, far), away = crossing.at_m, zebra_m(crossing), stop_line_m(crossing) - 0.9
+            ends = ((at - far, at - near), (at + near, at + far))
+            zebra = np.array([(*end, y, y + 0.5) for end in ends for y in stripes if crossing.zebra])
+            zebras.append(patches(road, zebra, MARK_M))
+            lines = [(at - away, at - away + 0.4, right, 0.0), (at + away - 0.4, at + away, 0.0, left)]
+            stops.append(patches(road, np.array(lines), MARK_M))
     kinds = ((lanes, paint, Label.LANE_MARKING), (centre, middle, Label.LANE_MARKING),
              (zebras, paint, Label.CROSSWALK), (stops, paint, Label.STOP_LINE))  # fmt: skip
     return [_flat(np.concatenate(shapes), colour, label, wetness=0.5 * wetness) for shapes, colour, label in kinds]
@@ -172,7 +166,7 @@ def _dashes(road: Road, lateral: float, width: float, dash: tuple[float, float] 
     spans = road.free_spans(_CORNER_M + 5.6, *_MARKED_M)
     right, left = lateral - width / 2, lateral + width / 2
     if dash is None:
-        return ribbon(road, right, left, MARK_M, spans)
+        return ribbon(road, (right, MARK_M), (left, MARK_M), spans)
     starts = np.concatenate([[], *(np.arange(lo, hi - dash[0], sum(dash)) for lo, hi in spans)])
     return patches(road, np.stack([starts, starts + dash[0], 0 * starts + right, 0 * starts + left], -1), MARK_M)
 
@@ -185,20 +179,6 @@ def stop_line_m(crossing: Crossing) -> float:
 def zebra_m(crossing: Crossing) -> tuple[float, float]:
     """Where people cross, as distances from the crossing's middle."""
     return crossing.half_m + _CORNER_M + 0.4, crossing.half_m + _CORNER_M + 3.2
-
-
-def _zebra(road: Road, crossing: Crossing) -> Doubles:
-    stripes = np.arange(-road.right_m + 0.5, road.left_m - 0.6, 1.0)
-    near, far = zebra_m(crossing)
-    ends = ((crossing.at_m - far, crossing.at_m - near), (crossing.at_m + near, crossing.at_m + far))
-    return np.array([(*end, y, y + 0.5) for end in ends for y in stripes if crossing.zebra])
-
-
-def _stop_lines(road: Road, crossing: Crossing) -> Doubles:
-    away = stop_line_m(crossing) - 0.9
-    right, left = -road.lanes_right * road.lane_m, road.lanes_left * road.lane_m
-    at = crossing.at_m
-    return np.array([(at - away, at - away + 0.4, right, 0.0), (at + away - 0.4, at + away, 0.0, left)])
 
 
 def lamp_pools(spots: Iterable[tuple[float, float, float]], asphalt: Colour, strength: float) -> list[Sheet]:

@@ -9,11 +9,16 @@ from gcd_train.scenes.description import Doubles, Floats, Part
 
 STEP_M = 2.0
 _START_M, _END_M, _SIDE_M = -160.0, 340.0, 130.0
-_APART_M = 48.0
+_APART_M, _HOUSES_M = 48.0, 30.0
+"""Room between crossings, and between the side roads further out."""
 _CALM_M = 22.0
-_NEAR_STEP_M, _FAR_STEP_M, _NEAR_M = 5.0, 10.0, (-60.0, 180.0)
+_NEAR_M = (-60.0, 180.0)
+_KNOTS_M = np.concatenate([np.arange(-300.0, -60.0, 10.0), np.arange(180.0, 500.0, 10.0), np.arange(*_NEAR_M, 5.0)])
+"""Where strips along a road have corners: half as many far away."""
 
 Span = tuple[float, float]
+Edge = tuple[float, float]
+"""Lateral place and height, metres."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,43 +105,24 @@ class Road:
         return [span for span in [*spans, (start, end)] if span[1] > span[0]]
 
 
-def centre_line(headings: Doubles) -> Doubles:
-    """Points [N, 2] that are 2 m apart along headings [N]."""
-    return np.cumsum(np.stack([np.cos(headings), np.sin(headings)], -1) * STEP_M, 0)
-
-
 # flat shapes: triangles [N, 3, 3]
 
 
-def ribbon(
-    road: Road, right: float, left: float, z: float | tuple[float, float], spans: list[Span] | None = None
-) -> Floats:
-    """A strip along the road between two lateral places, all along or over some stretches.
-
-    z: its height, or those of its right and of its left edge.
-    """
-    heights = z if isinstance(z, tuple) else (z, z)
+def ribbon(road: Road, right: Edge, left: Edge, spans: list[Span] | None = None) -> Floats:
+    """A strip along the road between two edges, all along or over some stretches."""
     pieces = [np.zeros((0, 3, 3), np.float32)]
-    for span in [(road.start_m, road.end_m)] if spans is None else spans:
-        s = _knots(span)
-        low, high = (_lifted(road.places(s, y), z) for y, z in ((right, heights[0]), (left, heights[1])))
+    for begin, end in [(road.start_m, road.end_m)] if spans is None else spans:
+        inside = _KNOTS_M[(begin + 0.3 < _KNOTS_M) & (end - 0.3 > _KNOTS_M)]
+        s = np.sort(np.concatenate([[begin], inside, [end]]))
+        low, high = (_lifted(road.places(s, lateral), z) for lateral, z in (right, left))
         pieces.append(quads(low[:-1], low[1:], high[1:], high[:-1]))
     return np.concatenate(pieces)
-
-
-def _knots(span: Span) -> Doubles:
-    near = np.arange(*_NEAR_M, _NEAR_STEP_M)
-    far = np.concatenate([np.arange(-300.0, _NEAR_M[0], _FAR_STEP_M), np.arange(_NEAR_M[1], 500.0, _FAR_STEP_M)])
-    knots = np.concatenate([far, near])
-    inside = knots[(knots > span[0] + 0.3) & (knots < span[1] - 0.3)]
-    return np.sort(np.concatenate([[span[0]], inside, [span[1]]]))
 
 
 def patches(road: Road, rows: Doubles, z: float) -> Floats:
     """Small pieces on the road: rows [N, 4] of first and last s, right and left lateral place."""
     s0, s1, right, left = rows.reshape(-1, 4).T
-    a, b, c, d = (_lifted(road.places(s, y), z) for s, y in ((s0, right), (s1, right), (s1, left), (s0, left)))
-    return quads(a, b, c, d)
+    return quads(*(_lifted(road.places(s, y), z) for s, y in ((s0, right), (s1, right), (s1, left), (s0, left))))
 
 
 def fan(centre: Doubles, rim: Doubles) -> Floats:
@@ -174,29 +160,25 @@ class Street:
 
 def random_street(random: np.random.Generator) -> Street:
     """A layout drawn at random. Roads neither meet themselves nor each other but in their crossings."""
-    crossings = _random_crossings(random)
+    drawn: list[Crossing] = []
+    for _ in range(int(random.choice([0, 1, 2, 3], p=[0.12, 0.38, 0.32, 0.18]))):
+        at, zebra = random.uniform(-45, 125), bool(random.random() < 0.7)
+        if all(abs(at - other.at_m) > _APART_M for other in drawn):
+            drawn.append(Crossing(at_m=at, half_m=4.0, zebra=zebra))  # its width follows from the road below
+    crossings = tuple(sorted(drawn, key=lambda crossing: crossing.at_m))
     s = np.arange(_START_M, _END_M + STEP_M, STEP_M)
     main = _road(s, _winding(s, crossings, random), crossings, random, most_lanes=3)
     made = [_side_road(main, crossing, random) for crossing in crossings]
-    kept = [i for i, road in enumerate(made) if all(_apart(road, other) for other in made[:i])]
+    gaps = [[np.linalg.norm(a.points[:, None] - b.points, axis=-1).min() for b in made[:i]] for i, a in enumerate(made)]
+    kept = [i for i, each in enumerate(gaps) if min(each, default=np.inf) > _HOUSES_M]
     crossings = tuple(replace(crossings[i], half_m=(made[i].right_m + made[i].left_m) / 2) for i in kept)
     return Street(main=replace(main, crossings=crossings), crossed=tuple(made[i] for i in kept))
 
 
-def _random_crossings(random: np.random.Generator) -> tuple[Crossing, ...]:
-    """Places of crossings; their widths follow from the roads."""
-    made: list[Crossing] = []
-    for _ in range(int(random.choice([0, 1, 2, 3], p=[0.12, 0.38, 0.32, 0.18]))):
-        at, zebra = float(random.uniform(-45, 125)), bool(random.random() < 0.7)
-        if all(abs(at - other.at_m) > _APART_M for other in made):
-            made.append(Crossing(at_m=at, half_m=4.0, zebra=zebra))
-    return tuple(sorted(made, key=lambda crossing: crossing.at_m))
-
-
 def _winding(s: Doubles, crossings: tuple[Crossing, ...], random: np.random.Generator) -> Doubles:
     """Headings that sway but never turn back; straight in junctions, 0 at s = 0. No bend below 60 m of radius."""
-    long, short = float(random.uniform(280, 480)), float(random.uniform(140, 240))
-    sway = float(random.choice([0.0, 0.35, 0.6])) * float(random.uniform(0.7, 1.0))
+    long, short = random.uniform(280, 480), random.uniform(140, 240)
+    sway = float(random.choice([0.0, 0.35, 0.6])) * random.uniform(0.7, 1.0)
     slow = sway * np.sin(2 * np.pi * (s / long + random.uniform()))
     curvature = np.gradient(slow + 0.15 * sway * np.sin(2 * np.pi * (s / short + random.uniform())), s)
     for crossing in crossings:
@@ -208,18 +190,18 @@ def _winding(s: Doubles, crossings: tuple[Crossing, ...], random: np.random.Gene
 def _road(
     s: Doubles, headings: Doubles, crossings: tuple[Crossing, ...], random: np.random.Generator, most_lanes: int
 ) -> Road:
-    points = centre_line(headings)
+    points = np.cumsum(np.stack([np.cos(headings), np.sin(headings)], -1) * STEP_M, 0)
     points -= [np.interp(0.0, s, points[:, i]) for i in (0, 1)]
     right, left = (int(random.choice([1, 2, 3], p=[0.5, 0.4, 0.1])) for _ in range(2))
-    strips = [float(random.uniform(2.25, 2.6)) if random.random() < 0.55 else 0.0 for _ in range(2)]
+    strips = [random.uniform(2.25, 2.6) if random.random() < 0.55 else 0.0 for _ in range(2)]
     return Road(
         points=points,
         headings=headings,
-        lane_m=float(random.uniform(3.2, 3.7)),
+        lane_m=random.uniform(3.2, 3.7),
         lanes_right=min(right, most_lanes),
         lanes_left=min(left, most_lanes),
         parking_m=(strips[0], strips[1]),
-        pavement_m=float(random.uniform(2.4, 4.6)),
+        pavement_m=random.uniform(2.4, 4.6),
         verge_m=float(random.choice([0.0, random.uniform(1, 6)])),
         crossings=crossings,
         start_m=float(s[0]),
@@ -233,7 +215,7 @@ def _side_road(main: Road, crossing: Crossing, random: np.random.Generator) -> R
     """
     s = np.arange(-_SIDE_M, _SIDE_M + STEP_M, STEP_M)
     x, y, heading = main.at(crossing.at_m)
-    settled = float(np.mean(main.headings)) + 0.2 * float(random.uniform(-1, 1))
+    settled = float(np.mean(main.headings)) + 0.2 * random.uniform(-1, 1)
     share = np.clip((np.abs(s) - 25.0) / 60.0, 0, 1)
     headings = np.pi / 2 + heading + (settled - heading) * share**2 * (3 - 2 * share)
     middle, half = (main.left_m - main.right_m) / 2, (main.left_m + main.right_m) / 2
@@ -242,9 +224,3 @@ def _side_road(main: Road, crossing: Crossing, random: np.random.Generator) -> R
     lanes, strip = min(road.lanes_left, road.lanes_right), min(road.parking_m)
     points = road.points + np.array([x, y])
     return replace(road, points=points, lanes_left=lanes, lanes_right=lanes, parking_m=(strip, strip))
-
-
-def _apart(road: Road, other: Road) -> bool:
-    """Whether two side roads keep room for houses between them."""
-    gaps = np.linalg.norm(road.points[:, None] - other.points[None], axis=-1)
-    return bool(gaps.min() > 30.0)

@@ -6,6 +6,7 @@ A footprint is [..., 5]: x and y of its centre, yaw in radians, half its length 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,37 +22,29 @@ _NEAR_M, _PLANTED_M = 38.0, 175.0
 _CLEAR_M = 3.2
 
 Footprints = Doubles
-Parts = Sequence[Part]
-
-
-def overlap(first: Footprints, second: Footprints, gap_m: float = 0.0) -> NDArray[np.bool_]:
-    """Whether rectangles come closer than a gap (along one of their axes), [...]; sizes broadcast.
-
-    Two convex shapes are apart if and only if an edge's normal separates them.
-    """
-    apart = second[..., :2] - first[..., :2]
-    touching = np.ones(np.broadcast_shapes(first.shape[:-1], second.shape[:-1]), bool)
-    for yaw in (first[..., 2], first[..., 2] + np.pi / 2, second[..., 2], second[..., 2] + np.pi / 2):
-        distance = np.abs(apart[..., 0] * np.cos(yaw) + apart[..., 1] * np.sin(yaw))
-        touching &= distance < _reach(first, yaw) + _reach(second, yaw) + gap_m
-    return touching
+Side = tuple[Road, float, float]
+"""One side of a road: its sign (-1: right), and how far from the centre line its kerb is."""
 
 
 def touches(first: Footprints, second: Footprints, gap_m: float = 0.0) -> bool:
-    """Whether any two rectangles of a pair overlap; sizes broadcast. Only those near each other are looked at."""
+    """Whether any two rectangles of a pair come closer than a gap; sizes broadcast.
+
+    Two convex shapes are apart if and only if an edge's normal separates them. Only near pairs are looked at.
+    """
     away = first[..., :2] - second[..., :2]
     radius = np.hypot(first[..., 3], first[..., 4]) + np.hypot(second[..., 3], second[..., 4]) + 2 * gap_m
     near = away[..., 0] ** 2 + away[..., 1] ** 2 < radius**2
     if not near.any():
         return False
-    shape = (*near.shape, 5)
-    return bool(overlap(np.broadcast_to(first, shape)[near], np.broadcast_to(second, shape)[near], gap_m).any())
-
-
-def _reach(box: Footprints, yaw: Doubles) -> Doubles:
-    """Half the length of a rectangle's shadow on an axis."""
-    turn = yaw - box[..., 2]
-    return np.abs(np.cos(turn)) * box[..., 3] + np.abs(np.sin(turn)) * box[..., 4]
+    pair = [np.broadcast_to(boxes, (*near.shape, 5))[near] for boxes in (first, second)]
+    apart, touching = pair[1][:, :2] - pair[0][:, :2], np.ones(len(pair[0]), bool)
+    for axis in (yaw for boxes in pair for yaw in (boxes[:, 2], boxes[:, 2] + np.pi / 2)):
+        distance = np.abs(apart[:, 0] * np.cos(axis) + apart[:, 1] * np.sin(axis))
+        reach = [  # half the length of each rectangle's shadow on the axis
+            np.abs(np.cos(axis - box[:, 2])) * box[:, 3] + np.abs(np.sin(axis - box[:, 2])) * box[:, 4] for box in pair
+        ]
+        touching &= distance < reach[0] + reach[1] + gap_m
+    return bool(touching.any())
 
 
 def footprint_of(parts: Sequence[Part]) -> Footprints:
@@ -62,55 +55,42 @@ def footprint_of(parts: Sequence[Part]) -> Footprints:
     turn = np.array([part.yaw for part in parts]) - yaw
     cos, sin, half = np.abs(np.cos(turn)), np.abs(np.sin(turn)), np.abs([part.size[:2] for part in parts]) / 2
     halves = np.stack([cos * half[:, 0] + sin * half[:, 1], sin * half[:, 0] + cos * half[:, 1]], -1)
-    along, aside = centres @ ahead, centres @ left
-    low = np.array([(along - halves[:, 0]).min(), (aside - halves[:, 1]).min()])
-    high = np.array([(along + halves[:, 0]).max(), (aside + halves[:, 1]).max()])
+    places = np.stack([centres @ ahead, centres @ left], -1)
+    low, high = (places - halves).min(0), (places + halves).max(0)
     middle = (low + high) / 2
     x, y = ahead * middle[0] + left * middle[1]
-    return np.array([x, y, yaw, (high[0] - low[0]) / 2, (high[1] - low[1]) / 2])
+    return np.array([x, y, yaw, *((high - low) / 2)])
 
 
-def holds_a_point(parts: Sequence[Part], points: Doubles, margin_m: float) -> bool:
+def holds_a_point(parts: Sequence[Part], points: NDArray[Any], margin_m: float) -> bool:
     """Whether a point [N, 3] lies within a margin of a part's bounding box; the parts stand upright."""
     hub = np.array(parts[0].centre)
     radius = max(float(np.linalg.norm(part.centre - hub) + np.linalg.norm(part.size) / 2) for part in parts)
     points = points[((points - hub) ** 2).sum(-1) < (radius + 2 * margin_m) ** 2]
-    for part in parts if len(points) else ():
-        away = points - part.centre
-        cos, sin = np.cos(part.yaw), np.sin(part.yaw)
-        local = np.stack([away[:, 0] * cos + away[:, 1] * sin, away[:, 1] * cos - away[:, 0] * sin, away[:, 2]], -1)
-        reach = np.abs(part.size) / 2 + margin_m
-        if bool((np.abs(local) < reach).all(-1).any()):
-            return True
-    return False
+    return len(points) > 0 and any(
+        bool((np.abs(turned_back(points - part.centre, part.yaw)) < np.abs(part.size) / 2 + margin_m).all(-1).any())
+        for part in parts
+    )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Place:
-    """A place along a road, on one side (-1: right) at a distance from its centre line."""
-
-    road: Road
-    s: float
-    side: float
-    away: float
-
-    def moved(self, s: float, more_m: float) -> "Place":
-        """On the same side at another `s`, so much further from the road."""
-        return replace(self, s=s, away=self.away + more_m)
-
-    def put(self, parts: Parts, turn: float = 0.0) -> tuple[Part, ...]:
-        """An assembly stood there, its x along the road."""
-        return self.road.put(parts, self.s, self.side * self.away, turn)
+def turned_back(away: NDArray[Any], yaw: NDArray[Any] | float) -> NDArray[Any]:
+    """Points [..., 3] about an origin, in axes that are turned about the vertical by `yaw` radians."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y = away[..., 0] * cos + away[..., 1] * sin, away[..., 1] * cos - away[..., 0] * sin
+    return np.stack([x, y, away[..., 2]], -1)
 
 
 @dataclass(kw_only=True, slots=True)
 class Plot:
-    """The ground and what has been put on it; cameras: every place where one stands at some time, [N, 3]."""
+    """The ground and what has been put on it. cameras: every place where one stands at some time, [N, 3].
+
+    lamps: x, y and heading of what street lamps shine on, and how far along their road that is.
+    """
 
     street: Street
     cameras: Doubles
     things: list[tuple[Part, ...]] = field(default_factory=list[tuple[Part, ...]])
-    lamps: list[Place] = field(default_factory=list[Place])
+    lamps: list[tuple[float, float, float, float]] = field(default_factory=list[tuple[float, float, float, float]])
     _taken: list[Footprints] = field(default_factory=list[Footprints])
     _roads: Footprints = field(init=False)
     _lanes: Footprints = field(init=False)
@@ -119,9 +99,9 @@ class Plot:
         self._roads = np.concatenate([corridor(road, road.pavement_m) for road in self.street.roads])
         self._lanes = np.concatenate([corridor(road, 0.0) for road in self.street.roads])
 
-    def shows_details(self, place: Place) -> bool:
+    def shows_details(self, road: Road, s: float, lateral: float) -> bool:
         """Whether a camera comes close to a place."""
-        x, y, _ = place.road.at(place.s, place.side * place.away)
+        x, y, _ = road.at(s, lateral)
         return bool(np.hypot(self.cameras[:, 0] - x, self.cameras[:, 1] - y).min() < _NEAR_M)
 
     def put(
@@ -150,8 +130,7 @@ class Plot:
 def corridor(road: Road, beyond_m: float) -> Footprints:
     """A road up to its kerbs, and so much beyond them, as a chain of rectangles."""
     s = np.arange(road.start_m, road.end_m, 6.0) + 3.0
-    middle = (road.left_m - road.right_m) / 2
-    half = (road.left_m + road.right_m) / 2 + beyond_m
+    middle, half = (road.left_m - road.right_m) / 2, (road.left_m + road.right_m) / 2 + beyond_m
     return np.concatenate([road.places(s, middle), np.full((len(s), 1), 3.2), np.full((len(s), 1), half)], -1)
 
 
@@ -161,10 +140,21 @@ def furnish(plot: Plot, district: District, paved: bool, lit: bool, green: bool,
     lit: whether lamps shine. green: whether the main road's signals are green.
     """
     grey = tone(random, (0.33, 0.35, 0.36), 0.3)
-    _signals(plot, green, grey, random)
-    sides = [Place(road=road, s=0.0, side=side, away=kerb) for road in plot.street.roads for side, kerb in road.sides]
-    for side in sides:
-        _lamps(plot, side.moved(0.0, 0.5), grey, lit, random)
+    if random.random() >= 0.25:
+        for road, crossing in [(each, crossing) for each in plot.street.roads for crossing in each.crossings]:
+            for side, kerb in road.sides:
+                at = crossing.at_m + side * (crossing.half_m + _CLEAR_M + 3.2)
+                shown = things.signal(green if road is plot.street.main else not green, grey)
+                plot.put(road.put(shown, at, side * (kerb + 0.6), 0.0 if side < 0 else np.pi), on_pavement=True)
+    sides = [(road, side, kerb) for road in plot.street.roads for side, kerb in road.sides]
+    for road, side, kerb in sides:
+        every, height = random.uniform(22, 38), random.uniform(5.8, 8.5)
+        first = max(_BEGIN_M, road.start_m) + random.uniform(0, every)
+        for s in np.arange(first, min(road.end_m, 190.0), every).tolist():
+            lamp = road.put(things.street_lamp(height, side, grey, lit), s, side * (kerb + 0.5))
+            # its arm reaches over the road
+            if road.is_free(s, _CLEAR_M + 1.0) and plot.put(lamp, on_pavement=True, on_foot=True):
+                plot.lamps.append((*road.at(s, side * (kerb + 0.5 - 2.0)), s))
     for side in sides:
         _houses(plot, side, district, paved, lit, random)
     for side in sides:
@@ -172,41 +162,17 @@ def furnish(plot: Plot, district: District, paved: bool, lit: bool, green: bool,
         _greenery(plot, side, district, paved, random)
 
 
-def _signals(plot: Plot, green: bool, grey: Colour, random: np.random.Generator) -> None:
-    if random.random() < 0.25:
-        return
-    for number, road in enumerate(plot.street.roads):
-        for crossing in road.crossings:
-            for side, kerb in road.sides:
-                at = crossing.at_m + side * (crossing.half_m + _CLEAR_M + 3.2)
-                place = Place(road=road, s=at, side=side, away=kerb + 0.6)
-                shown = things.signal(green if number == 0 else not green, grey)
-                plot.put(place.put(shown, 0.0 if side < 0 else np.pi), on_pavement=True)
-
-
-def _lamps(plot: Plot, place: Place, grey: Colour, lit: bool, random: np.random.Generator) -> None:
-    road = place.road
-    every, height = float(random.uniform(22, 38)), float(random.uniform(5.8, 8.5))
-    first = max(_BEGIN_M, road.start_m) + float(random.uniform(0, every))
-    for s in np.arange(first, min(road.end_m, 190.0), every):
-        at = place.moved(float(s), 0.0)
-        if road.is_free(at.s, _CLEAR_M + 1.0):
-            lamp = at.put(things.street_lamp(height, place.side, grey, lit))
-            if plot.put(lamp, on_pavement=True, on_foot=True):  # its arm reaches over the road
-                plot.lamps.append(at)
-
-
-def _houses(plot: Plot, place: Place, district: District, paved: bool, lit: bool, random: np.random.Generator) -> None:
-    road = place.road
+def _houses(plot: Plot, place: Side, district: District, paved: bool, lit: bool, random: np.random.Generator) -> None:
+    road, side, kerb = place
     edge = road.pavement_m + road.verge_m * (0.0 if paved else 1.0) + 0.8
-    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, 10))
+    s = max(_BEGIN_M, road.start_m) + random.uniform(0, 10)
     while s < min(_END_M, road.end_m):
-        width, depth = float(random.uniform(*district.width_m)), float(random.uniform(9, 17))
+        width, depth = random.uniform(*district.width_m), random.uniform(9, 17)
         if random.random() < district.built:
             middle = s + width / 2
             bend = abs(road.at(middle + width / 2)[2] - road.at(middle - width / 2)[2])
-            back = float(random.uniform(*district.setback_m)) + (width * bend / 4 + 0.3)  # fronts are straight
-            at = place.moved(middle, edge + back + depth / 2)
+            back = random.uniform(*district.setback_m) + (width * bend / 4 + 0.3)  # fronts are straight
+            lateral = side * (kerb + (edge + back + depth / 2))
             house = things.building(width, depth, district, random)
             roof = house[1]
             if roof.shape == "gable":  # closed from below
@@ -214,55 +180,49 @@ def _houses(plot: Plot, place: Place, district: District, paved: bool, lit: bool
                 size = (roof.size[0], roof.size[1], 0.1)
                 soffit = replace(roof.paint, colour=(0.7, 0.68, 0.64))
                 house.append(replace(roof, shape="box", centre=below, size=size, paint=soffit))
-            if paved and plot.shows_details(at):
-                house += things.shop(width, -place.side * depth / 2, lit, random)
-            plot.put(at.put(house))
-        s += width + float(random.uniform(*district.gap_m))
+            if paved and plot.shows_details(road, middle, lateral):
+                house += things.shop(width, -side * depth / 2, lit, random)
+            plot.put(road.put(house, middle, lateral))
+        s += width + random.uniform(*district.gap_m)
 
 
-def _furniture(plot: Plot, place: Place, lit: bool, grey: Colour, random: np.random.Generator) -> None:
-    road, room = place.road, place.road.pavement_m
-    makers: tuple[tuple[Callable[[], list[Part]], float, float], ...] = (
-        (lambda: things.sign(random, grey), 0.45, 0.45),
-        (lambda: things.planter(random), 0.2, 1.1),
-        (lambda: things.shelter(random, lit), 0.2, 1.3),
-        (lambda: things.kiosk(random, lit), 0.15, 1.6),
+def _furniture(plot: Plot, place: Side, lit: bool, grey: Colour, random: np.random.Generator) -> None:
+    road, side, kerb = place
+    makers: tuple[tuple[Callable[[], list[Part]], float], ...] = (
+        (lambda: things.sign(random, grey), 0.45),
+        (lambda: things.planter(random), 1.1),
+        (lambda: things.shelter(random, lit), 1.3),
+        (lambda: things.kiosk(random, lit), 1.6),
     )
-    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, 20))
+    s = max(_BEGIN_M, road.start_m) + random.uniform(0, 20)
     while s < min(150.0, road.end_m):
-        make, _, away = makers[int(random.choice(4, p=[share for _, share, _ in makers]))]
-        if road.is_free(s, _CLEAR_M + 4.0) and room > away + 0.9:
-            plot.put(place.moved(s, away).put(make(), 0.0 if place.side < 0 else np.pi), on_pavement=True)
-        s += float(random.uniform(12, 45))
+        make, away = makers[int(random.choice(4, p=[0.45, 0.2, 0.2, 0.15]))]
+        if road.is_free(s, _CLEAR_M + 4.0) and road.pavement_m > away + 0.9:
+            plot.put(road.put(make(), s, side * (kerb + away), 0.0 if side < 0 else np.pi), on_pavement=True)
+        s += random.uniform(12, 45)
 
 
-def _greenery(plot: Plot, place: Place, district: District, paved: bool, random: np.random.Generator) -> None:
+def _greenery(plot: Plot, place: Side, district: District, paved: bool, random: np.random.Generator) -> None:
     """Trees in a row, and hedges or fences before the gardens."""
-    road = place.road
+    road, side, kerb = place
     bare, firs = random.random() < 0.12, 0.0 if paved else float(random.choice([0.0, 0.1, 0.4]))
     in_row = road.pavement_m - 0.7 if paved else road.pavement_m + max(0.5 * road.verge_m, 0.6)
     every = district.trees_every_m * (1.0 if paved else 0.8)
-    s = max(_BEGIN_M, road.start_m) + float(random.uniform(0, every))
+    begin = max(_BEGIN_M, road.start_m)
+    s = begin + random.uniform(0, every)
     while s < min(_PLANTED_M, road.end_m) and not bare:
-        draw = float(random.random())
+        draw = random.random()
         kind = things.bush if draw < 0.12 else things.conifer if draw < 0.12 + firs else things.tree
         made = kind(random)
-        at = place.moved(s, in_row + float(random.uniform(0, 0.5)))
+        lateral = side * (kerb + (in_row + random.uniform(0, 0.5)))
         if road.is_free(s, _CLEAR_M + 3.0):
-            shown = made if plot.shows_details(at) or len(made) < 3 else made[:2]  # far away one crown is enough
-            plot.put(at.put(shown), on_pavement=True, on_foot=True)
-        s += every * float(random.uniform(0.5, 1.6))
-    if not paved:
-        _borders(plot, place, random)
-
-
-def _borders(plot: Plot, place: Place, random: np.random.Generator) -> None:
-    road = place.road
-    edge = road.pavement_m + road.verge_m + 0.5
-    s = max(_BEGIN_M, road.start_m)
-    while s < min(150.0, road.end_m):
-        length = float(random.uniform(5, 14))
+            whole = len(made) < 3 or plot.shows_details(road, s, lateral)  # far away one crown is enough
+            plot.put(road.put(made if whole else made[:2], s, lateral), on_pavement=True, on_foot=True)
+        s += every * random.uniform(0.5, 1.6)
+    s, edge = begin, road.pavement_m + road.verge_m + 0.5
+    while s < min(150.0, road.end_m) and not paved:
+        length = random.uniform(5, 14)
         make = things.hedge if random.random() < 0.6 else things.fence
         if random.random() < 0.6 and road.is_free(s + length / 2, length / 2 + _CLEAR_M):
-            plot.put(place.moved(s + length / 2, edge).put(make(random, length)), gap_m=0.1)
-        s += length + float(random.uniform(1.5, 8))
+            plot.put(road.put(make(random, length), s + length / 2, side * (kerb + edge)), gap_m=0.1)
+        s += length + random.uniform(1.5, 8)

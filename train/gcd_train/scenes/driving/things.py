@@ -72,10 +72,10 @@ def building(width: float, depth: float, district: District, random: np.random.G
     body = block((0, 0, height / 2), (width, depth, height), wall, label, pattern=Pattern.WINDOWS)
     dark = tone(random, (0.36, 0.25, 0.22) if random.random() < 0.5 else (0.3, 0.31, 0.33))
     if random.random() < district.gabled:
-        size = (width * 1.06, depth * 1.08, depth * float(random.uniform(0.3, 0.5)))
+        size = (width * 1.06, depth * 1.08, depth * random.uniform(0.3, 0.5))
         roof = block((0, 0, height + size[2] / 2), size, dark, label, shape="gable", pattern=Pattern.BRICK)
         return [body, roof]
-    along = float(random.uniform(-0.2, 0.2)) * width
+    along = random.uniform(-0.2, 0.2) * width
     return [
         body,
         block((0, 0, height + 0.2), (width * 1.02, depth * 1.02, 0.4), dark, label),
@@ -87,7 +87,7 @@ def shop(width: float, front: float, lit: bool, random: np.random.Generator) -> 
     """A shop window and its sign along the ground floor, or none; front: the house's, across the road."""
     if random.random() < 0.35:
         return []
-    wide, label = width * float(random.uniform(0.5, 0.92)), Label.BUILDING
+    wide, label = width * random.uniform(0.5, 0.92), Label.BUILDING
     board = tone(random, pick(random, _BOARDS), 0.2)
     shines = lit and random.random() < 0.6
     glass: Colour = (0.95, 0.8, 0.55) if shines else (0.1, 0.12, 0.14)
@@ -118,65 +118,64 @@ def lit_windows(house: Sequence[Part], random: np.random.Generator) -> list[Part
         for index in random.choice(len(cells), count, replace=False) if count else []:
             column, floor = cells[int(index)]
             x, y = face + along * ((column + 0.5) * wide - start)
-            warm, share = pick(random, _WARM), float(random.uniform(0.35, 0.8))
+            warm, share = pick(random, _WARM), random.uniform(0.35, 0.8)
             at = (float(x), float(y), (floor + 0.55) * high)
             parts.append(block(at, size, mixed((0.0, 0.0, 0.0), share, warm), Label.BUILDING, lit=True, yaw=wall.yaw))
     return parts
 
 
-def leaf_colour(random: np.random.Generator) -> Colour:
+def _leaf_colour(random: np.random.Generator) -> Colour:
     """Mostly green."""
     return tone(random, (0.26, 0.4, 0.16) if random.random() < 0.85 else (0.5, 0.42, 0.15), 0.25)
 
 
-def foliage(at: Point, size: Point, colour: Colour, shape: str = "ball", yaw: float = 0.0) -> Part:
-    """One body of leaves."""
+def _foliage(at: Point, size: Point, colour: Colour, shape: str = "ball", yaw: float = 0.0) -> Part:
     return block(at, size, colour, Label.VEGETATION, shape=shape, pattern=Pattern.LEAVES, yaw=yaw)
 
 
 def tree(random: np.random.Generator) -> list[Part]:
     """A stem with two or three crowns."""
-    height, spread = float(random.uniform(4.5, 10)), float(random.uniform(2.4, 5.0))
-    leaf, stem = leaf_colour(random), height * float(random.uniform(0.3, 0.42))
+    height, spread = random.uniform(4.5, 10), random.uniform(2.4, 5.0)
+    leaf, stem = _leaf_colour(random), height * random.uniform(0.3, 0.42)
     size = (0.3, 0.3, stem + 0.6)
     parts = [block((0, 0, stem / 2 + 0.3), size, (0.3, 0.22, 0.16), Label.VEGETATION, shape="post")]
     for _ in range(int(random.integers(2, 4))):
-        x, y = (float(random.uniform(-0.22, 0.22)) * spread for _ in range(2))
-        crown = (height - stem) * float(random.uniform(0.75, 1.0))
-        size = (spread * float(random.uniform(0.7, 1)), spread * float(random.uniform(0.7, 1)), crown)
-        z = stem + crown / 2 + float(random.uniform(-0.2, 0.6))
-        parts.append(foliage((x, y, z), size, tone(random, leaf, 0.1)))
+        x, y = (random.uniform(-0.22, 0.22) * spread for _ in range(2))
+        crown = (height - stem) * random.uniform(0.75, 1.0)
+        size = (spread * random.uniform(0.7, 1), spread * random.uniform(0.7, 1), crown)
+        z = stem + crown / 2 + random.uniform(-0.2, 0.6)
+        parts.append(_foliage((x, y, z), size, tone(random, leaf, 0.1)))
     return parts
 
 
 def bush(random: np.random.Generator) -> list[Part]:
     """One low crown."""
-    size = (float(random.uniform(1.2, 3.5)), float(random.uniform(0.9, 1.5)), float(random.uniform(0.8, 1.7)))
-    return [foliage((0, 0, size[2] * 0.35), size, leaf_colour(random))]
+    size = (random.uniform(1.2, 3.5), random.uniform(0.9, 1.5), random.uniform(0.8, 1.7))
+    return [_foliage((0, 0, size[2] * 0.35), size, _leaf_colour(random))]
 
 
 def conifer(random: np.random.Generator) -> list[Part]:
     """A fir."""
-    high, wide = float(random.uniform(6, 12)), float(random.uniform(2.4, 3.6))
+    high, wide = random.uniform(6, 12), random.uniform(2.4, 3.6)
     green = tone(random, (0.14, 0.28, 0.16), 0.2)
     parts = [block((0, 0, 0.7), (0.3, 0.3, 1.4), (0.28, 0.2, 0.14), Label.VEGETATION)]
     for tier, (low, share, tall) in enumerate(((0.1, 1.0, 0.55), (0.32, 0.78, 0.45), (0.55, 0.5, 0.45))):
         size = (wide * share, wide * share, high * tall)
-        parts.append(foliage((0, 0, high * (low + tall / 2)), size, green, "cone", 0.5 * tier))
+        parts.append(_foliage((0, 0, high * (low + tall / 2)), size, green, "cone", 0.5 * tier))
     return parts
 
 
 def hedge(random: np.random.Generator, length: float) -> list[Part]:
     """A clipped hedge along the road."""
-    high = float(random.uniform(0.9, 1.9))
+    high = random.uniform(0.9, 1.9)
     size = (length, 0.8, high)
-    return [foliage((0, 0, high / 2 - 0.05), size, leaf_colour(random), "taper" if high < 1.2 else "box")]
+    return [_foliage((0, 0, high / 2 - 0.05), size, _leaf_colour(random), "taper" if high < 1.2 else "box")]
 
 
 def fence(random: np.random.Generator, length: float) -> list[Part]:
     """Boards between posts, or a wall."""
     colour = tone(random, pick(random, ((0.5, 0.36, 0.24), (0.75, 0.75, 0.72), (0.35, 0.37, 0.38))), 0.2)
-    high = float(random.uniform(0.9, 1.8))
+    high = random.uniform(0.9, 1.8)
     ends = np.arange(-length / 2, length / 2 + 0.01, length / 3)
     return [
         block((0, 0, high / 2 + 0.06), (length, 0.07, high - 0.12), colour, Label.FENCE),
@@ -214,7 +213,7 @@ def signal(green: bool, grey: Colour) -> list[Part]:
 def sign(random: np.random.Generator, grey: Colour) -> list[Part]:
     """A traffic sign that shows its face against x."""
     face = pick(random, ((0.8, 0.05, 0.06), (0.05, 0.2, 0.65), (0.92, 0.78, 0.08)))
-    size, high = float(random.uniform(0.5, 0.75)), float(random.uniform(2.1, 2.6))
+    size, high = random.uniform(0.5, 0.75), random.uniform(2.1, 2.6)
     return [
         block((0, 0, high / 2), (0.08, 0.08, high), grey, Label.POLE, shape="post"),
         block((-0.05, 0, high), (0.03, size, size), face, Label.TRAFFIC_SIGN),
@@ -253,4 +252,4 @@ def planter(random: np.random.Generator) -> list[Part]:
     """A tub with a small bush."""
     grey = tone(random, (0.55, 0.53, 0.5))
     tub = block((0, 0, 0.35), (1.3, 1.0, 0.7), grey, Label.STREET_FURNITURE, shape="taper")
-    return [tub, foliage((0, 0, 0.95), (1.1, 0.9, 0.9), leaf_colour(random))]
+    return [tub, _foliage((0, 0, 0.95), (1.1, 0.9, 0.9), _leaf_colour(random))]

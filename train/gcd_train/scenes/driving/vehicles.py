@@ -109,40 +109,36 @@ def varied(colour: Colour, random: np.random.Generator) -> Colour:
 
 
 def _car(style: _Style, paint: Colour, lamps: Lamps, near: bool) -> Assembly:
-    length, width, label = style.length, style.width, Label.CAR
-    sill = 0.6 * style.belt
-    shoulder = (length * 0.985, width, style.belt - sill)
+    length, width, belt, label = style.length, style.width, style.belt, Label.CAR
+    sill, front = 0.6 * belt, length / 2
+    start, end = (share * length - length / 2 for share in style.cabin)
+    middle, long, high = (start + end) / 2, end - start, style.height - belt
+    z, leans = (belt + style.height) / 2, style.glass == "cabin"
+    roof = (long * (0.72 if style.glass == "taper" else 0.62), width * 0.76, 0.05)
     parts = [
         block((0, 0, (0.2 + sill) / 2), (length, width, sill - 0.2), paint, label, gloss=0.35),
-        block((0, 0, (sill + style.belt) / 2), shoulder, paint, label, gloss=0.35, shape="nose"),
-        *_cabin(style, paint),
-        *_lights(length, width, 0.68 * style.belt, lamps, label, near),
-        *_wheels((-0.3 * length, 0.31 * length), width, style.wheel, label, near),
-    ]  # fmt: skip
-    if near:
-        parts += _fittings(style, paint)
-    return Assembly(parts=tuple(parts), length=length + 0.1, width=width + 0.1)
-
-
-def _cabin(style: _Style, paint: Colour) -> list[Part]:
-    length, width = style.length, style.width
-    start, end = (share * length - length / 2 for share in style.cabin)
-    middle, long, high = (start + end) / 2, end - start, style.height - style.belt
-    z, label = (style.belt + style.height) / 2, Label.CAR
-    roof = (long * (0.72 if style.glass == "taper" else 0.62), width * 0.76, 0.05)
-    lean = -0.04 * long if style.glass == "cabin" else 0.0
-    parts = [
+        block((0, 0, (sill + belt) / 2), (length * 0.985, width, belt - sill), paint, label, gloss=0.35, shape="nose"),
         block((middle, 0, z), (long, width * 0.95, high), _GLASS, label, gloss=0.45, shape=style.glass),
-        block((middle + lean, 0, style.height), roof, paint, label, gloss=0.35),
+        block((middle + (-0.04 * long if leans else 0.0), 0, style.height), roof, paint, label, gloss=0.35),
     ]
     if style.closed:  # a van's load room has no windows
         room = style.closed * length
-        size = (room, width * 0.97, high + 0.02)
-        parts.append(block((start + room / 2, 0, z), size, paint, label, gloss=0.4))
+        parts.append(block((start + room / 2, 0, z), (room, width * 0.97, high + 0.02), paint, label, gloss=0.4))
     if style.bed:
         load = start + length / 2 - 0.15
-        parts.append(block((start - load / 2, 0, style.belt - 0.02), (load, width * 0.82, 0.05), _DARK, label))
-    return parts
+        parts.append(block((start - load / 2, 0, belt - 0.02), (load, width * 0.82, 0.05), _DARK, label))
+    parts += _lights(length, width, 0.68 * belt, lamps, label, near)
+    parts += _wheels((-0.3 * length, 0.31 * length), width, style.wheel, label, near)
+    if near:  # grille, bumpers, plate and mirrors
+        mirror = style.cabin[1] * length - front - 0.3
+        parts += [
+            block((front + 0.01, 0, 0.62 * belt), (0.05, width * 0.42, 0.16), _DARK, label),
+            block((front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
+            block((-front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
+            block((-front - 0.02, 0, 0.6 * belt), (0.05, 0.5, 0.11), (0.85, 0.85, 0.8), label),
+            block((mirror, 0, belt + 0.1), (0.12, width + 0.08, 0.12), paint, label, gloss=0.35),
+        ]
+    return Assembly(parts=tuple(parts), length=length + 0.1, width=width + 0.1)
 
 
 def _lights(length: float, width: float, z: float, lamps: Lamps, label: Label, near: bool) -> list[Part]:
@@ -156,19 +152,6 @@ def _lights(length: float, width: float, z: float, lamps: Lamps, label: Label, n
         parts.append(block((length / 2, y, z), (0.07, 0.34, 0.14), _HEADLIGHT, label, gloss=0.6, lit=lamps.lit))
         parts.append(block((-length / 2, y, z + 0.06), (0.07, 0.3, 0.17), tail, label, gloss=0.6, lit=red))
     return parts
-
-
-def _fittings(style: _Style, paint: Colour) -> list[Part]:
-    """Grille, bumpers, plates and mirrors."""
-    front, width, label = style.length / 2, style.width, Label.CAR
-    mirror = style.cabin[1] * style.length - front - 0.3
-    return [
-        block((front + 0.01, 0, 0.62 * style.belt), (0.05, width * 0.42, 0.16), _DARK, label),
-        block((front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
-        block((-front, 0, 0.3), (0.1, width * 0.96, 0.2), _DARK, label),
-        block((-front - 0.02, 0, 0.6 * style.belt), (0.05, 0.5, 0.11), (0.85, 0.85, 0.8), label),
-        block((mirror, 0, style.belt + 0.1), (0.12, width + 0.08, 0.12), paint, label, gloss=0.35),
-    ]
 
 
 def _wheels(axles: tuple[float, ...], width: float, radius: float, label: Label, near: bool) -> list[Part]:
@@ -187,8 +170,8 @@ def random_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assem
     """A box truck, a tipper or a lorry with a long trailer."""
     kind = str(random.choice(["box", "tipper", "trailer"], p=[0.55, 0.2, 0.25]))
     length = float(random.uniform(11, 13.5) if kind == "trailer" else random.uniform(6, 8.5))
-    height = 2.5 if kind == "tipper" else float(random.uniform(2.8, 3.6))
-    white = float(random.uniform(0.6, 0.92))
+    height = 2.5 if kind == "tipper" else random.uniform(2.8, 3.6)
+    white = random.uniform(0.6, 0.92)
     cargo: Colour = (white, white, white) if random.random() < 0.55 else random_paint(random)
     front, load, label = length / 2, length - 2.35, Label.TRUCK
     paint = random_paint(random)
@@ -212,7 +195,7 @@ def random_truck(random: np.random.Generator, lamps: Lamps, near: bool) -> Assem
 
 def random_bus(random: np.random.Generator, lamps: Lamps, near: bool) -> Assembly:
     """A city bus or a coach."""
-    length, label = float(random.uniform(9.5, 12.2)), Label.BUS
+    length, label = random.uniform(9.5, 12.2), Label.BUS
     paint = varied(pick(random, _LIVERIES), random)
     band: Colour = (0.9, 0.9, 0.88)
     parts = [
@@ -237,7 +220,7 @@ def _cloth(random: np.random.Generator) -> Colour:
 def random_person(random: np.random.Generator, walks: bool) -> Assembly:
     """A grown-up or a child, walking or standing; some carry a bag."""
     height = float(random.uniform(1.52, 1.92) if random.random() < 0.88 else random.uniform(1.0, 1.35))
-    stride = float(random.uniform(0.12, 0.24)) * height / 1.7 if walks else 0.0
+    stride = random.uniform(0.12, 0.24) * height / 1.7 if walks else 0.0
     parts = _figure(random, height, Label.PERSON, stride)
     if random.random() < 0.3:
         parts.append(block((0.0, 0.3 * height / 1.7, 0.42 * height), (0.32, 0.12, 0.3), _cloth(random), Label.PERSON))
@@ -277,6 +260,15 @@ def random_motorcyclist(random: np.random.Generator, lamps: Lamps) -> Assembly:
     return Assembly(parts=parts, length=2.15, width=0.8)
 
 
+def left_two_wheeler(random: np.random.Generator, heavy: bool) -> Assembly:
+    """A motorcycle or a bicycle nobody sits on."""
+    if heavy:
+        return Assembly(parts=_motorcycle(random_paint(random), Lamps(), Label.MOTORCYCLE), length=2.1, width=0.6)
+    saddle = block((-0.25, 0, 0.88), (0.25, 0.14, 0.07), _DARK, Label.BICYCLE)
+    parts = (*_two_wheels(_cloth(random), 0.34, 0.05, Label.BICYCLE), saddle)
+    return Assembly(parts=parts, length=1.8, width=0.55)
+
+
 def _two_wheels(paint: Colour, radius: float, wide: float, label: Label) -> list[Part]:
     reach = 0.53 if wide < 0.1 else 0.7
     return [
@@ -284,18 +276,6 @@ def _two_wheels(paint: Colour, radius: float, wide: float, label: Label) -> list
         block((0, 0, 0.6), (0.95, 0.06, 0.1), paint, label),
         block((reach - 0.1, 0, 0.95), (0.05, 0.5, 0.05), _DARK, label),
     ]
-
-
-def left_bicycle(random: np.random.Generator) -> Assembly:
-    """A bicycle nobody sits on."""
-    saddle = block((-0.25, 0, 0.88), (0.25, 0.14, 0.07), _DARK, Label.BICYCLE)
-    parts = (*_two_wheels(_cloth(random), 0.34, 0.05, Label.BICYCLE), saddle)
-    return Assembly(parts=parts, length=1.8, width=0.55)
-
-
-def left_motorcycle(random: np.random.Generator) -> Assembly:
-    """A motorcycle nobody sits on."""
-    return Assembly(parts=_motorcycle(random_paint(random), Lamps(), Label.MOTORCYCLE), length=2.1, width=0.6)
 
 
 def _motorcycle(paint: Colour, lamps: Lamps, label: Label) -> tuple[Part, ...]:

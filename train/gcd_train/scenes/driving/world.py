@@ -5,6 +5,7 @@ behind the car, 10 frames per second.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,6 +48,7 @@ EDITION = 2
 """Rises whenever a seed draws another world."""
 _PATH_STEPS = 8
 _PAVED = ("city", "business")
+_MOUNT = CameraMount()
 _SIDE_YAW_DEG, _SIDE_M = 60.0, 0.25
 _FOCUS_AHEAD_M = 28.0
 """Shadows fall around a point that far ahead of the vehicle."""
@@ -90,22 +92,19 @@ def driving_drive(seed: int, frames: int = 50) -> Scene:
     return replace(scene, cameras=_on_vehicle(users[0].rows))
 
 
-def driving_scene(
-    seed: int, *, frames: int = 14, mount: CameraMount | None = None, move_time: int | None = None
-) -> Scene:
+def driving_scene(seed: int, *, frames: int = 14, mount: CameraMount = _MOUNT, move_time: int | None = None) -> Scene:
     """A scene for pairs, seen by a source and a target camera that ride on the vehicle, in the models' thirteen
     classes; the arguments decide it all.
 
     Args:
         seed: 0 or more.
         frames: time steps at 10 Hz.
-        mount: where the source camera sits, if not where ParallelDomain-4D has it; the target path stays.
+        mount: where the source camera sits, by default where ParallelDomain-4D has it; the target path stays.
         move_time: the frame in which the target camera is at its goal, the last if left out; 0 is the direct path.
     """
     scene, users = random_world(seed, frames)
     parts = tuple(replace(part, label=coarse(part.label)) for part in scene.parts)
     sheets = tuple(replace(sheet, label=coarse(sheet.label)) for sheet in scene.sheets)
-    mount = mount or CameraMount()
     world_from_vehicle, source = rigid(users[0].rows), mount.vehicle_from_camera.numpy()
     path = driving_trajectory(frames=frames, move_time=frames - 1 if move_time is None else move_time, mount=mount)
     goal = source @ path.source_from_target.numpy()
@@ -123,17 +122,20 @@ def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
     district = str(layout.choice(list(DISTRICTS), p=[0.4, 0.3, 0.18, 0.12]))
     paved = district in _PAVED
     drive = random_drive(street, frames, way)
-    cameras = _camera_places(drive.rows)
+    path = driving_trajectory(frames=_PATH_STEPS, move_time=_PATH_STEPS - 1).source_from_target.numpy()
+    along = rigid(drive.rows)[:, None] @ (vehicle_from_camera()["yaw-0"] @ path)[None]
+    # where the rig's cameras stand, and some places on the path from the forward to the top-down one: [T, C, 3]
+    cameras = np.concatenate([np.stack(list(_on_vehicle(drive.rows).values()), 1), along], 1)[..., :3, 3]
     plot = Plot(street=street, cameras=cameras.reshape(-1, 3))
-    furnish(plot, DISTRICTS[district], paved, weather.dark, not drive.waits, standing)
+    waits = drive.waits_at is not None
+    furnish(plot, DISTRICTS[district], paved, weather.dark, not waits, standing)
     crowd = Crowd(street=street, drive=drive, obstacles=plot.taken, cameras=cameras)
     fill(crowd, weather.lamps, moving)
     sheets = ground_sheets(street, weather.wetness, paved, ground)
     asphalt = next(sheet.paint.colour for sheet in sheets if sheet.label == Label.ROAD)
     parts = [_SKY, *(part for thing in plot.things for part in thing)]
     if weather.dark:
-        lamps = [lamp for lamp in plot.lamps if abs(lamp.s) < _POOLS_M]
-        spots = [lamp.road.at(lamp.s, lamp.side * (lamp.away - 2.0)) for lamp in lamps]
+        spots = [(x, y, heading) for x, y, heading, s in plot.lamps if abs(s) < _POOLS_M]
         sheets += lamp_pools(spots, asphalt, 0.9 if weather.kind == "night" else 0.3)
         parts += [part for thing in plot.things for part in lit_windows(thing, standing)]
     users, bodies = _users(crowd.users)
@@ -156,7 +158,7 @@ def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
             "lanes": street.main.lanes_left + street.main.lanes_right,
             "crossings": len(street.crossed),
             "road_users": len(crowd.users),
-            "waits": int(drive.waits),
+            "waits": int(waits),
             "ego_m_s": round(drive.speed, 3),
         },
     )
@@ -177,13 +179,6 @@ def _users(users: list[RoadUser]) -> tuple[list[Part], Floats]:
     return parts, upright(np.stack(rows, 1))
 
 
-def _camera_places(ego: Floats) -> Doubles:
-    """[T, C, 3]: where the rig's cameras stand, and some places on the path from the forward to the top-down one."""
-    path = driving_trajectory(frames=_PATH_STEPS, move_time=_PATH_STEPS - 1).source_from_target.numpy()
-    along = rigid(ego)[:, None] @ (vehicle_from_camera()["yaw-0"] @ path)[None]
-    return np.concatenate([np.stack(list(_on_vehicle(ego).values()), 1), along], 1)[..., :3, 3]
-
-
 def _on_vehicle(rows: Floats) -> dict[str, Doubles]:
     """world_from_camera [T, 4, 4] of the rig's cameras, where the vehicle is at x, y, z, yaw [T, 4]."""
     world_from_vehicle = rigid(rows)
@@ -196,10 +191,10 @@ def vehicle_from_camera() -> dict[str, Doubles]:
     camera0 to camera15 stand around and above the car, camera0 where the paper's path ends; yaw-0 looks ahead from
     where that path begins, yaw-60 and yaw-neg-60 stand beside it and look to the left and to the right.
     """
-    poses = {"camera0": _looking(DRIVING_GOAL_POSITION, DRIVING_GOAL_TARGET)}
+    poses = {"camera0": looking(DRIVING_GOAL_POSITION, DRIVING_GOAL_TARGET)}
     for number, (x, y, z, azimuth_deg, down_deg) in enumerate(_SURROUND, start=1):
         poses[f"camera{number}"] = _turned((x, y, z), azimuth_deg, down_deg)
-    poses["yaw-0"] = _looking(DRIVING_SOURCE_POSITION, DRIVING_SOURCE_TARGET)
+    poses["yaw-0"] = looking(DRIVING_SOURCE_POSITION, DRIVING_SOURCE_TARGET)
     for name, side in (("yaw-60", 1.0), ("yaw-neg-60", -1.0)):
         x, y, z = DRIVING_SOURCE_POSITION
         poses[name] = _turned((x, y + side * _SIDE_M, z), side * _SIDE_YAW_DEG, 0.0)
@@ -216,12 +211,12 @@ def rigid(rows: NDArray[Any]) -> Doubles:
 def _turned(position: Point, azimuth_deg: float, down_deg: float) -> Doubles:
     azimuth, down = np.radians(azimuth_deg), np.radians(down_deg)
     ahead = (np.cos(azimuth) * np.cos(down), np.sin(azimuth) * np.cos(down), -np.sin(down))
-    x, y, z = (float(at + step) for at, step in zip(position, ahead, strict=True))
-    return _looking(position, (x, y, z))
+    return looking(position, np.add(position, ahead))
 
 
-def _looking(position: Point, target: Point) -> Doubles:
-    return look_at(torch.tensor(position, dtype=torch.float64), torch.tensor(target, dtype=torch.float64)).numpy()
+def looking(eye: Sequence[float] | Doubles, target: Sequence[float] | Doubles) -> Doubles:
+    """world_from_camera [4, 4] of an upright camera at one point [3] that looks at another."""
+    return look_at(*(torch.tensor(point, dtype=torch.float64) for point in (eye, target))).numpy()
 
 
 def _beams(asphalt: Colour, body: int) -> list[Part]:
@@ -242,37 +237,37 @@ _SHARES = {
     "clear": 0.3, "cloudy": 0.18, "low sun": 0.12, "overcast": 0.12, "rain": 0.12, "fog": 0.06, "dusk": 0.06,
     "night": 0.04,
 }  # fmt: skip
-WEATHERS = tuple(_SHARES)
-_DIM = {
-    "dusk": Light(
-        sun_to=(0.0, 0.0, 1.0),
-        sun=(0.16, 0.08, 0.05),
-        sky=(0.2, 0.2, 0.3),
-        ground=(0.08, 0.07, 0.07),
-        horizon=(0.62, 0.34, 0.26),
-        zenith=(0.1, 0.13, 0.27),
-        fog_m=420.0,
-        cloud=0.0,
-        exposure=1.5,
-    ),
-    "night": Light(
-        sun_to=(0.0, 0.0, 1.0),
-        sun=(0.035, 0.045, 0.07),
-        sky=(0.06, 0.065, 0.095),
-        ground=(0.03, 0.026, 0.022),
-        horizon=(0.055, 0.05, 0.06),
-        zenith=(0.008, 0.011, 0.026),
-        fog_m=240.0,
-        cloud=0.0,
-        exposure=1.9,
-    ),
-}
+_GREY = {"overcast": (0.72, (220, 600)), "rain": (0.5, (110, 220)), "fog": (0.66, (38, 75))}
+"""How bright the sky is, and between which distances half of the fog lies, metres."""
+_DUSK = Light(
+    sun_to=(0.0, 0.0, 1.0),
+    sun=(0.16, 0.08, 0.05),
+    sky=(0.2, 0.2, 0.3),
+    ground=(0.08, 0.07, 0.07),
+    horizon=(0.62, 0.34, 0.26),
+    zenith=(0.1, 0.13, 0.27),
+    fog_m=420.0,
+    cloud=0.0,
+    exposure=1.5,
+)
+_NIGHT = replace(
+    _DUSK,
+    sun=(0.035, 0.045, 0.07),
+    sky=(0.06, 0.065, 0.095),
+    ground=(0.03, 0.026, 0.022),
+    horizon=(0.055, 0.05, 0.06),
+    zenith=(0.008, 0.011, 0.026),
+    fog_m=240.0,
+    exposure=1.9,
+)
+_DIM = {"dusk": (_DUSK, 8.0), "night": (_NIGHT, 40.0)}
+"""With the height of sun and moon, degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Weather:
-    """kind: one of WEATHERS. wetness: of the ground, 0..1. lamps: whether vehicles have theirs lit. dark: whether
-    street lamps and windows are lit too.
+    """wetness: of the ground, 0..1. lamps: whether vehicles have theirs lit. dark: whether street lamps and windows
+    are lit too.
     """
 
     kind: str
@@ -286,7 +281,7 @@ def random_weather(random: np.random.Generator) -> Weather:
     """Drawn at random; one in six is wet, one in ten dark."""
     kind = pick_by_share(random, tuple(_SHARES.items()))
     light = _light(kind, random)
-    wet = {"rain": float(random.uniform(0.7, 1.0)), "dusk": 0.3, "night": float(random.choice([0.0, 0.7]))}
+    wet = {"rain": random.uniform(0.7, 1.0), "dusk": 0.3, "night": float(random.choice([0.0, 0.7]))}
     return Weather(
         kind=kind,
         light=light,
@@ -297,48 +292,38 @@ def random_weather(random: np.random.Generator) -> Weather:
 
 
 def _light(kind: str, random: np.random.Generator) -> Light:
-    azimuth = float(random.uniform(0, 2 * math.pi))
-    exposure = float(random.uniform(0.9, 1.12))
-    if kind in ("clear", "cloudy", "low sun"):
-        return _sunny(kind, azimuth, exposure, random)
+    azimuth = random.uniform(0, 2 * math.pi)
+    exposure = random.uniform(0.9, 1.12)
     if kind in _DIM:
-        sun_to = towards(math.radians(8.0 if kind == "dusk" else 40.0), azimuth)
-        return replace(_DIM[kind], sun_to=sun_to, exposure=_DIM[kind].exposure * exposure)
-    return _grey(kind, azimuth, exposure, random)
-
-
-def _sunny(kind: str, azimuth: float, exposure: float, random: np.random.Generator) -> Light:
-    height = float(random.uniform(9, 17) if kind == "low sun" else random.uniform(24, 66))
+        dim, height = _DIM[kind]
+        return replace(dim, sun_to=towards(math.radians(height), azimuth), exposure=dim.exposure * exposure)
+    if kind in _GREY:
+        fog_m = {name: random.uniform(*bounds) for name, (_, bounds) in _GREY.items()}[kind]
+        grey, _ = _GREY[kind]
+        sky: Colour = (grey * 0.96, grey * 0.99, grey * 1.03)
+        return Light(
+            sun_to=towards(math.radians(random.uniform(45, 75)), azimuth),
+            sun=(0.12, 0.12, 0.11),
+            sky=(0.86 * grey + 0.16, 0.88 * grey + 0.16, 0.92 * grey + 0.16),
+            ground=(0.3 * grey, 0.29 * grey, 0.28 * grey),
+            horizon=sky,
+            zenith=(0.82 * sky[0], 0.85 * sky[1], 0.9 * sky[2]),
+            fog_m=float(fog_m),
+            cloud=0.25 if kind == "rain" else 0.1,
+            exposure=1.5 * exposure,
+        )
+    height, cloudy = float(random.uniform(9, 17) if kind == "low sun" else random.uniform(24, 66)), kind == "cloudy"
     low = math.exp(-height / 18.0)  # how golden the light is
-    strength = 2.5 if kind != "cloudy" else 1.9
-    sun: Colour = (strength, strength * (1 - 0.3 * low), strength * (0.94 - 0.55 * low))
-    blue = float(random.uniform(0.6, 1.0)) * (1.0 if kind != "cloudy" else 0.6)
-    zenith: Colour = (0.5 - 0.42 * blue, 0.56 - 0.33 * blue, 0.68 + 0.02 * blue)
+    strength = 1.9 if cloudy else 2.5
+    blue = random.uniform(0.6, 1.0) * (0.6 if cloudy else 1.0)
     return Light(
         sun_to=towards(math.radians(height), azimuth),
-        sun=sun,
+        sun=(strength, strength * (1 - 0.3 * low), strength * (0.94 - 0.55 * low)),
         sky=(0.38 - 0.06 * blue, 0.42, 0.48 + 0.06 * blue),
         ground=(0.17, 0.16, 0.14),
         horizon=(0.64 - 0.12 * blue + 0.34 * low, 0.68 - 0.04 * blue + 0.02 * low, 0.8 - 0.3 * low),
-        zenith=zenith,
-        fog_m=float(random.uniform(320, 800)),
-        cloud=float(random.uniform(0.7, 1.0)) if kind == "cloudy" else float(random.uniform(0, 0.45)),
+        zenith=(0.5 - 0.42 * blue, 0.56 - 0.33 * blue, 0.68 + 0.02 * blue),
+        fog_m=random.uniform(320, 800),
+        cloud=random.uniform(0.7, 1.0) if cloudy else random.uniform(0, 0.45),
         exposure=1.45 * exposure,
-    )
-
-
-def _grey(kind: str, azimuth: float, exposure: float, random: np.random.Generator) -> Light:
-    far = {"overcast": random.uniform(220, 600), "rain": random.uniform(110, 220), "fog": random.uniform(38, 75)}
-    grey = {"overcast": 0.72, "rain": 0.5, "fog": 0.66}[kind]
-    sky: Colour = (grey * 0.96, grey * 0.99, grey * 1.03)
-    return Light(
-        sun_to=towards(math.radians(float(random.uniform(45, 75))), azimuth),
-        sun=(0.12, 0.12, 0.11),
-        sky=(0.86 * grey + 0.16, 0.88 * grey + 0.16, 0.92 * grey + 0.16),
-        ground=(0.3 * grey, 0.29 * grey, 0.28 * grey),
-        horizon=sky,
-        zenith=(0.82 * sky[0], 0.85 * sky[1], 0.9 * sky[2]),
-        fog_m=float(far[kind]),
-        cloud=0.25 if kind == "rain" else 0.1,
-        exposure=1.5 * exposure,
     )

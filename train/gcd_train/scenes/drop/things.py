@@ -67,14 +67,14 @@ _FAMILIES = (
 def random_paint(random: _Random, size_m: float) -> Paint:
     """Any family; the pattern's spacing suits a thing of that size."""
     pattern = pick_by_share(random, _FAMILIES)
-    gloss = 0.0 if random.random() < 0.35 else float(random.uniform(0.15, 0.8))
+    gloss = 0.0 if random.random() < 0.35 else random.uniform(0.15, 0.8)
     if pattern in (Pattern.WOOD, Pattern.MARBLE):
         colour, accent = pick(random, _WOODS if pattern is Pattern.WOOD else _STONES)
         grain_m = size_m * float(random.uniform(0.12, 0.3) if pattern is Pattern.WOOD else random.uniform(0.3, 0.7))
         return Paint(colour, accent, pattern, grain_m, 0.5 * gloss)
     colour = _random_colour(random)
     accent = (0.92, 0.9, 0.86) if random.random() < 0.4 else _random_colour(random)
-    return Paint(colour, accent, pattern, size_m * float(random.uniform(0.13, 0.32)), gloss)
+    return Paint(colour, accent, pattern, size_m * random.uniform(0.13, 0.32), gloss)
 
 
 def _random_colour(random: _Random) -> Colour:
@@ -82,7 +82,7 @@ def _random_colour(random: _Random) -> Colour:
     if random.random() < 0.18:
         grey = float(random.choice([0.08, 0.35, 0.62, 0.93]))
         return grey, grey, min(grey * 1.03, 1.0)
-    hue, strength, bright = float(random.random()), float(random.uniform(0.45, 0.92)), float(random.uniform(0.4, 0.95))
+    hue, strength, bright = random.random(), random.uniform(0.45, 0.92), random.uniform(0.4, 0.95)
     return colorsys.hsv_to_rgb(hue, strength, bright)
 
 
@@ -100,14 +100,14 @@ def random_thing(random: _Random, *, side_m: float, dynamic: bool) -> Thing:
             part, centre=_point(scale * (np.array(part.centre) + move)), size=_point(scale * np.array(part.size))
         )
 
-    density = float(random.lognormal(math.log(120.0), 0.5))  # kg/m3: hollow toys to solid wood
+    density = random.lognormal(math.log(120.0), 0.5)  # kg/m3: hollow toys to solid wood
     return Thing(
         name=name,
         parts=tuple(map(scaled, parts)),
         size=_point(scale * (high - low)),
         mass_kg=density * _FILLED * _MEAN_SIDE_M * side_m**2,
-        friction=float(random.uniform(0.5, 0.9)),
-        restitution=float(random.uniform(0.1, 0.5)),
+        friction=random.uniform(0.5, 0.9),
+        restitution=random.uniform(0.1, 0.5),
         dynamic=dynamic,
     )
 
@@ -138,7 +138,7 @@ def _single(name: str, low: Point = (1, 1, 1), high: Point = (1, 1, 1), *, round
     """One shape, each side by chance between two bounds; round ones are as deep as they are wide."""
 
     def make(random: _Random, a: Paint, b: Paint) -> list[Part]:
-        x, y, z = (float(random.uniform(*sides)) for sides in zip(low, high, strict=True))
+        x, y, z = (random.uniform(*sides) for sides in zip(low, high, strict=True))
         return [_part(name, (0, 0, 0), (x, x if round_ else y, z), a)]
 
     return make
@@ -150,14 +150,14 @@ def _plain(paint: Paint, factor: float = 1.0) -> Paint:
 
 
 def _table(random: _Random, a: Paint, b: Paint) -> list[Part]:
-    depth, high = float(random.uniform(0.6, 1.0)), float(random.uniform(0.5, 0.8))
+    depth, high = random.uniform(0.6, 1.0), random.uniform(0.5, 0.8)
     at = [(x, y * depth) for x in (-0.42, 0.42) for y in (-0.42, 0.42)]
     legs = [_part("box", (x, y, -0.04), (0.09, 0.09, high), _plain(a, 0.8)) for x, y in at]
     return [_part("box", (0, 0, high / 2), (1, depth, 0.1), a), *legs]
 
 
 def _dumbbell(random: _Random, a: Paint, b: Paint) -> list[Part]:
-    ball = float(random.uniform(0.34, 0.48))
+    ball = random.uniform(0.34, 0.48)
     ends = [_part("sphere", (x, 0, 0), (ball, ball, ball), a) for x in (ball / 2 - 0.5, 0.5 - ball / 2)]
     return [*ends, _part("cylinder", (0, 0, 0), (0.13, 0.13, 0.8), _plain(b), _ALONG_X)]
 
@@ -175,7 +175,7 @@ def _toy_car(random: _Random, a: Paint, b: Paint) -> list[Part]:
 
 
 def _present(random: _Random, a: Paint, b: Paint) -> list[Part]:
-    deep, high, ribbon = float(random.uniform(0.7, 1.0)), float(random.uniform(0.45, 0.85)), _plain(b)
+    deep, high, ribbon = random.uniform(0.7, 1.0), random.uniform(0.45, 0.85), _plain(b)
     return [
         _part("box", (0, 0, 0), (1, deep, high), a),
         _part("box", (0, 0, 0), (1.012, 0.12, high * 1.012), ribbon),

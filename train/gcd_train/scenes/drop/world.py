@@ -6,7 +6,7 @@ twelve at 5.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from gcd_train.scenes.description import (
     Paint,
     Part,
     Pattern,
+    Point,
     Scene,
     SceneObject,
     Sheet,
@@ -88,88 +89,69 @@ def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: in
         overlapped at most, metres.
     Raises: UnsoundSceneError if no free place was found or something never came to rest; RenderError without MuJoCo.
     """
-    stage = _Stage(things)
-    settled = [i for i, thing in enumerate(things) if not thing.dynamic]
-    for i in settled:
-        stage.put(i, random, (-7.0, -7.0, 0.0), (7.0, 7.0, 7.0))
-    stage.settle(settled)
-    for i, thing in enumerate(things):
-        if thing.dynamic:
-            place = stage.put(i, random, (-5.0, -5.0, 1.0), (5.0, 5.0, 6.0))
-            pull = np.array([place[0], place[1], 0.0])  # Kubric's throw: anywhere, and towards the middle
-            stage.throw(i, random.uniform((-4, -4, 0), (4, 4, 0)) - pull, random.uniform(-2.5, 2.5, 3))
-    return stage.watch(frames)
+    mujoco, model = load_mujoco(), _compiled(things)
+    data = mujoco.MjData(model)
+    q, v = (
+        data.qpos.reshape(-1, 7),
+        data.qvel.reshape(-1, 6),
+    )  # what MuJoCo works on: places and attitudes; speeds, spins
+    for i, thing in enumerate(things):  # far outside, alone, where it disturbs nothing
+        q[i] = (500.0 + 20.0 * i, 500.0, thing.size[2] / 2 + 0.01, *np.eye(4)[0])
 
-
-class _Stage:
-    """A floor and things on it; the only owner of MuJoCo's state."""
-
-    def __init__(self, things: Sequence[Thing]) -> None:
-        self._mujoco = load_mujoco()
-        self._things = things
-        self._model: Any = _compiled(self._mujoco, things)
-        self._data: Any = self._mujoco.MjData(self._model)
-        for i, thing in enumerate(things):  # far outside, alone, where it disturbs nothing
-            self._place(i, np.array([500.0 + 20.0 * i, 500.0, thing.size[2] / 2 + 0.01]), np.eye(4)[0])
-
-    def put(self, i: int, random: np.random.Generator, low: Sequence[float], high: Sequence[float]) -> Doubles:
+    def put(i: int, low: Point, high: Point) -> Doubles:
         """Somewhere in a box, in any attitude, where it touches nothing; its place [3]."""
         for _ in range(_TRIES):
-            quaternion = random.normal(size=4)
-            place = random.uniform(low, high)
-            self._place(i, place, quaternion / np.linalg.norm(quaternion))
-            self._mujoco.mj_forward(self._model, self._data)
-            if not (self._model.geom_bodyid[self._data.contact.geom] == i + 1).any():
+            quaternion, place = random.normal(size=4), random.uniform(low, high)
+            q[i], v[i] = (*place, *(quaternion / np.linalg.norm(quaternion))), 0.0
+            mujoco.mj_forward(model, data)
+            if not (model.geom_bodyid[data.contact.geom] == i + 1).any():
                 return place
-        raise UnsoundSceneError(f"no free place for a {self._things[i].name} in {_TRIES} tries")
+        raise UnsoundSceneError(f"no free place for a {things[i].name} in {_TRIES} tries")
 
-    def settle(self, which: Sequence[int]) -> None:
-        """Until all of them lie still, which is then made exact. Air as thick as syrup saves waiting for what rolls."""
-        mass, inertia = self._model.body_mass[1:, None], self._model.body_inertia[1:]
-        self._model.dof_damping[:] = _SYRUP_HZ * np.concatenate([mass, mass, mass, inertia], 1).ravel()
-        self._run(_SETTLING_S)
-        rows = [6 * i + k for i in which for k in range(6)]
-        waited = _SETTLING_S
-        while np.abs(self._data.qvel[rows]).max(initial=0.0) > _STILL_M_S:
-            if waited >= _LONGEST_SETTLING_S:
-                raise UnsoundSceneError(f"something still moves after {waited:.0f} s")
-            self._run(0.5)
-            waited += 0.5
-        self._data.qvel[:] = 0.0
-        self._model.dof_damping[:] = 0.0
-
-    def throw(self, i: int, velocity: Doubles, spin: Doubles) -> None:
-        """Give it a velocity, metres a second, and a spin about its own axes, radians a second."""
-        self._data.qvel[6 * i : 6 * i + 6] = np.concatenate([velocity, spin])
-
-    def watch(self, frames: int) -> tuple[Tracks, float]:
-        """The motion from now on, and how deep solids overlapped at most."""
-        deepest, q, v = 0.0, [], []
-        for frame in range(frames):
-            if frame:
-                deepest = max(deepest, self._run(1 / FPS))
-            q.append(self._data.qpos.reshape(-1, 7).copy())
-            v.append(self._data.qvel.reshape(-1, 6).copy())
-        q, v = np.stack(q), np.stack(v)  # [T, N, 7], [T, N, 6]
-        spin = rotations(q[..., 3:]) @ v[..., 3:, None]  # MuJoCo's are in the body's frame
-        tracks = Tracks(
-            positions=q[..., :3], quaternions=q[..., 3:], velocities=v[..., :3], angular_velocities=spin[..., 0]
-        )
-        return tracks, deepest
-
-    def _run(self, seconds: float) -> float:
-        """Let time pass. Returns how deep solids overlapped at most. Raises UnsoundSceneError if it diverged."""
+    def run(seconds: float) -> float:
+        """Let time pass. Returns how deep solids overlapped at most."""
         deepest = 0.0
         for _ in range(round(seconds / _STEP_S)):
-            self._mujoco.mj_step(self._model, self._data)
-            deepest = min(deepest, self._data.contact.dist.min(initial=0.0))
-        if any(warning.number for warning in self._data.warning):  # MuJoCo starts anew after such
+            mujoco.mj_step(model, data)
+            deepest = min(deepest, data.contact.dist.min(initial=0.0))
+        if any(warning.number for warning in data.warning):  # MuJoCo starts anew after such
             raise UnsoundSceneError("the simulation diverged")
         return -float(deepest)
 
-    def _place(self, i: int, place: Doubles, quaternion: Doubles) -> None:
-        self._data.qpos[7 * i : 7 * i + 7] = np.concatenate([place, quaternion])
-        self._data.qvel[6 * i : 6 * i + 6] = 0.0
+    settled, thrown = ([i for i, thing in enumerate(things) if thing.dynamic == flies] for flies in (False, True))
+    for i in settled:
+        put(i, (-7.0, -7.0, 0.0), (7.0, 7.0, 7.0))
+    mass, inertia = model.body_mass[1:, None], model.body_inertia[1:]
+    # air as thick as syrup saves waiting for what rolls
+    model.dof_damping[:] = _SYRUP_HZ * np.concatenate([mass, mass, mass, inertia], 1).ravel()
+    waited = _SETTLING_S
+    run(waited)
+    while np.abs(v[settled]).max(initial=0.0) > _STILL_M_S:
+        if waited >= _LONGEST_SETTLING_S:
+            raise UnsoundSceneError(f"something still moves after {waited:.0f} s")
+        run(0.5)
+        waited += 0.5
+    v[:], model.dof_damping[:] = 0.0, 0.0  # they lie still, exactly
+    for i in thrown:
+        x, y, _ = put(i, (-5.0, -5.0, 1.0), (5.0, 5.0, 6.0))
+        # Kubric's throw: anywhere, and towards the middle; the spin is about its own axes
+        v[i] = (*(random.uniform((-4, -4, 0), (4, 4, 0)) - (x, y, 0.0)), *random.uniform(-2.5, 2.5, 3))
+    return _watched(q, v, run, frames)
+
+
+def _watched(q: Doubles, v: Doubles, run: Callable[[float], float], frames: int) -> tuple[Tracks, float]:
+    """The motion from now on, and how deep solids overlapped at most."""
+    deepest, places, rates = 0.0, [q.copy()], [v.copy()]
+    for _ in range(1, frames):
+        deepest = max(deepest, run(1 / FPS))
+        places.append(q.copy())
+        rates.append(v.copy())
+    q, v = np.stack(places), np.stack(rates)  # [T, N, 7], [T, N, 6]
+    spin = rotations(q[..., 3:]) @ v[..., 3:, None]  # MuJoCo's are in the body's frame
+    tracks = Tracks(
+        positions=q[..., :3], quaternions=q[..., 3:], velocities=v[..., :3], angular_velocities=spin[..., 0]
+    )
+    return tracks, deepest
 
 
 def load_mujoco() -> Any:
@@ -181,7 +163,8 @@ def load_mujoco() -> Any:
     return mujoco
 
 
-def _compiled(mujoco: Any, things: Sequence[Thing]) -> Any:
+def _compiled(things: Sequence[Thing]) -> Any:
+    mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.option.timestep = _STEP_S
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -258,7 +241,24 @@ def drop_scene(seed: int, frames: int = 60) -> Scene:
         except UnsoundSceneError as error:
             reasons.append(str(error))
             continue
-        return _scene(things, tracks, np.random.default_rng([seed, 0x100C]), {"seed": seed, "attempts": attempt + 1})
+        random = np.random.default_rng([seed, 0x100C])
+        surroundings, dome, floor = random_surroundings(random)
+        counts = {"settled": len(settled), "thrown": len(things) - len(settled)}
+        return Scene(
+            parts=(dome, *(part.of(instance=i, body=i) for i, thing in enumerate(things, 1) for part in thing.parts)),
+            sheets=(floor,),
+            poses=with_world(rotations(tracks.quaternions), tracks.positions),
+            focus=np.zeros((frames, 3), np.float32),
+            cameras=orbit_cameras(frames),
+            hfov_deg=HFOV_DEG,
+            light=random_light(random),
+            facts={"seed": seed, "attempts": attempt + 1, "surroundings": surroundings, **counts},
+            objects=tuple(
+                SceneObject.of(thing, tracks, i, instance=i + 1, body=i + 1, label=DropLabel.OBJECT)
+                for i, thing in enumerate(things)
+            ),
+            extent=ORBIT,
+        )
     raise RenderError(f"drop scene {seed}: no sound simulation in {_ATTEMPTS} attempts ({'; '.join(reasons)}); skip it")
 
 
@@ -283,27 +283,6 @@ def _require_free_cameras(things: list[Thing], tracks: Tracks) -> None:
     away = np.linalg.norm(tracks.positions[:, :, None] - cameras, axis=-1).min((0, 2))  # [N]
     if (away < reach).any():
         raise UnsoundSceneError(f"a {things[int((away - reach).argmin())].name} reaches a camera")
-
-
-def _scene(things: list[Thing], tracks: Tracks, random: np.random.Generator, facts: dict[str, float | str]) -> Scene:
-    frames = len(tracks.positions)
-    surroundings, dome, floor = random_surroundings(random)
-    thrown = sum(thing.dynamic for thing in things)
-    return Scene(
-        parts=(dome, *(part.of(instance=i, body=i) for i, thing in enumerate(things, 1) for part in thing.parts)),
-        sheets=(floor,),
-        poses=with_world(rotations(tracks.quaternions), tracks.positions),
-        focus=np.zeros((frames, 3), np.float32),
-        cameras=orbit_cameras(frames),
-        hfov_deg=HFOV_DEG,
-        light=random_light(random),
-        facts={**facts, "surroundings": surroundings, "settled": len(things) - thrown, "thrown": thrown},
-        objects=tuple(
-            SceneObject.of(thing, tracks, i, instance=i + 1, body=i + 1, label=DropLabel.OBJECT)
-            for i, thing in enumerate(things)
-        ),
-        extent=ORBIT,
-    )
 
 
 DOME_M = 40.0
@@ -354,7 +333,7 @@ def random_surroundings(random: np.random.Generator) -> tuple[str, Part, Sheet]:
     _, pattern, floors = _BACKDROPS[backdrop]
     name = pick(random, floors)
     colour, accent = _HILLS if backdrop == "hills" else pick(random, _WALLS)
-    side, bright, floor = 2 * DOME_M, float(random.uniform(0.85, 1.12)), _FLOORS[name]
+    side, bright, floor = 2 * DOME_M, random.uniform(0.85, 1.12), _FLOORS[name]
     dome = Part("sphere", (0, 0, 0), (-side, side, side), Paint(colour, accent, pattern), DropLabel.BACKGROUND)
     lit = replace(floor, colour=shaded(floor.colour, bright), accent=shaded(floor.accent, bright))
     return f"{name}, {backdrop}", dome, Sheet(square(DOME_M + 1.0, 0.0), lit, DropLabel.BACKGROUND)
@@ -363,11 +342,11 @@ def random_surroundings(random: np.random.Generator) -> tuple[str, Part, Sheet]:
 def random_light(random: np.random.Generator) -> Light:
     """A sun at some height, warmer when low, or a bright overcast sky."""
     overcast = random.random() < 0.2
-    height, round_ = float(random.uniform(math.radians(28), math.radians(72))), float(random.uniform(0, 2 * math.pi))
-    warm = float(random.uniform(0, 1)) * (1.1 - math.sin(height))
-    strength = 0.55 if overcast else float(random.uniform(1.3, 1.9))
-    fill = 0.85 if overcast else float(random.uniform(0.45, 0.62))
-    blue = 0.15 if overcast else float(random.uniform(0.4, 1.0))
+    height, round_ = random.uniform(math.radians(28), math.radians(72)), random.uniform(0, 2 * math.pi)
+    warm = random.uniform(0, 1) * (1.1 - math.sin(height))
+    strength = 0.55 if overcast else random.uniform(1.3, 1.9)
+    fill = 0.85 if overcast else random.uniform(0.45, 0.62)
+    blue = 0.15 if overcast else random.uniform(0.4, 1.0)
     return Light(
         sun_to=towards(height, round_),
         sun=(strength, strength * (1 - 0.3 * warm), strength * (0.95 - 0.6 * warm)),
@@ -375,7 +354,7 @@ def random_light(random: np.random.Generator) -> Light:
         ground=(0.5 * fill, 0.46 * fill, 0.42 * fill),
         horizon=(0.74 + 0.12 * warm, 0.77, 0.8 - 0.1 * warm),
         zenith=(0.62 - 0.42 * blue, 0.68 - 0.32 * blue, 0.8 - 0.02 * blue),
-        fog_m=float(random.uniform(70, 160)),
-        cloud=float(random.uniform(0.2, 0.9)),
-        exposure=float(random.uniform(1.35, 1.75)),
+        fog_m=random.uniform(70, 160),
+        cloud=random.uniform(0.2, 0.9),
+        exposure=random.uniform(1.35, 1.75),
     )

@@ -1,13 +1,11 @@
 """The arm, six hinges and a parallel gripper, and the physics: arm, table and things as one MuJoCo model, in metres."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcd_train.scenes.description import Colour, Part, Point, pick, rotations
+from gcd_train.scenes.description import Colour, Doubles, Part, pick, rotations
 from gcd_train.scenes.drop.world import load_mujoco
 from gcd_train.scenes.tabletop.things import (
     FLOOR_M,
@@ -81,13 +79,10 @@ _MOVED_ALIKE = '<joint joint1="slide_right" joint2="slide_left" polycoef="0 1 0 
 
 
 def random_setting(random: np.random.Generator) -> Setting:
-    """An arm, a table with clutter, and things that the arm can take."""
+    """An arm, a table with clutter, and five to twelve loose things; the first four or so stand apart and within
+    reach, so that they can be taken.
+    """
     arm, table, clutter = random_arm(random), random_table(random), random_clutter(random)
-    return Setting(arm=arm, table=table, clutter=clutter, things=_random_things(random, clutter))
-
-
-def _random_things(random: np.random.Generator, clutter: tuple[Placed, ...]) -> tuple[Placed, ...]:
-    """Five to twelve loose things; the first four or so stand apart and within reach, so that they can be taken."""
     wanted = int(random.integers(5, 13))
     placed: list[Placed] = []
     for _ in range(_TRIES):
@@ -95,26 +90,23 @@ def _random_things(random: np.random.Generator, clutter: tuple[Placed, ...]) -> 
             break
         first = len(placed) < 4
         thing = random_thing(random, 2 * OPEN_M - 0.022)
-        x, y = reachable_spot(random) if first else tuple(float(random.uniform(*span)) for span in _SPANS_M)
-        gap = FINGER_ROOM_M - 0.02 if first else _GAP_M
-        if _is_free(x, y, thing.radius_m + gap, (*placed, *clutter)):
+        x, y = reachable_spot(random) if first else tuple(random.uniform(*span) for span in _SPANS_M)
+        radius = thing.radius_m + (FINGER_ROOM_M - 0.02 if first else _GAP_M)
+        others = [
+            (math.hypot(x - each.place[0], y - each.place[1]), each.thing.radius_m) for each in (*placed, *clutter)
+        ]
+        apart = math.hypot(x - BASE[0], y - BASE[1]) > 0.2 + radius
+        if apart and all(away > radius + other for away, other in others):
             place = (x, y, thing.size[2] / 2 + _DROP_M)
-            placed.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-math.pi, math.pi))))
-    return tuple(placed)
+            placed.append(Placed(thing=thing, place=place, yaw=random.uniform(-math.pi, math.pi)))
+    return Setting(arm=arm, table=table, clutter=clutter, things=tuple(placed))
 
 
 def reachable_spot(random: np.random.Generator) -> tuple[float, float]:
     """A point of the table, x and y in metres, that the arm can grasp at from above."""
-    radius = float(random.uniform(REACH_M[0] + 0.02, REACH_M[1] - 0.02))
-    azimuth = float(random.uniform(-_WIDEST_AZIMUTH, _WIDEST_AZIMUTH))
+    radius = random.uniform(REACH_M[0] + 0.02, REACH_M[1] - 0.02)
+    azimuth = random.uniform(-_WIDEST_AZIMUTH, _WIDEST_AZIMUTH)
     return BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth)
-
-
-def _is_free(x: float, y: float, radius: float, others: tuple[Placed, ...]) -> bool:
-    apart = math.hypot(x - BASE[0], y - BASE[1]) > 0.2 + radius
-    return apart and all(
-        math.hypot(x - other.place[0], y - other.place[1]) > radius + other.thing.radius_m for other in others
-    )
 
 
 def is_reachable(x: float, y: float) -> bool:
@@ -129,8 +121,8 @@ def random_arm(random: np.random.Generator) -> str:
     from finger to finger.
     """
     shell, joint = pick(random, _LIVERIES)
-    upper, fore = float(random.uniform(0.33, 0.37)), float(random.uniform(0.30, 0.34))
-    r, s, j = 0.045 * float(random.uniform(0.9, 1.15)), _rgba(shell), _rgba(joint)
+    upper, fore = random.uniform(0.33, 0.37), random.uniform(0.30, 0.34)
+    r, (s, j) = 0.045 * random.uniform(0.9, 1.15), (f'rgba="{a} {b} {c} 1"' for a, b, c in (shell, joint))
     return f"""
 <body name="base" gravcomp="1">
   <geom class="arm" type="cylinder" size="{2.1 * r} 0.018" pos="0 0 0.018" {j}/>
@@ -157,30 +149,20 @@ def random_arm(random: np.random.Generator) -> str:
             <joint name="wrist_pitch" class="wrist" axis="0 1 0" range="-2.6 2.6"/>
             <geom class="arm" type="capsule" size="{0.66 * r}" fromto="0 0 0 0 0 0.05" {s}/>
             <geom class="arm" type="cylinder" size="{0.75 * r} 0.012" pos="0 0 0.075" {j}/>
-            {_palm(s, j)}
+            <body name="palm" pos="0 0 0.087" gravcomp="1">
+              <joint name="tool_roll" class="wrist" axis="0 0 1" range="-3.6 3.6"/>
+              <site name="tool" pos="0 0 0.135"/>
+              <geom class="arm" type="cylinder" size="0.030 0.010" pos="0 0 0.010" {s}/>
+              <geom class="arm" type="box" size="0.024 0.068 0.018" pos="0 0 0.036" {j}/>
+              <geom class="arm" type="box" size="0.018 0.064 0.004" pos="0 0 0.056" {s}/>
+              {_finger("left", 1, s)}
+              {_finger("right", -1, s)}
+            </body>
           </body>
         </body>
       </body>
     </body>
   </body>
-</body>"""
-
-
-def _rgba(colour: Colour) -> str:
-    return f'rgba="{colour[0]} {colour[1]} {colour[2]} 1"'
-
-
-def _palm(shell: str, joint: str) -> str:
-    """Palm, two fingers with rubber pads, and the point between the tips."""
-    return f"""
-<body name="palm" pos="0 0 0.087" gravcomp="1">
-  <joint name="tool_roll" class="wrist" axis="0 0 1" range="-3.6 3.6"/>
-  <site name="tool" pos="0 0 0.135"/>
-  <geom class="arm" type="cylinder" size="0.030 0.010" pos="0 0 0.010" {shell}/>
-  <geom class="arm" type="box" size="0.024 0.068 0.018" pos="0 0 0.036" {joint}/>
-  <geom class="arm" type="box" size="0.018 0.064 0.004" pos="0 0 0.056" {shell}/>
-  {_finger("left", 1, shell)}
-  {_finger("right", -1, shell)}
 </body>"""
 
 
@@ -196,89 +178,8 @@ def _finger(side: str, sign: int, shell: str) -> str:
 </body>"""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Model:
-    """A compiled model and the numbers of what is in it.
-
-    joints, fingers: [J], [2] addresses in qpos; rates: of `joints` in qvel. controls, grips: their actuators.
-    things: body ids. site: the tool.
-    """
-
-    mujoco: Any
-    model: Any
-    joints: NDArray[np.int64]
-    rates: NDArray[np.int64]
-    fingers: NDArray[np.int64]
-    controls: NDArray[np.int64]
-    grips: NDArray[np.int64]
-    things: tuple[int, ...]
-    site: int
-
-
-def build_model(setting: Setting) -> Model:
-    """Compile everything. Raises RenderError without MuJoCo."""
-    mujoco = load_mujoco()
-    model = mujoco.MjModel.from_xml_string(_xml(setting))
-    return Model(
-        mujoco=mujoco,
-        model=model,
-        joints=np.array([model.joint(name).qposadr[0] for name in JOINTS]),
-        rates=np.array([model.joint(name).dofadr[0] for name in JOINTS]),
-        fingers=np.array([model.joint(name).qposadr[0] for name in FINGERS]),
-        controls=np.array([model.actuator(name).id for name in JOINTS]),
-        grips=np.array([model.actuator(name).id for name in FINGERS]),
-        things=tuple(model.body(f"thing_{index}").id for index in range(len(setting.things))),
-        site=model.site("tool").id,
-    )
-
-
-def arm_links(model: Model) -> list[tuple[TableThing, int, TabletopClass]]:
-    """The arm's links, the gripper's last, each with its body's number and its class.
-
-    Their names tell the class too, for layouts that keep no classes: robot_arm/upper_arm, gripper/palm.
-    """
-    found: list[tuple[TableThing, int, TabletopClass]] = []
-    for name in (*_LINKS, *_GRIPPER):
-        label = TabletopClass.GRIPPER if name in _GRIPPER else TabletopClass.ROBOT_ARM
-        body = model.model.body(name).id
-        parts = _parts_of_body(model, body, label)
-        middle, size = _bounding_box(parts)
-        mass_kg = float(model.model.body_mass[body])
-        link = TableThing(
-            name=f"{label.name.lower()}/{name}", parts=parts, size=size, middle=middle, mass_kg=mass_kg, friction=0.8
-        )
-        found.append((link, body, label))
-    return found
-
-
-def _parts_of_body(model: Model, body: int, label: TabletopClass) -> tuple[Part, ...]:
-    """The geoms of one body of a compiled model, as they are seen."""
-    kinds, compiled = model.mujoco.mjtGeom, model.model
-    shapes = {kinds.mjGEOM_BOX: "box", kinds.mjGEOM_CYLINDER: "cylinder", kinds.mjGEOM_CAPSULE: "capsule"}
-    first = compiled.body_geomadr[body]
-    found: list[Part] = []
-    for geom in range(first, first + compiled.body_geomnum[body]):
-        shape = shapes[kinds(compiled.geom_type[geom])]
-        x, y, z = (2 * compiled.geom_size[geom]).tolist()
-        size = (x, y, z) if shape == "box" else (x, x, y)
-        colour, place = tuple(compiled.geom_rgba[geom][:3].tolist()), tuple(compiled.geom_pos[geom].tolist())
-        found.append(Part(shape, place, size, plain(colour, 0.25), label, tuple(compiled.geom_quat[geom].tolist())))
-    return tuple(found)
-
-
-def _bounding_box(parts: tuple[Part, ...]) -> tuple[Point, Point]:
-    """Middle and size of the box along the body's axes that holds all parts' own boxes, metres."""
-    corners: list[NDArray[np.float64]] = []
-    for part in parts:
-        x, y, z = part.size
-        own = np.array([x, y, z + x if part.shape == "capsule" else z])
-        half = np.abs(rotations(np.asarray(part.turn))) @ (own / 2)
-        corners += [np.asarray(part.centre) - half, np.asarray(part.centre) + half]
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
-    return tuple(((low + high) / 2).tolist()), tuple((high - low).tolist())
-
-
-def _xml(setting: Setting) -> str:
+def build_model(setting: Setting) -> Any:
+    """Everything as one MjModel; body `thing_3` is number 3 of the things. Raises RenderError without MuJoCo."""
     floor = f'<geom class="still" type="plane" size="5 5 0.1" pos="0 0 {FLOOR_M}"/>'  # what falls off the table lands
     still = floor + "\n".join(_geom(part, "still") for part in setting.table)
     still += "\n".join(_body(placed, None) for placed in setting.clutter)
@@ -288,12 +189,56 @@ def _xml(setting: Setting) -> str:
         f'<position name="{name}" joint="{name}" class="{kind}"/>'
         for name, kind in zip((*JOINTS, *FINGERS), classes, strict=True)
     )
-    return f"""<mujoco>{_OPTIONS}
+    return load_mujoco().MjModel.from_xml_string(f"""<mujoco>{_OPTIONS}
 <default>{_DEFAULTS}</default>
 <worldbody>{still}<body name="mount" pos="{BASE[0]} {BASE[1]} {BASE[2]}">{setting.arm}</body>{loose}</worldbody>
 <equality>{_MOVED_ALIKE}</equality>
 <actuator>{actuators}</actuator>
-</mujoco>"""
+</mujoco>""")
+
+
+def arm_links(model: Any) -> list[tuple[TableThing, int, TabletopClass]]:
+    """The arm's links, the gripper's last, each with its body's number and its class.
+
+    Their names tell the class too, for layouts that keep no classes: robot_arm/upper_arm, gripper/palm.
+    """
+    found: list[tuple[TableThing, int, TabletopClass]] = []
+    for name in (*_LINKS, *_GRIPPER):
+        label = TabletopClass.GRIPPER if name in _GRIPPER else TabletopClass.ROBOT_ARM
+        body = model.body(name).id
+        parts = _parts_of_body(model, body, label)
+        corners: list[Doubles] = []  # of the parts' own boxes, along the body's axes
+        for part in parts:
+            x, y, z = part.size
+            own = np.array([x, y, z + x if part.shape == "capsule" else z])
+            half = np.abs(rotations(np.asarray(part.turn))) @ (own / 2)
+            corners += [np.asarray(part.centre) - half, np.asarray(part.centre) + half]
+        low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+        link = TableThing(
+            name=f"{label.name.lower()}/{name}",
+            parts=parts,
+            size=tuple((high - low).tolist()),
+            middle=tuple(((low + high) / 2).tolist()),
+            mass_kg=float(model.body_mass[body]),
+            friction=0.8,
+        )
+        found.append((link, body, label))
+    return found
+
+
+def _parts_of_body(model: Any, body: int, label: TabletopClass) -> tuple[Part, ...]:
+    """The geoms of one body of a compiled model, as they are seen."""
+    kinds = load_mujoco().mjtGeom
+    shapes = {kinds.mjGEOM_BOX: "box", kinds.mjGEOM_CYLINDER: "cylinder", kinds.mjGEOM_CAPSULE: "capsule"}
+    first = model.body_geomadr[body]
+    found: list[Part] = []
+    for geom in range(first, first + model.body_geomnum[body]):
+        shape = shapes[kinds(model.geom_type[geom])]
+        x, y, z = (2 * model.geom_size[geom]).tolist()
+        size = (x, y, z) if shape == "box" else (x, x, y)
+        colour, place = tuple(model.geom_rgba[geom][:3].tolist()), tuple(model.geom_pos[geom].tolist())
+        found.append(Part(shape, place, size, plain(colour, 0.25), label, tuple(model.geom_quat[geom].tolist())))
+    return tuple(found)
 
 
 def _body(placed: Placed, index: int | None) -> str:

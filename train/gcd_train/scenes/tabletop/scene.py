@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from gcd_train.scenes.description import (
     Colour,
     Doubles,
     Extent,
-    Floats,
     Light,
     Paint,
     Part,
@@ -25,18 +25,20 @@ from gcd_train.scenes.description import (
     SceneObject,
     Sheet,
     Tracks,
+    moved,
     pick,
     rotations,
     shaded,
     square,
     towards,
+    upright,
     with_world,
     yawed,
 )
-from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.tabletop.arm import BASE, Model, arm_links, build_model, random_setting
+from gcd_train.scenes.drop.world import HFOV_DEG, orbit_cameras
+from gcd_train.scenes.tabletop.arm import BASE, arm_links, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
-from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TabletopClass
+from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TableThing, TabletopClass
 
 UNITS_A_METRE = 10.0
 _EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
@@ -46,6 +48,15 @@ _TABLE_Z_M = -0.12
 """Height of the table's surface in the world: arm and things are then in the middle of the pictures."""
 _WALL, _WALL_TOP = 36.0, 19.0  # units
 _WALLS: tuple[Colour, ...] = ((0.85, 0.83, 0.78), (0.68, 0.74, 0.76), (0.78, 0.70, 0.62), (0.60, 0.64, 0.58))
+
+
+_TABLE_FROM_BASE = np.eye(4)
+_TABLE_FROM_BASE[:3, 3] = BASE
+_EYE, _RIGHT = np.array([-0.11, 0.0, -0.17]), np.array([0.0, 1.0, 0.0])
+_AHEAD = (np.array([0.0, 0.0, 0.02]) - _EYE) / np.linalg.norm(np.array([0.0, 0.0, 0.02]) - _EYE)
+_HAND_FROM_CAMERA = np.eye(4)
+"""A camera before the palm that looks past the fingers: in the tool's frame, metres."""
+_HAND_FROM_CAMERA[:3] = np.stack([_RIGHT, np.cross(_AHEAD, _RIGHT), _AHEAD, _EYE], -1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,35 +94,49 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
     random = np.random.default_rng([seed, 0x7AB])
     setting = random_setting(random)
     model = build_model(setting)
-    drawn_s, speed = float(random.uniform(0, 1.4)), float(random.uniform(0.5, 0.9))
+    drawn_s, speed = random.uniform(0, 1.4), random.uniform(0.5, 0.9)
     motion = Simulation(model, setting.things, random, speed).run(frames, drawn_s if skipped_s is None else skipped_s)
-    world_from_table = _table_pose(float(random.uniform(-math.pi, math.pi)))
+    world_from_table = _table_pose(random.uniform(-math.pi, math.pi))
     walls, floor = room(random)
-    task = _in_words(motion, setting)
+    verbs = {"lift": "pick up the {} and place it elsewhere", "push": "push the {} aside"}
+    done = [verbs[name].format(setting.things[index].thing.name) for name, index in motion.tasks]
+    task = ", then ".join(done) or "move over the table"
     parts, objects = _counted(model, setting, motion, world_from_table)
+    turns = world_from_table[:3, :3] @ rotations(motion.tracks.quaternions)
     scene = Scene(
         parts=(*walls, *parts),
         sheets=(floor,),
-        poses=_poses(motion, world_from_table),
+        poses=with_world(turns, UNITS_A_METRE * moved(world_from_table, motion.tracks.positions)),
         focus=np.tile(np.array([[0.0, 0.0, 1.0]], np.float32), (frames, 1)),
         cameras=orbit_cameras(frames),
         hfov_deg=HFOV_DEG,
         light=random_light(random),
-        facts=_facts(seed, setting, motion) | {"task": task},
+        facts={
+            "seed": seed,
+            "arm": "primitive",
+            "arm_licence": "Apache-2.0 (part of gcd-node)",
+            "metres_a_unit": 1 / UNITS_A_METRE,
+            "objects": len(setting.things),
+            "clutter": len(setting.clutter),
+            "grasps": len(motion.grasps),
+            "grasps_held": sum(grasp.held for grasp in motion.grasps),
+            "steps": " ".join(step for step, _ in groupby(motion.steps)),
+            "task": task,
+        },
         objects=tuple(objects),
         extent=_EXTENT,
     )
     return Episode(
         scene=scene,
         motion=motion,
-        wrist=_in_units(world_from_table @ motion.tool @ _hand_from_camera()),
-        world_from_base=_world_from_base(world_from_table),
+        wrist=_in_units(world_from_table @ motion.tool @ _HAND_FROM_CAMERA),
+        world_from_base=_in_units(world_from_table @ _TABLE_FROM_BASE),
         task=task,
     )
 
 
 def _counted(
-    model: Model, setting: Setting, motion: Motion, world_from_table: Doubles
+    model: Any, setting: Setting, motion: Motion, world_from_table: Doubles
 ) -> tuple[list[Part], list[SceneObject]]:
     """The table's parts; those of things, links and clutter, and what metadata tells of them, in scene units.
 
@@ -120,10 +145,11 @@ def _counted(
     parts = [piece.of(instance=0, body=_TABLE) for part in setting.table for piece in _drawn(part)]
     objects: list[SceneObject] = []
     tracks = _in_world(motion.tracks, setting.clutter, world_from_table)
-    things = [
-        (placed.thing, body, TabletopClass.OBJECT) for placed, body in zip(setting.things, model.things, strict=True)
-    ]
-    rows = [(*row, row[1], None) for row in (*things, *arm_links(model))]
+    rows: list[tuple[TableThing, int, TabletopClass, int, Placed | None]] = []
+    for index, each in enumerate(setting.things):
+        body = model.body(f"thing_{index}").id
+        rows.append((each.thing, body, TabletopClass.OBJECT, body, None))
+    rows += [(link, body, label, body, None) for link, body, label in arm_links(model)]
     bodies = motion.tracks.positions.shape[1]
     rows += [(each.thing, 0, TabletopClass.CLUTTER, bodies + k, each) for k, each in enumerate(setting.clutter)]
     for instance, (thing, body, label, track, stands) in enumerate(rows, start=1):
@@ -139,10 +165,10 @@ def _counted(
 def _in_world(moving: Tracks, clutter: tuple[Placed, ...], world_from_table: Doubles) -> Tracks:
     """The tracks of all bodies and, after them, of the clutter, from the table's frame to the world's, scene units."""
     turn, still = world_from_table[:3, :3], np.zeros((len(moving.positions), len(clutter), 3))
-    places = still + np.stack([_moved(world_from_table, np.array(each.place)) for each in clutter])
+    places = still + np.stack([moved(world_from_table, np.array(each.place)) for each in clutter])
     turned = still[..., :1] + np.stack([yawed(np.eye(4)[0], each.yaw) for each in clutter])
     return Tracks(
-        positions=UNITS_A_METRE * np.concatenate([_moved(world_from_table, moving.positions), places], 1),
+        positions=UNITS_A_METRE * np.concatenate([moved(world_from_table, moving.positions), places], 1),
         quaternions=yawed(np.concatenate([moving.quaternions, turned], 1), math.atan2(turn[1, 0], turn[0, 0])),
         velocities=UNITS_A_METRE * np.concatenate([moving.velocities @ turn.T, still], 1),
         angular_velocities=np.concatenate([moving.angular_velocities @ turn.T, still], 1),
@@ -164,42 +190,16 @@ def _drawn(part: Part) -> Iterator[Part]:
         yield replace(scaled, shape="sphere", centre=_scaled((x, y, z)), size=(scaled.size[0],) * 3)
 
 
-def _poses(motion: Motion, world_from_table: Doubles) -> Floats:
-    """world_from_body [T, 1 + B, 3, 4]: the world, then the physics model's bodies, its own world being the table."""
-    turns = world_from_table[:3, :3] @ rotations(motion.tracks.quaternions)
-    places = UNITS_A_METRE * _moved(world_from_table, motion.tracks.positions)
-    return with_world(turns, places)
-
-
 def _table_pose(yaw: float) -> Doubles:
     """world_from_table [4, 4]: turned about the vertical, metres."""
-    turn = np.eye(4)
-    turn[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    turn[2, 3] = _TABLE_Z_M
-    return turn
-
-
-def _world_from_base(world_from_table: Doubles) -> Doubles:
-    """[4, 4], decimetres."""
-    table_from_base = np.eye(4)
-    table_from_base[:3, 3] = BASE
-    return _in_units(world_from_table @ table_from_base)
+    pose = np.eye(4)
+    pose[:3] = upright(np.array([0.0, 0.0, _TABLE_Z_M, yaw]))
+    return pose
 
 
 def upright_base() -> Doubles:
     """world_from_base [4, 4] of an arm whose table is not turned, decimetres."""
-    return _world_from_base(_table_pose(0.0))
-
-
-def _hand_from_camera() -> Doubles:
-    """A camera before the palm that looks past the fingers: in the tool's frame, metres."""
-    eye, target = np.array([-0.11, 0.0, -0.17]), np.array([0.0, 0.0, 0.02])
-    ahead = (target - eye) / np.linalg.norm(target - eye)
-    right = np.array([0.0, 1.0, 0.0])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], -1)
-    pose[:3, 3] = eye
-    return pose
+    return _in_units(_table_pose(0.0) @ _TABLE_FROM_BASE)
 
 
 def _in_units(poses: Doubles) -> Doubles:
@@ -213,31 +213,6 @@ def _scaled(point: Point) -> Point:
     return point[0] * UNITS_A_METRE, point[1] * UNITS_A_METRE, point[2] * UNITS_A_METRE
 
 
-def _moved(world_from_table: Doubles, points: Doubles) -> Doubles:
-    """Points [..., 3] of the table's frame in the world."""
-    return points @ world_from_table[:3, :3].T + world_from_table[:3, 3]
-
-
-def _facts(seed: int, setting: Setting, motion: Motion) -> dict[str, float | str]:
-    return {
-        "seed": seed,
-        "arm": "primitive",
-        "arm_licence": "Apache-2.0 (part of gcd-node)",
-        "metres_a_unit": 1 / UNITS_A_METRE,
-        "objects": len(setting.things),
-        "clutter": len(setting.clutter),
-        "grasps": len(motion.grasps),
-        "grasps_held": sum(grasp.held for grasp in motion.grasps),
-        "steps": " ".join(step for step, _ in groupby(motion.steps)),
-    }
-
-
-def _in_words(motion: Motion, setting: Setting) -> str:
-    verbs = {"lift": "pick up the {} and place it elsewhere", "push": "push the {} aside"}
-    told = [verbs[name].format(setting.things[index].thing.name) for name, index in motion.tasks]
-    return ", then ".join(told) or "move over the table"
-
-
 def room(random: np.random.Generator) -> tuple[list[Part], Sheet]:
     """Four walls with the sky above them, and the floor, in scene units; lower than the sun at the table."""
     low, colour = (FLOOR_M + _TABLE_Z_M) * UNITS_A_METRE, pick(random, _WALLS)
@@ -247,7 +222,17 @@ def room(random: np.random.Generator) -> tuple[list[Part], Sheet]:
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         size = (1.0 if x else 2 * _WALL, 1.0 if y else 2 * _WALL, height)
         parts.append(Part("box", (x * _WALL, y * _WALL, middle), size, paint, TabletopClass.WALL))
-    parts += _panels(random, low)
+    for side in range(4):  # cupboards, pictures and doors along the walls, so that the background tells where it is
+        for along in np.arange(-0.75, 0.76, 0.5) + random.uniform(-0.12, 0.12, 4):
+            wide, deep, high = (random.uniform(*sides) for sides in ((5, 11), (0.6, 4.5), (6, 22)))
+            red, green, blue = (random.uniform(0.2, most) for most in (0.85, 0.8, 0.8))
+            lift, grey = 0.0 if deep > 1.5 else 8.0, 0.5 * (red + green)
+            colour = ((red + grey) / 2, (green + grey) / 2, (blue + grey) / 2)
+            pattern = pick(random, (Pattern.PLAIN, Pattern.WOOD, Pattern.STRIPES))
+            centre = (float(along) * _WALL, _WALL - 0.5 - deep / 2, low + lift + high / 2)
+            panel = Paint(colour, (0.4, 0.35, 0.3), pattern, 2.0)
+            part = Part("box", centre, (wide, deep, high), panel, TabletopClass.WALL)
+            parts.append(part.placed(0.0, 0.0, 0.0, side * math.pi / 2))
     size = (-5.5 * _WALL, 5.5 * _WALL, 5.5 * _WALL)  # its inside faces the cameras, hence the negative size
     parts.append(Part("ball", (0, 0, 0), size, Paint((1, 1, 1), pattern=Pattern.SKY), TabletopClass.SKY))
     pattern = pick(random, (Pattern.PLANKS, Pattern.TERRAZZO, Pattern.CHECKER, Pattern.CLOUDY))
@@ -255,25 +240,11 @@ def room(random: np.random.Generator) -> tuple[list[Part], Sheet]:
     return parts, Sheet(square(_WALL, low), Paint(colour, shaded(colour, 0.8), pattern, 3.0, 0.1), TabletopClass.FLOOR)
 
 
-def _panels(random: np.random.Generator, low: float) -> Iterator[Part]:
-    """Cupboards, pictures and doors along the walls, so that the background tells where it is."""
-    for side in range(4):
-        for along in np.arange(-0.75, 0.76, 0.5) + random.uniform(-0.12, 0.12, 4):
-            wide, deep, high = (float(random.uniform(*sides)) for sides in ((5, 11), (0.6, 4.5), (6, 22)))
-            red, green, blue = (float(random.uniform(0.2, most)) for most in (0.85, 0.8, 0.8))
-            lift, grey = 0.0 if deep > 1.5 else 8.0, 0.5 * (red + green)
-            colour = ((red + grey) / 2, (green + grey) / 2, (blue + grey) / 2)
-            paint = Paint(colour, (0.4, 0.35, 0.3), pick(random, (Pattern.PLAIN, Pattern.WOOD, Pattern.STRIPES)), 2.0)
-            centre = (float(along) * _WALL, _WALL - 0.5 - deep / 2, low + lift + high / 2)
-            panel = Part("box", centre, (wide, deep, high), paint, TabletopClass.WALL)
-            yield panel.placed(0.0, 0.0, 0.0, side * math.pi / 2)
-
-
 def random_light(random: np.random.Generator) -> Light:
     """A lamp high above, as parallel light, and the bright room around it."""
-    height, round_ = float(random.uniform(0.85, 1.35)), float(random.uniform(0, 2 * math.pi))
-    warm, strength = float(random.uniform(0.0, 0.3)), float(random.uniform(0.8, 1.5))
-    fill = float(random.uniform(0.55, 0.85))
+    height, round_ = random.uniform(0.85, 1.35), random.uniform(0, 2 * math.pi)
+    warm, strength = random.uniform(0.0, 0.3), random.uniform(0.8, 1.5)
+    fill = random.uniform(0.55, 0.85)
     return Light(
         sun_to=towards(height, round_),
         sun=(strength, strength * (1 - 0.4 * warm), strength * (1 - 0.8 * warm)),
@@ -283,5 +254,5 @@ def random_light(random: np.random.Generator) -> Light:
         zenith=(0.80, 0.80, 0.79),
         fog_m=4000.0,
         cloud=0.0,
-        exposure=float(random.uniform(1.1, 1.5)),
+        exposure=random.uniform(1.1, 1.5),
     )

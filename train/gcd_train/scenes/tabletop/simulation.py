@@ -12,7 +12,18 @@ import numpy as np
 
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Doubles, Point, Tracks
-from gcd_train.scenes.tabletop.arm import BASE, FINGER_ROOM_M, HOME, OPEN_M, STEP_S, Model, is_reachable, reachable_spot
+from gcd_train.scenes.drop.world import load_mujoco
+from gcd_train.scenes.tabletop.arm import (
+    BASE,
+    FINGER_ROOM_M,
+    FINGERS,
+    HOME,
+    JOINTS,
+    OPEN_M,
+    STEP_S,
+    is_reachable,
+    reachable_spot,
+)
 from gcd_train.scenes.tabletop.things import Placed
 
 FPS = 24.0
@@ -59,7 +70,7 @@ class Grasp:
         return self.lifted > 0.05 and self.slip < _SLIP_M
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Motion:
     """What happened, a row a frame; metres, radians, seconds, in the frame of the table.
 
@@ -77,37 +88,52 @@ class Motion:
 
 
 class Simulation:
-    """One run. `model`: built of `things`; `speed`: of the tool, metres a second."""
+    """One run. `model`: see `build_model`; `things`: in it; `speed`: of the tool, metres a second."""
 
-    def __init__(self, model: Model, things: tuple[Placed, ...], random: np.random.Generator, speed: float) -> None:
-        self._m, self._data = model, model.mujoco.MjData(model.model)
-        self._scratch, self._joints = model.mujoco.MjData(model.model), np.asarray(HOME)
-        self._planner = _Planner(model, self._data, things, random)
-        self._speed, self._opening = speed, 1.0
-        self._watch = _Watch(model, self._data)
+    def __init__(self, model: Any, things: tuple[Placed, ...], random: np.random.Generator, speed: float) -> None:
+        self._mujoco, self._model = load_mujoco(), model
+        self._things, self._random, self._speed = [each.thing for each in things], random, speed
+        self._data, self._scratch = self._mujoco.MjData(model), self._mujoco.MjData(model)
+        # where joints and fingers are in qpos, and joints in qvel; their actuators; bodies of the things; the tool
+        self._at = [model.joint(name).qposadr[0] for name in (*JOINTS, *FINGERS)]
+        self._rates = [model.joint(name).dofadr[0] for name in JOINTS]
+        self._controls = [model.actuator(name).id for name in (*JOINTS, *FINGERS)]
+        self._bodies = [model.body(f"thing_{index}").id for index in range(len(things))]
+        self._site = model.site("tool").id
+        self._joints, self._opening = np.asarray(HOME), 1.0
         self._rows: list[tuple[Doubles, ...]] = []
         self._names: list[str] = []
+        # of the thing in the hand: its index, its place there and its height at first, and what became of it
+        self._held, self._offset, self._low, self._lifted, self._slip = -1, np.zeros(3), 0.0, math.nan, 0.0
+        self._grasps: list[Grasp] = []
+        self._tasks: list[tuple[str, int]] = []
 
     def run(self, frames: int, skipped_s: float) -> Motion:
         """Let things settle, let `skipped_s` of work pass unseen, then keep `frames`.
 
         Raises: RenderError if the physics became unstable.
         """
-        m, data = self._m, self._data
-        data.qpos[m.joints], data.qpos[m.fingers] = self._joints, OPEN_M
+        mujoco, data = self._mujoco, self._data
+        data.qpos[self._at] = (*self._joints, OPEN_M, OPEN_M)
         self._command(self._joints)
-        m.mujoco.mj_step(m.model, data, round(_SETTLE_S / STEP_S))
+        mujoco.mj_step(self._model, data, round(_SETTLE_S / STEP_S))
         first = round(skipped_s / _TICK_S)
-        self._watch.clock = -first * _TICK_S
+        clock = -first * _TICK_S
+        last = None
         for tick, step in enumerate(self._followed()):
+            if step is not last:
+                self._begin(step, clock)
+                last = step
             if tick >= first and (tick - first) % _TICKS_A_FRAME == 0:
                 self._keep(step)
             if len(self._names) == frames:
                 break
-            m.mujoco.mj_step(m.model, data, _STEPS_A_TICK)
-            self._watch.tick()
-        self._watch.end()
-        faults = m.mujoco.mjtWarning  # MuJoCo starts a diverging simulation anew and only counts that
+            mujoco.mj_step(self._model, data, _STEPS_A_TICK)
+            clock += _TICK_S
+            if self._held >= 0:
+                self._slip = max(self._slip, float(np.linalg.norm(self._in_hand() - self._offset)))
+        self._end_grasp()
+        faults = mujoco.mjtWarning  # MuJoCo starts a diverging simulation anew and only counts that
         kinds = (faults.mjWARN_BADQPOS, faults.mjWARN_BADQVEL, faults.mjWARN_BADQACC)
         if any(data.warning[int(kind)].number for kind in kinds):
             raise RenderError("the physics of this tabletop scene became unstable; leave its seed out")
@@ -115,24 +141,16 @@ class Simulation:
         tracks = Tracks(
             positions=positions, quaternions=quaternions, velocities=rates[..., 3:], angular_velocities=rates[..., :3]
         )
-        return Motion(
-            tracks=tracks,
-            tool=tool,
-            state=state,
-            action=action,
-            steps=tuple(self._names),
-            grasps=tuple(self._watch.grasps),
-            tasks=tuple(self._watch.tasks),
-        )
+        kept = tuple(self._names), tuple(self._grasps), tuple(self._tasks)
+        return Motion(tracks, tool, state, action, *kept)
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""
-        x, y, z = self._data.site_xpos[self._m.site].tolist()
+        x, y, z = self._data.site_xpos[self._site].tolist()
         place: Point = (x, y, z)
-        here, yaw = _polar(place), math.atan2(*self._data.site_xmat[self._m.site][[3, 0]].tolist())
+        here, yaw = _polar(place), math.atan2(*self._data.site_xmat[self._site][[3, 0]].tolist())
         while True:
-            for step in self._planner.task(place):
-                self._watch.begin(step)
+            for step in self._next_task(place):
                 goal, turn = _polar(step.place), yaw + (step.yaw - yaw + math.pi) % (2 * math.pi) - math.pi
                 opening = self._opening
                 ticks = max(1, math.ceil(max(0.22, math.dist(step.place, place) / self._speed) / _TICK_S))
@@ -140,8 +158,9 @@ class Simulation:
                     share = tick / ticks
                     share = share**3 * (10 - 15 * share + 6 * share**2)  # minimum jerk: at rest at both ends
                     self._opening = opening + share * (step.opening - opening)
-                    before = self._joints
-                    self._joints = self._solved(_from_polar(here + share * (goal - here)), yaw + share * (turn - yaw))
+                    before, (azimuth, radius, height) = self._joints, here + share * (goal - here)
+                    at = np.array([BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth), height])
+                    self._joints = self._solved(at, yaw + share * (turn - yaw))
                     self._command(self._joints + (self._joints - before) * (_LEAD_S / _TICK_S))
                     yield step
                 here, yaw, place = goal, turn, step.place
@@ -153,17 +172,17 @@ class Simulation:
         "Selectively damped least squares for inverse kinematics" (2005), section 2: the plain damped form, with the
         pull towards the home pose in the null space.
         """
-        m, model, data, joints = self._m, self._m.model, self._scratch, self._joints
-        limits, cos, sin = model.jnt_range[model.dof_jntid[m.rates]].T, np.cos(yaw), np.sin(yaw)
+        mujoco, model, data, joints = self._mujoco, self._model, self._scratch, self._joints
+        limits, cos, sin = model.jnt_range[model.dof_jntid[self._rates]].T, np.cos(yaw), np.sin(yaw)
         wanted = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])  # the tool's axes as columns
         for _ in range(_ROUNDS):
-            data.qpos[m.joints] = joints
-            m.mujoco.mj_kinematics(model, data)
-            m.mujoco.mj_comPos(model, data)
+            data.qpos[self._at[: len(joints)]] = joints
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
             full = np.zeros((6, model.nv))
-            m.mujoco.mj_jacSite(model, data, full[:3], full[3:], m.site)
-            twist = 0.5 * np.cross(data.site_xmat[m.site].reshape(3, 3), wanted, axis=0).sum(1)
-            error, jacobian = np.concatenate([place - data.site_xpos[m.site], twist]), full[:, m.rates]
+            mujoco.mj_jacSite(model, data, full[:3], full[3:], self._site)
+            twist = 0.5 * np.cross(data.site_xmat[self._site].reshape(3, 3), wanted, axis=0).sum(1)
+            error, jacobian = np.concatenate([place - data.site_xpos[self._site], twist]), full[:, self._rates]
             square = jacobian @ jacobian.T + _DAMPING**2 * np.eye(6)
             pull = _HOMING * (np.asarray(HOME) - joints)
             move = pull + jacobian.T @ np.linalg.solve(square, error - jacobian @ pull)
@@ -171,116 +190,80 @@ class Simulation:
         return joints
 
     def _command(self, joints: Doubles) -> None:
-        m = self._m
-        self._data.ctrl[m.controls] = joints
-        self._data.ctrl[m.grips] = self._opening * OPEN_M
+        self._data.ctrl[self._controls] = (*joints, *(2 * [self._opening * OPEN_M]))
 
     def _keep(self, step: Step) -> None:
-        m, data = self._m, self._data
-        m.mujoco.mj_forward(m.model, data)
-        rates = np.zeros((m.model.nbody, 6))
-        for body in range(m.model.nbody):
-            m.mujoco.mj_objectVelocity(m.model, data, m.mujoco.mjtObj.mjOBJ_BODY, body, rates[body], 0)
+        mujoco, model, data = self._mujoco, self._model, self._data
+        mujoco.mj_forward(model, data)
+        rates = np.zeros((model.nbody, 6))
+        for body, row in enumerate(rates):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, row, 0)
         tool = np.eye(4)
-        tool[:3, :3], tool[:3, 3] = data.site_xmat[m.site].reshape(3, 3), data.site_xpos[m.site]
-        state = data.qpos[np.concatenate([m.joints, m.fingers])].copy()
-        action = np.concatenate([self._joints, data.ctrl[m.grips]])
-        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, state, action))
+        tool[:3, :3], tool[:3, 3] = data.site_xmat[self._site].reshape(3, 3), data.site_xpos[self._site]
+        action = np.concatenate([self._joints, data.ctrl[self._controls[len(JOINTS) :]]])
+        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, data.qpos[self._at].copy(), action))
         self._names.append(step.name)
 
+    # whether what was grasped follows the hand
 
-class _Watch:
-    """Looks at whether what was grasped follows the hand."""
-
-    def __init__(self, model: Model, data: Any) -> None:
-        self._m, self._data = model, data
-        self.clock = 0.0
-        self.grasps: list[Grasp] = []
-        self.tasks: list[tuple[str, int]] = []
-        self._thing, self._offset = -1, np.zeros(3)
-        self._low, self._lifted, self._slip = 0.0, math.nan, 0.0
-
-    def begin(self, step: Step) -> None:
+    def _begin(self, step: Step, clock: float) -> None:
         """A step begins: at the lift the fingers have closed, at the opening the grasp ends."""
         if step.name == "lift":
-            self._thing, self._slip, self._lifted = step.thing, 0.0, math.nan
-            self._offset, self._low = self._in_hand(), self._height()
+            self._held, self._slip, self._lifted = step.thing, 0.0, math.nan
+            self._offset, self._low = self._in_hand(), self._pose(step.thing)[0][2]
         if step.name == "carry":
-            self._lifted = self._height() - self._low
-        if step.name in ("lift", "push") and self.clock > -0.3:
-            self.tasks.append((step.name, step.thing))
+            self._lifted = self._pose(self._held)[0][2] - self._low
+        if step.name in ("lift", "push") and clock > -0.3:
+            self._tasks.append((step.name, step.thing))
         if step.name == "open":
-            self.end()
+            self._end_grasp()
 
-    def tick(self) -> None:
-        """A tick has passed."""
-        self.clock += _TICK_S
-        if self._thing >= 0:
-            self._slip = max(self._slip, float(np.linalg.norm(self._in_hand() - self._offset)))
-
-    def end(self) -> None:
+    def _end_grasp(self) -> None:
         """The grasp is over; one that never got to the end of the lift does not count."""
-        if self._thing >= 0 and not math.isnan(self._lifted):
-            self.grasps.append(Grasp(thing=self._thing, lifted=self._lifted, slip=self._slip))
-        self._thing = -1
+        if self._held >= 0 and not math.isnan(self._lifted):
+            self._grasps.append(Grasp(thing=self._held, lifted=self._lifted, slip=self._slip))
+        self._held = -1
 
     def _in_hand(self) -> Doubles:
-        """The thing's origin in the tool's frame."""
-        data, site = self._data, self._m.site
-        turned = data.site_xmat[site].reshape(3, 3)
-        return turned.T @ (data.xpos[self._m.things[self._thing]] - data.site_xpos[site])
+        """The held thing's origin in the tool's frame."""
+        data, site = self._data, self._site
+        return data.site_xmat[site].reshape(3, 3).T @ (data.xpos[self._bodies[self._held]] - data.site_xpos[site])
 
-    def _height(self) -> float:
-        return float(self._data.xpos[self._m.things[self._thing]][2])
+    # tasks: chosen at random and turned into steps, from where things are by now
 
-
-def _polar(place: Point) -> Doubles:
-    """Azimuth, distance and height about the base: the arm's own way of moving."""
-    x, y = place[0] - BASE[0], place[1] - BASE[1]
-    return np.array([math.atan2(y, x), math.hypot(x, y), place[2]])
-
-
-def _from_polar(polar: Doubles) -> Doubles:
-    azimuth, radius, height = polar
-    return np.array([BASE[0] + radius * math.cos(azimuth), BASE[1] + radius * math.sin(azimuth), height])
-
-
-# tasks
-
-
-@dataclass(frozen=True, slots=True)
-class _Planner:
-    """Chooses tasks at random and turns them into steps; reads the things' places from the running simulation."""
-
-    model: Model
-    data: Any
-    things: tuple[Placed, ...]
-    random: np.random.Generator
-
-    def task(self, here: Point) -> list[Step]:
-        """The next one's steps, from where things are by now; the arm at `here` waits where nothing can be done."""
-        order = self.random.permutation(len(self.things)).tolist()
-        if self.random.random() < 0.25:
+    def _next_task(self, here: Point) -> list[Step]:
+        """Its steps; the arm at `here` waits where nothing can be done."""
+        order = self._random.permutation(len(self._things)).tolist()
+        if self._random.random() < 0.25:
             pushed = next((i for i in order if self._push(i)), None)
             if pushed is not None:
                 return self._push(pushed)
-        taken = next((i for i in order if self._can_take(i)), None)
-        return [Step("wait", here, _natural_yaw(here), 1.0)] if taken is None else self._pick_and_place(taken)
+        for i in order:
+            (x, y, z), _ = self._pose(i)
+            stands = self._data.xmat[self._bodies[i]][8] > 0.98 and abs(z - self._things[i].size[2] / 2) < 0.01
+            if stands and is_reachable(x, y) and self._clearance(np.array([x, y]), i) > 0.06:
+                return self._pick_and_place(i)
+        return [Step("wait", here, _natural_yaw(here), 1.0)]
 
     def _pick_and_place(self, index: int) -> list[Step]:
-        thing = self.things[index].thing
+        thing = self._things[index]
         (x, y, z), yaw = self._pose(index)
         level = max(z + thing.grip_z, _LOWEST_M)
         above, grip = max(level + _ABOVE_M, 0.16), (x, y, level)
         natural = _natural_yaw(grip)
         if thing.any_yaw:
-            turn = natural + float(self.random.uniform(-0.4, 0.4))
+            turn = natural + self._random.uniform(-0.4, 0.4)
         else:  # fingers across the thing's y axis, with the least turn of the wrist
             turn = natural + (yaw - natural + math.pi / 2) % math.pi - math.pi / 2
-        lifted = level + float(self.random.uniform(0.10, 0.17))
-        to_x, to_y = self._free_spot(index)
+        lifted = level + self._random.uniform(0.10, 0.17)
+        apart, to_x, to_y = max(FINGER_ROOM_M, thing.radius_m + 0.03), x, y
+        for spot in [reachable_spot(self._random) for _ in range(40)]:  # near by, with room for the thing and the hand
+            way = math.hypot(spot[0] - x, spot[1] - y)
+            if 0.12 < way < 0.45 and self._clearance(np.array(spot), index) > apart:
+                to_x, to_y = spot
+                break
         carried, down = (to_x, to_y, lifted), (to_x, to_y, level + 0.003)
-        turned = _natural_yaw(carried) + (turn - natural) * float(self.random.uniform(0, 1))
+        turned = _natural_yaw(carried) + (turn - natural) * self._random.uniform(0, 1)
         opening = min(1.0, (thing.size[1] / 2 + 0.018) / OPEN_M)
         return [
             Step("reach", (x, y, above), turn, opening, index),
@@ -296,8 +279,8 @@ class _Planner:
     def _push(self, index: int) -> list[Step]:
         """A thing is pushed with closed fingers, sideways to the arm, if there is room; no steps else."""
         (x, y, z), _ = self._pose(index)
-        radius, low = self.things[index].thing.radius_m, max(_LOWEST_M, min(z, 0.05))
-        for turn in self.random.permutation([0.5 * math.pi, -0.5 * math.pi, 0.25 * math.pi, -0.25 * math.pi]).tolist():
+        radius, low = self._things[index].radius_m, max(_LOWEST_M, min(z, 0.05))
+        for turn in self._random.permutation([0.5 * math.pi, -0.5 * math.pi, 0.25 * math.pi, -0.25 * math.pi]).tolist():
             yaw = math.atan2(y - BASE[1], x - BASE[0]) + turn
             ahead = np.array([math.cos(yaw), math.sin(yaw)])
             before, after = np.array([x, y]) - (radius + 0.035) * ahead, np.array([x, y]) + (0.10 - radius) * ahead
@@ -313,38 +296,27 @@ class _Planner:
                 ]
         return []
 
-    def _can_take(self, index: int) -> bool:
-        (x, y, z), _ = self._pose(index)
-        thing = self.things[index].thing
-        upright = self.data.xmat[self.model.things[index]][8] > 0.98
-        stands = upright and abs(z - thing.size[2] / 2) < 0.01
-        return stands and is_reachable(x, y) and self._clearance(np.array([x, y]), index) > 0.06
-
-    def _free_spot(self, index: int) -> tuple[float, float]:
-        """A spot near by with room for the thing and the hand; where it is, if a few tries find none."""
-        (x, y, _), _ = self._pose(index)
-        apart = max(FINGER_ROOM_M, self.things[index].thing.radius_m + 0.03)
-        for spot in [reachable_spot(self.random) for _ in range(40)]:
-            way = math.hypot(spot[0] - x, spot[1] - y)
-            if 0.12 < way < 0.45 and self._clearance(np.array(spot), index) > apart:
-                return spot
-        return x, y
-
     def _clearance(self, spot: Doubles, but: int) -> float:
         """Distance from a point of the table to the nearest other loose thing's circle, metres."""
         gaps = [
-            math.hypot(*(spot - np.array(self._pose(i)[0][:2]))) - self.things[i].thing.radius_m
-            for i in range(len(self.things))
+            math.hypot(*(spot - np.array(self._pose(i)[0][:2]))) - thing.radius_m
+            for i, thing in enumerate(self._things)
             if i != but
         ]
         return min(gaps, default=1.0)
 
     def _pose(self, index: int) -> tuple[Point, float]:
         """Place and yaw of a thing now."""
-        body = self.model.things[index]
-        x, y, z = self.data.xpos[body].tolist()
-        turned = self.data.xmat[body].reshape(3, 3)
+        body = self._bodies[index]
+        x, y, z = self._data.xpos[body].tolist()
+        turned = self._data.xmat[body].reshape(3, 3)
         return (x, y, z), math.atan2(turned[1, 0], turned[0, 0])
+
+
+def _polar(place: Point) -> Doubles:
+    """Azimuth, distance and height about the base: the arm's own way of moving."""
+    x, y = place[0] - BASE[0], place[1] - BASE[1]
+    return np.array([math.atan2(y, x), math.hypot(x, y), place[2]])
 
 
 def _natural_yaw(place: Point) -> float:

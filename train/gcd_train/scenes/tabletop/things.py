@@ -87,7 +87,7 @@ def random_table(random: _Random) -> tuple[Part, ...]:
     wooden = random.random() < 0.6
     colour = pick(random, WOODS if wooden else FLATS)
     dark, pattern = shaded(colour, 0.7), Pattern.PLANKS if wooden else Pattern.PLAIN
-    paint = Paint(colour, dark, pattern, float(random.uniform(0.09, 0.2)), float(random.uniform(0.05, 0.3)))
+    paint = Paint(colour, dark, pattern, random.uniform(0.09, 0.2), random.uniform(0.05, 0.3))
     (x, y), half = TABLE_M, (-FLOOR_M - 0.04) / 2
     top = Part("box", (0.0, 0.0, -0.02), (2 * x, 2 * y, 0.04), paint, TabletopClass.TABLE)
     if random.random() < 0.4:
@@ -103,24 +103,24 @@ def random_clutter(random: _Random) -> tuple[Placed, ...]:
     for index in random.choice(len(_CLUTTER_SPOTS), int(random.integers(2, 6)), replace=False):
         thing = _clutter_thing(random)
         x, y = _CLUTTER_SPOTS[int(index)]
-        place = (x + float(random.uniform(-0.03, 0.03)), y + float(random.uniform(-0.03, 0.03)), thing.size[2] / 2)
-        made.append(Placed(thing=thing, place=place, yaw=float(random.uniform(-0.4, 0.4))))
+        place = (x + random.uniform(-0.03, 0.03), y + random.uniform(-0.03, 0.03), thing.size[2] / 2)
+        made.append(Placed(thing=thing, place=place, yaw=random.uniform(-0.4, 0.4)))
     return tuple(made)
 
 
 def _clutter_thing(random: _Random) -> TableThing:
     kind = int(random.integers(4))
-    red, green, blue = (float(random.uniform(0.15, most)) for most in (0.9, 0.85, 0.85))
+    red, green, blue = (random.uniform(0.15, most) for most in (0.9, 0.85, 0.85))
     colour = (red, green, blue)
     if kind == 1:
         return _books(random)
     if kind == 2:
-        across, high = 2 * float(random.uniform(0.04, 0.07)), 2 * float(random.uniform(0.05, 0.11))
+        across, high = 2 * random.uniform(0.04, 0.07), 2 * random.uniform(0.05, 0.11)
         body = _clutter("cylinder", (across, across, high), plain(colour, 0.5))
         lid_size, lid_at = (across * 1.04, across * 1.04, 0.012), (0, 0, high / 2 - 0.006)
         return _still("tin", (body, _clutter("cylinder", lid_size, plain((0.75, 0.76, 0.78)), lid_at)), body.size)
     bounds = ((0.07, 0.10), (0.08, 0.13), (0.03, 0.06)) if kind == 0 else ((0.05, 0.09), (0.06, 0.11), (0.04, 0.12))
-    x, y, z = (2 * float(random.uniform(low, high)) for low, high in bounds)
+    x, y, z = (2 * random.uniform(low, high) for low, high in bounds)
     if kind == 0:  # an open crate: a floor and four walls
         plates: tuple[tuple[Point, Point], ...] = (
             ((x, y, 0.008), (0, 0, 0.004 - z / 2)),
@@ -140,9 +140,9 @@ def _books(random: _Random) -> TableThing:
     low = -float(thick.sum())
     books: list[Part] = []
     for half in thick.tolist():
-        size = (2 * float(random.uniform(0.06, 0.085)), 2 * float(random.uniform(0.09, 0.12)), 2 * half)
-        colour = (float(random.uniform(0.1, 0.8)), float(random.uniform(0.1, 0.6)), float(random.uniform(0.1, 0.7)))
-        shift = (float(random.uniform(-0.01, 0.01)), float(random.uniform(-0.01, 0.01)), low + half)
+        size = (2 * random.uniform(0.06, 0.085), 2 * random.uniform(0.09, 0.12), 2 * half)
+        colour = (random.uniform(0.1, 0.8), random.uniform(0.1, 0.6), random.uniform(0.1, 0.7))
+        shift = (random.uniform(-0.01, 0.01), random.uniform(-0.01, 0.01), low + half)
         books.append(_clutter("box", size, plain(colour, 0.15), shift))
         low += 2 * half
     return _still("books", tuple(books), (0.19, 0.26, 2 * float(thick.sum())))
@@ -168,53 +168,55 @@ _PATTERNS = (Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.CHECKER, Pat
 
 def _paints(random: _Random) -> tuple[Paint, Paint]:
     """Two paints of one thing: a patterned one, and its second colour alone."""
-    first, second = random.choice(len(_COLOURS), 2, replace=False)
-    colour, accent = _tinted(_COLOURS[int(first)], random), _tinted(_COLOURS[int(second)], random)
+    colours: list[Colour] = []
+    for index in random.choice(len(_COLOURS), 2, replace=False):
+        red, green, blue = (min(1.0, part * random.uniform(0.85, 1.15)) for part in _COLOURS[int(index)])
+        colours.append((red, green, blue))
+    colour, accent = colours
     pattern = pick(random, _PATTERNS)
-    grain_m, gloss = float(random.uniform(0.02, 0.06)), float(random.uniform(0.0, 0.5))
+    grain_m, gloss = random.uniform(0.02, 0.06), random.uniform(0.0, 0.5)
     return Paint(colour, accent, pattern, grain_m, gloss), plain(accent, gloss)
 
 
-def _tinted(colour: Colour, random: _Random) -> Colour:
-    red, green, blue = (min(1.0, channel * float(random.uniform(0.85, 1.15))) for channel in colour)
-    return red, green, blue
-
-
 def random_thing(random: _Random, widest: float) -> TableThing:
-    """A thing a gripper that opens a little more than `widest` metres can hold."""
-    return pick(random, _MAKERS)(random, widest)
+    """What a gripper that opens a little more than `widest` metres can hold, of a density between balsa and water."""
+    thing = pick(random, _MAKERS)(random, widest)
+    mass_kg = max(0.02, thing.mass_kg * random.uniform(250, 800))
+    return replace(thing, mass_kg=mass_kg, friction=random.uniform(0.7 if thing.rolls else 0.6, 1.0))
+
+
+# makers: of things without friction that weigh a kilogramme a cubic metre, roughly
 
 
 def _block(random: _Random, widest: float) -> TableThing:
     """A block or a carton, at most `widest` across its y axis."""
-    wide, deep = float(random.uniform(0.035, widest)), float(random.uniform(0.04, 0.12))
-    size = (deep, wide, float(random.uniform(0.04, 0.15)))
-    body = _part("box", size, _paints(random)[0])
-    name = "block" if size[2] < 0.08 else "carton"
-    return _loose(random, name, (body,), size, deep * wide * size[2], grip_z=_below_top(size[2]))
+    wide, deep = random.uniform(0.035, widest), random.uniform(0.04, 0.12)
+    size = (deep, wide, random.uniform(0.04, 0.15))
+    body, name = _part("box", size, _paints(random)[0]), "block" if size[2] < 0.08 else "carton"
+    return _loose(name, (body,), size, deep * wide * size[2], grip_z=_below_top(size[2]))
 
 
 def _can(random: _Random, widest: float) -> TableThing:
-    radius, high = float(random.uniform(0.022, widest / 2)), float(random.uniform(0.05, 0.13))
+    radius, high = random.uniform(0.022, widest / 2), random.uniform(0.05, 0.13)
     paint, lid = _paints(random)
     parts = (_cylinder(paint, radius, high - 0.006, -0.003), _cylinder(lid, radius * 0.94, 0.008, high / 2 - 0.004))
-    return _round(random, "can", parts, radius, high)
+    return _round("can", parts, radius, high)
 
 
 def _bottle(random: _Random, widest: float) -> TableThing:
-    radius, high = float(random.uniform(0.022, min(widest / 2, 0.034))), float(random.uniform(0.13, 0.155))
+    radius, high = random.uniform(0.022, min(widest / 2, 0.034)), random.uniform(0.13, 0.155)
     paint, cap = _paints(random)
     parts = (
         _cylinder(paint, radius, 0.62 * high, -0.19 * high),
         _sphere(paint, radius * 0.985, 0.12 * high),
         _cylinder(cap, radius * 0.4, 0.38 * high, 0.31 * high),
     )
-    return replace(_round(random, "bottle", parts, radius, high), grip_z=0.12 * high - 0.010)
+    return replace(_round("bottle", parts, radius, high), grip_z=0.12 * high - 0.010)
 
 
 def _mug(random: _Random, widest: float) -> TableThing:
     """The handle points along x, so that the fingers come from the sides."""
-    radius, high = float(random.uniform(0.42 * widest, widest / 2)), float(random.uniform(0.07, 0.10))
+    radius, high = random.uniform(0.42 * widest, widest / 2), random.uniform(0.07, 0.10)
     (paint, inside), reach = _paints(random), 0.026
     x = radius + reach / 2
     parts = (
@@ -224,36 +226,35 @@ def _mug(random: _Random, widest: float) -> TableThing:
         _part("box", (reach, 0.01, 0.012), paint, (x, 0, -0.25 * high)),
         _part("box", (0.01, 0.012, 2 * (0.25 * high + 0.006)), paint, (radius + reach, 0, 0)),
     )
-    mug = _round(random, "mug", parts, radius, high)
+    mug = _round("mug", parts, radius, high)
     return replace(mug, size=(2 * (radius + reach), 2 * radius, high), any_yaw=False)
 
 
 def _ball(random: _Random, widest: float) -> TableThing:
-    radius = float(random.uniform(0.025, widest / 2))
+    radius = random.uniform(0.025, widest / 2)
     ball = _sphere(_paints(random)[0], radius)
-    return _loose(random, "ball", (ball,), ball.size, 4 * radius**3, any_yaw=True, rolls=True)
+    return replace(_loose("ball", (ball,), ball.size, 4 * radius**3), any_yaw=True, rolls=True)
 
 
 def _bar(random: _Random, widest: float) -> TableThing:
     """A thick stick that lies along x: a sausage, a marker, a roll."""
-    radius, half = float(random.uniform(0.018, min(widest / 2, 0.03))), float(random.uniform(0.03, 0.07))
+    radius, half = random.uniform(0.018, min(widest / 2, 0.03)), random.uniform(0.03, 0.07)
     lying: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
     stick = replace(_part("capsule", (2 * radius, 2 * radius, 2 * half), _paints(random)[0]), turn=lying)
     size = (2 * (half + radius), 2 * radius, 2 * radius)
-    return _loose(random, "bar", (stick,), size, 6 * half * radius**2, rolls=True)
+    return replace(_loose("bar", (stick,), size, 6 * half * radius**2), rolls=True)
 
 
 def _bridge(random: _Random, widest: float) -> TableThing:
     """A toy of three blocks: two feet and a beam."""
-    wide, long, high = float(random.uniform(0.03, min(widest, 0.05))), float(random.uniform(0.09, 0.13)), 0.075
+    wide, long, high = random.uniform(0.03, min(widest, 0.05)), random.uniform(0.09, 0.13), 0.075
     paint, other = _paints(random)
     foot = (0.03, wide, 2 * (high / 2 - 0.014))
     parts = (
         _part("box", (long, wide, 0.028), paint, (0, 0, high / 2 - 0.014)),
         *(_part("box", foot, other, (x, 0, -0.014)) for x in (0.015 - long / 2, long / 2 - 0.015)),
     )
-    size = (long, wide, high)
-    return _loose(random, "bridge", parts, size, long * wide * 0.05, grip_z=high / 2 - 0.018)
+    return _loose("bridge", parts, (long, wide, high), long * wide * 0.05, grip_z=high / 2 - 0.018)
 
 
 _MAKERS: tuple[Callable[[_Random, float], TableThing], ...] = (
@@ -278,30 +279,10 @@ def _below_top(high: float) -> float:
     return max(0.0, high / 2 - 0.035)
 
 
-def _round(random: _Random, name: str, parts: tuple[Part, ...], radius: float, high: float) -> TableThing:
-    size, volume = (2 * radius, 2 * radius, high), math.pi * radius**2 * high
-    return _loose(random, name, parts, size, volume, grip_z=_below_top(high), any_yaw=True)
+def _loose(name: str, parts: tuple[Part, ...], size: Point, volume: float, grip_z: float = 0.0) -> TableThing:
+    return TableThing(name=name, parts=parts, size=size, mass_kg=volume, friction=0.0, grip_z=grip_z)
 
 
-def _loose(
-    random: _Random,
-    name: str,
-    parts: tuple[Part, ...],
-    size: Point,
-    volume: float,
-    *,
-    grip_z: float = 0.0,
-    any_yaw: bool = False,
-    rolls: bool = False,
-) -> TableThing:
-    """A thing with a density between balsa and water. volume: m3, roughly."""
-    return TableThing(
-        name=name,
-        parts=parts,
-        size=size,
-        mass_kg=max(0.02, volume * float(random.uniform(250, 800))),
-        friction=float(random.uniform(0.7 if rolls else 0.6, 1.0)),
-        grip_z=grip_z,
-        any_yaw=any_yaw,
-        rolls=rolls,
-    )
+def _round(name: str, parts: tuple[Part, ...], radius: float, high: float) -> TableThing:
+    thing = _loose(name, parts, (2 * radius, 2 * radius, high), math.pi * radius**2 * high, _below_top(high))
+    return replace(thing, any_yaw=True)

@@ -22,19 +22,14 @@ from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_train.data.sample import to_network
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix, gradient_map, psnr, ssim_map, window_mask
 from gcd_train.evaluation.predictors import pixel_rays, to_pixels
-from gcd_train.live.clips import LiveClip
+from gcd_train.live.calibration import SpreadHistogram
+from gcd_train.live.clips import NEVER, STATES, LiveClip
 
-NEVER, BEFORE, NOW = 0, 1, 2
-STATES = ("painted", "before", "now")
-"""Names of the visibility's values."""
 NAMED_CLASSES = ("person", "cyclist", "car", "pole")
 """Classes whose IoU is reported apart."""
-_INTERVAL, _Z = 0.9, 1.6448536269514722
 _FULL_CELL = 0.8
 """A cell counts as never seen from this share of its pixels."""
 _SAME_SURFACE = 0.02
-_BINS, _FARTHEST = 8000, 40.0
-"""Of the histograms of shifts, which reach this far to both sides: steps of 0.01."""
 _CELL, _FEATURES, _JUDGE_SEED = 16, 64, 7
 """Pixels a side of a cell of the judge, its features, and what its weights are drawn from."""
 _RIDGE = 1e-3
@@ -107,36 +102,6 @@ def surface_motion(metres: Tensor, moves: Tensor, poses: Tensor, lens: Intrinsic
     same = (there[:, 0] / turned[..., 2] - 1).abs() < _SAME_SURFACE
     inside = (place.abs() <= 1).all(dim=-1) & (turned[..., 2] > 1e-3)
     return place, inside & same & (there[:, 1] == 0) & ~moves[1:]
-
-
-class SpreadHistogram:
-    """How many errors, channel by channel, need which shift of the log-variance, apart for each state of visibility."""
-
-    def __init__(self) -> None:
-        self.counts = torch.zeros(len(STATES), _BINS, dtype=torch.float64)
-
-    def add(self, error: Tensor, log_variance: Tensor, visibility: Tensor) -> None:
-        """error: [T, 3, H, W], view minus truth in [0, 1]. log_variance, visibility: [T, H, W], as published."""
-        shift = 2 * (error.abs().clamp(min=1e-9) / _Z).log() - log_variance[:, None]  # inside where not above 0
-        place = torch.ceil((shift + _FARTHEST) * (_BINS / (2 * _FARTHEST))).long().clamp(1, _BINS) - 1
-        state = visibility[:, None].expand_as(error).long()
-        self.counts += torch.bincount((state * _BINS + place).flatten(), minlength=self.counts.numel()).view(3, -1)
-
-    @property
-    def coverage(self) -> list[float]:
-        """Share of errors inside the 90 % interval, by state; NaN for a state that never occurs."""
-        inside = self.counts[:, : _BINS // 2].sum(1)
-        return (inside / self.counts.sum(1)).tolist()
-
-
-def fit_spread(histogram: SpreadHistogram) -> tuple[float, float, float]:
-    """What to add to the log-variance of each state so that the 90 % interval holds 90 %; 0 for an absent state."""
-    shifts: list[float] = []
-    for counts in histogram.counts:
-        share = counts.cumsum(0) / counts.sum()
-        enough = int((share < _INTERVAL).sum()) + 1  # right edge of the first bin that reaches it
-        shifts.append(enough * (2 * _FARTHEST / _BINS) - _FARTHEST if bool(counts.sum() > 0) else 0.0)
-    return shifts[0], shifts[1], shifts[2]
 
 
 class Tally:

@@ -1,42 +1,51 @@
-"""The live view measured beside the splat by exact depth.
+"""The live view measured beside the splat by exact depth, the best homography, and itself in other ways.
 
-    python -m gcd_train.live.measure --heldout DIR --training DIR --weights FILE --sets paper,orbit \
+    python tools/live_measure.py --heldout DIR --training DIR --weights FILE --sets paper,orbit \
         --methods splat,live --out DIR
 
-Same clips, same run; writes report.md, report.json and a sheet of pictures for each set.
+Same clips, same run; writes report.md, report.json and a sheet of pictures for each set. The other ways are errors that
+nobody declares and other ways to paint: `--methods live,live-mean`, see `variants`.
 """
 
 import argparse
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import torch
+from live_figures import NAMED_CLASSES, MethodViews, Tally, truth_of
 from torch import Tensor
 
 from gcd_model import hatched
 from gcd_model.errors import ModelError
-from gcd_model.geometry import invert_rigid
-from gcd_model.live.config import LiveConfig
-from gcd_model.live.eyes import Eyes, Floor, SeenWorld
+from gcd_model.geometry import Intrinsics, invert_rigid
+from gcd_model.layers import zeroed
+from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.eyes import Eyes, Floor, FrameGeometry
 from gcd_model.live.paint_net import filled, seen_of
 from gcd_model.live.splat import splat, unproject
-from gcd_model.live.synthesizer import COVERED, LiveSynthesizer, Painter
-from gcd_model.loading import load_synthesizer
+from gcd_model.live.synthesizer import COVERED
 from gcd_model.networks import LiveNetworks
 from gcd_train.errors import DataError, TrainError
 from gcd_train.evaluation.galleries import Strip, to_bytes, write_sheet
+from gcd_train.evaluation.predictors import pixel_rays, to_pixels
 from gcd_train.evaluation.statistics import scene_weights
 from gcd_train.evaluation.tables import markdown_rows
-from gcd_train.live.batches import Pictures, pictures_of
-from gcd_train.live.clips import LiveClip, clip_paths, evenly, read_clip, training_paths
-from gcd_train.live.figures import NAMED_CLASSES, NEVER, NOW, STATES, MethodViews, Tally, fit_spread, truth_of
+from gcd_train.live.batches import pictures_of
+from gcd_train.live.calibration import fit_spread, floors_of, frames_of
+from gcd_train.live.clips import NEVER, NOW, STATES, Array, LiveClip, clip_paths, evenly, read_clip, training_paths
+from gcd_train.live.training import live_model
 
+_FEWEST_PAIRS, _MOST_PAIRS = 8, 3000
+_RANSAC_PX = 1.5
+_ECC_ROUNDS, _ECC_STEP = 40, 1e-5
 _SAMPLE = 60
 """Training clips that the fill of holes is read off."""
 _SHEET_FRAMES, _SHEET_CLIPS = (5, 9, 13), 4
@@ -131,14 +140,9 @@ class LiveModel:
 
     def views(self, clip: LiveClip) -> MethodViews:
         """See Method."""
-        eyes, config = self.eyes(self.networks), self.networks.config
-        world = SeenWorld(config, next(self.networks.parameters()).device)
-        painter = Painter(self.networks, steps=self.steps or config.steps)
-        source, moves = pictures_of(clip), invert_rigid(clip.poses("source")) @ clip.poses("target")
-        lens, target_lens = source.lenses[0], clip.lens("target")
-        seen = (eyes.see(frame, lens=lens, floor=self._floor(source, t)) for t, frame in enumerate(source.video))
-        placed = (world.place(each, [move], target_lens) for each, move in zip(seen, moves, strict=True))
-        frames = [painter.paint(each)[0] for each in placed]
+        source = pictures_of(clip)
+        floors, eyes = [self._misjudged(floor) for floor in floors_of(source)], self.eyes(self.networks)
+        frames = frames_of(self.networks, clip, source, floors, eyes=eyes, steps=self.steps)
         return MethodViews(
             video=torch.stack([(frame.picture.clamp(-1, 1) + 1) / 2 for frame in frames]),
             classes=torch.stack([frame.classes for frame in frames]),
@@ -146,19 +150,100 @@ class LiveModel:
             log_variance=torch.stack([frame.log_variance for frame in frames]),
         )
 
-    def _floor(self, source: Pictures, t: int) -> Floor:
+    def _misjudged(self, floor: Floor) -> Floor:
         tilt = torch.tensor(np.radians(self.floor_tilt_deg)).float()
-        x, y, z = source.ups[t]
+        x, y, z = floor.up
         up = torch.stack([x, y * tilt.cos() - z * tilt.sin(), y * tilt.sin() + z * tilt.cos()])
-        return Floor(up=up, height_m=float(source.heights_m[t]) + self.floor_higher_m)
+        return Floor(up=up, height_m=floor.height_m + self.floor_higher_m)
 
 
-def live_model(weights: str, *, device: str = "auto", dtype: str | None = None) -> LiveSynthesizer:
-    """A live model. Raises DataError for weights of another."""
-    loaded = load_synthesizer(weights, device=device, dtype=dtype)
-    if not isinstance(loaded, LiveSynthesizer):
-        raise DataError(f"{weights} is no live model; give the weights of one")
-    return loaded
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BestHomography:
+    """The source's picture under the best plane-to-plane map, frame by frame: of three the one nearest to the truth.
+
+    Candidates: least squares and RANSAC on exact correspondences of pixels that are seen now, and ECC on the pictures.
+    """
+
+    name: str = "homography"
+
+    def views(self, clip: LiveClip) -> MethodViews:
+        """See Method."""
+        metres, seen = clip.depth("target"), torch.from_numpy(clip.arrays["target.visibility"] == NOW)
+        video, classes = [], []
+        for t, move in enumerate(invert_rigid(clip.poses("source")) @ clip.poses("target")):
+            source, target = (clip.arrays[f"{name}.rgb"][t] for name in ("source", "target"))
+            places = _correspondences(metres[t], seen[t], move, clip.lens("target"), clip.lens("source"))
+            shown = [(_warped(source, each, cv2.INTER_LINEAR), each) for each in _candidates(*places, source, target)]
+            best, chosen = min(shown, key=lambda each: float(np.square(each[0].astype(np.float64) - target).mean()))
+            video.append(best)
+            classes.append(_warped(clip.arrays["source.labels"][t], chosen, cv2.INTER_NEAREST))
+        pictures = torch.from_numpy(np.stack(video)).permute(0, 3, 1, 2).float() / 255
+        return MethodViews(video=pictures, classes=torch.from_numpy(np.stack(classes)))
+
+
+def _correspondences(
+    metres: Tensor, seen: Tensor, source_from_target: Tensor, lens: Intrinsics, own: Intrinsics
+) -> tuple[Array, Array]:
+    """Where pixels are in the target and in the source, [N, 2] each, as OpenCV counts pixels; evenly chosen.
+
+    metres: [H, W], of the target. seen: bool [H, W], the pixels to take. lens, own: of target and source.
+    """
+    v, u = (each[:: max(len(each) // _MOST_PAIRS, 1)] for each in seen.nonzero(as_tuple=True))
+    points = pixel_rays(lens)[v, u] * metres[v, u, None].double()
+    there = to_pixels(points @ source_from_target[:3, :3].T + source_from_target[:3, 3], own) - 0.5
+    return torch.stack([u, v], dim=1).double().numpy(), there.numpy()
+
+
+def _candidates(here: Array, there: Array, source: Array, target: Array) -> list[Array]:
+    """Maps from target to source pixels."""
+    made: list[Array | None] = []
+    if len(here) >= _FEWEST_PAIRS:
+        made = [cv2.findHomography(here, there, method, _RANSAC_PX)[0] for method in (0, cv2.RANSAC)]
+    kept = [each for each in made if each is not None] or [np.eye(3)]
+    template, moved = (cv2.cvtColor(np.ascontiguousarray(each), cv2.COLOR_RGB2GRAY) for each in (target, source))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ECC_ROUNDS, _ECC_STEP)
+    try:
+        found = cv2.findTransformECC(template, moved, kept[0].astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria)[1]
+    except cv2.error:  # it does not converge where the pictures have little in common
+        return kept
+    return [*kept, np.asarray(found)]
+
+
+def _warped(picture: Array, source_from_target: Array, interpolation: int) -> Array:
+    height, width = picture.shape[:2]
+    flags, move = interpolation | cv2.WARP_INVERSE_MAP, source_from_target.astype(np.float64)
+    return np.asarray(cv2.warpPerspective(picture, move, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+class Misjudging(Eyes):
+    """Eyes whose depth is off by a factor."""
+
+    def __init__(self, networks: LiveNetworks, scale: float) -> None:
+        super().__init__(networks)
+        self._scale = scale
+
+    def look(self, *args: Any, **kwargs: Any) -> FrameGeometry:
+        geometry = super().look(*args, **kwargs)
+        metres = geometry.metres
+        return replace(geometry, metres=torch.where(metres < SKY_M, metres * self._scale, metres))
+
+
+def variants(live: LiveModel) -> Sequence[Method]:
+    """The homography, and the live model with what may be wrong, with several steps, its mean, or that made crisp."""
+    mean, crisp = deepcopy(live.networks), deepcopy(live.networks)
+    mean.paint.first_step = partial(mean.paint.first_step, detail=False)
+    zeroed(crisp.paint.detail.out)
+    return [
+        BestHomography(),
+        replace(live, name="live-depth-0.9", eyes=partial(Misjudging, scale=0.9)),
+        replace(live, name="live-depth-1.1", eyes=partial(Misjudging, scale=1.1)),
+        replace(live, name="live-floor-20cm", floor_higher_m=0.2),
+        replace(live, name="live-floor-2deg", floor_tilt_deg=2.0),
+        replace(live, name="live-2-steps", steps=2),
+        replace(live, name="live-4-steps", steps=4),
+        replace(live, name="live-mean", networks=mean),
+        replace(live, name="live-crisp", networks=crisp),
+    ]
 
 
 def chosen_methods(names: Sequence[str], known: Sequence[Method]) -> list[Method]:
@@ -271,8 +356,8 @@ def to_json(results: Sequence[SetResult]) -> dict[str, Any]:
     }
 
 
-def main(arguments: Sequence[str] | None = None, more: Callable[[LiveModel], Sequence[Method]] = lambda _: ()) -> None:
-    """See the module. more: methods beside the splat and the live model."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """See the module."""
     parser = argparse.ArgumentParser(description="Measure the live view beside the exact splat.")
     parser.add_argument("--heldout", type=Path, required=True, help="folder of the sets")
     parser.add_argument("--training", type=Path, required=True, help="clips that fill holes as they are on average")
@@ -285,7 +370,7 @@ def main(arguments: Sequence[str] | None = None, more: Callable[[LiveModel], Seq
     results: list[SetResult] = []
     try:
         live = LiveModel(networks=live_model(options.weights, device="cpu").networks)
-        known = [ExactSplat(training=options.training), live, *more(live)]
+        known = [ExactSplat(training=options.training), live, *variants(live)]
         methods = chosen_methods(options.methods.split(","), known)
         options.out.mkdir(parents=True, exist_ok=True)
         for name in options.sets.split(","):
