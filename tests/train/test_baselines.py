@@ -18,6 +18,7 @@ from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import SamplingConfig
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
 from gcd_train.data.pairs import PairedClip
+from gcd_train.data.visibility import visibility
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import (
     GroundHomography,
@@ -31,7 +32,6 @@ from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.methods import EvaluateOptions, baselines
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, Predictor, SourceClip, to_pictures
-from gcd_train.pointcloud import visibility
 
 FRAMES, HEIGHT, WIDTH = 3, 64, 96
 

@@ -31,8 +31,8 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, Control, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, ViewPairs, trained_lens, trained_picture
 from gcd_train.data.sample import Sample, collate
+from gcd_train.data.visibility import render_lens
 from gcd_train.errors import DataError, RenderError
-from gcd_train.pointcloud import render_lens
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CAMERAS = tuple(DRIVING_POSES)

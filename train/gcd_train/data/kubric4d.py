@@ -31,7 +31,6 @@ from gcd_train.data import encodings
 from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, pose_from_quaternion, scene_names
 from gcd_train.data.encodings import (
     Doubles,
-    Floats,
     quaternions,
     read_colour,
     read_depth,
@@ -41,8 +40,8 @@ from gcd_train.data.encodings import (
 )
 from gcd_train.data.files import MOST_TEXT, FileFault, Recent, SceneFiles, one_of, read
 from gcd_train.data.sample import SceneView
+from gcd_train.data.splat import ray_lengths
 from gcd_train.errors import DataError
-from gcd_train.pointcloud import planar_from_distance
 from gcd_train.scenes.description import Scene, SceneObject, rotations
 
 if TYPE_CHECKING:
@@ -178,7 +177,7 @@ class Kubric4D(Dataset4D):
             instances = sized(path, read_palette_indices(path), *size).astype(np.uint16)
         return SceneView(
             rgb=rgb,
-            depth=depth if far.suffix == _PLANAR else planar_from_distance(depth, view.lens, published=self._published),
+            depth=depth if far.suffix == _PLANAR else depth / ray_lengths(view.lens, published=self._published),
             classes=None,
             instances=instances,
             world_from_camera=view.poses[time],
@@ -266,13 +265,6 @@ class Kubric4DWriter:
 
     def _write(self, view: str, layer: Layer, time: int, data: bytes) -> None:
         self._files.write(frame_path(self._files.folder, view, layer, time, compact=self._compact), data)
-
-
-def ray_lengths(lens: Intrinsics) -> Floats:
-    """[H, W]: distance to the camera centre over depth along the axis, for the middle of every pixel."""
-    x = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
-    y = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
-    return np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2).astype(np.float32)
 
 
 def segment_ids(instances: tuple[int, ...]) -> encodings.Bytes:

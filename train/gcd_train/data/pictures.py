@@ -23,8 +23,9 @@ from gcd_train.data.dataset4d import VOID, Dataset4D
 from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_manifest
 from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
+from gcd_train.data.splat import Splatted, splat
+from gcd_train.data.visibility import depth_visibility, published_picture, render_lens, visibility
 from gcd_train.errors import DataError, RenderError
-from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility
 
 if TYPE_CHECKING:
     from gcd_train.scenes.frozen import FrozenScene
@@ -124,21 +125,14 @@ class SplatPictures(Pictures):
             if self._options.class_ids:
                 made.classes.append(self._target_ids(views, world_from_target, lens))
             if self._options.visible:
-                made.visible.append(
-                    visibility(seen, world_from_target, lens, width=across, height=along, options=self._points)
-                )
+                size, published = self._options.size, self._options.published
+                made.visible.append(visibility(seen, world_from_target, lens, size, published=published))
         return made
-
-    @property
-    def _points(self) -> SplatOptions:
-        return SplatOptions(published=self._options.published)
 
     def _target_ids(self, views: Sequence[SceneView], world_from_target: Doubles, lens: Intrinsics) -> Bytes:
         """The class of the point that shows most in each pixel, `VOID` where none does: colours of edges are mixed, and
         read back as a third class."""
-        smaller = render_lens(lens, self._width, self._height)
-        labels, device = self._ids(views), self._options.device
-        drawn = splat(views, world_from_target, smaller, labels=labels, options=self._points, device=device)
+        drawn = self._splat(views, world_from_target, lens, self._ids(views))
         return drawn.labels.masked_fill(~drawn.covered, VOID).byte().cpu().numpy()
 
     def _ids(self, views: Sequence[SceneView]) -> list[Bytes]:
@@ -156,23 +150,28 @@ class SplatPictures(Pictures):
         lens: Intrinsics,
         values: Sequence[Bytes] | None = None,
     ) -> Bytes:
+        options = self._options
         return published_picture(
             views,
             world_from_camera,
             lens,
-            width=self._width,
-            height=self._height,
+            options.size,
             values=values,
-            options=self._points,
-            device=self._options.device,
+            published=options.published,
+            device=options.device,
         )
 
     def _seen(self, views: Sequence[SceneView], world_from_source: Doubles, lens: Intrinsics) -> SceneView:
         """What a camera at a drawn source pose would have seen, with depth, from the points of all."""
-        smaller = render_lens(lens, self._width, self._height)
-        drawn = splat(views, world_from_source, smaller, options=self._points, device=self._options.device)
-        rgb = (drawn.colour * 255).round().byte().cpu().numpy()
-        return _view(rgb, drawn.depth.cpu().numpy(), world_from_source, smaller)
+        drawn = self._splat(views, world_from_source, lens)
+        smaller = render_lens(lens, *self._options.size)
+        return _view(drawn.picture, drawn.depth.cpu().numpy(), world_from_source, smaller)
+
+    def _splat(
+        self, views: Sequence[SceneView], at: Doubles, lens: Intrinsics, labels: Sequence[Bytes] | None = None
+    ) -> Splatted:
+        smaller, options = render_lens(lens, *self._options.size), self._options
+        return splat(views, at, smaller, labels=labels, published=options.published, device=options.device)
 
 
 class ExactPictures(Pictures):

@@ -23,9 +23,9 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
 from gcd_train.data.pictures import frames_of, geometry_poses, renderer_kind
 from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.visibility import depth_visibility, published_picture, render_lens, visibility
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.look.sheet import Footage, Poses
-from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, visibility
 
 _WIDTH = 384
 _SHAPE = 1.5  # of the trained pictures
@@ -184,7 +184,7 @@ def _target(
         except RenderError:
             pass  # no renderer on this machine; points need none
     every = [
-        published_picture(data.views(scene, number), at, lens, width=lens.width, height=lens.height)
+        published_picture(data.views(scene, number), at, lens, (lens.width, lens.height))
         for number, at in zip(numbers, poses, strict=True)
     ]
     return np.stack(every), None, f"points of all {len(data.cameras)} cameras"
@@ -195,11 +195,8 @@ def _visible(
 ) -> NDArray[np.bool_]:
     """What the source camera saw: the very surface where the target's depth is known, else by the published rule."""
     if target_depth is None:
-        seen = [
-            visibility(view, at, lens, width=lens.width, height=lens.height)
-            for view, at in zip(views, poses, strict=True)
-        ]
-        return np.stack(seen)
+        size = lens.width, lens.height
+        return np.stack([visibility(view, at, lens, size) for view, at in zip(views, poses, strict=True)])
     each = zip(views, target_depth, poses, strict=True)
     return np.stack([depth_visibility(view, depth, at, lens) for view, depth, at in each])
 
