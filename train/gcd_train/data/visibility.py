@@ -19,8 +19,7 @@ OVERSIZE = 1.09375
 _LEAST = 1e-7
 _BLACK = 1e-7
 WIDE, NARROW = (21, 5.25), (3, 0.75)
-"""How holes are filled in pictures to train on, and in those that tell what is visible: pixels of the Gaussian (odd), and
-its sigma."""
+"""How holes are filled in pictures to train on, and in those that tell what is visible: pixels, odd, and sigma."""
 _BLUR_SIGMA = 0.6
 _NEAREST_M = 0.1  # in front of the source camera
 _TOLERANCE = 0.02  # share of the depth by which two surfaces that are the same may differ

@@ -18,11 +18,11 @@ from safetensors.numpy import save_file
 
 from gcd_model.geometry import CameraMount, Intrinsics, Spherical, look_at, path_progress, to_pose
 from gcd_model.live.config import LIVE_CLASSES, SKY_M
+from gcd_train.data.splat import tangents
 from gcd_train.errors import RecipeError, RenderError
 from gcd_train.files import whole
 from gcd_train.live.clips import CAMERAS, Array, Poses, encode_depth
 from gcd_train.parallel import map_items, one_thread_each
-from gcd_train.pointcloud.project import tangents
 from gcd_train.scenes.description import Scene, rotations
 from gcd_train.scenes.driving import driving_scene
 from gcd_train.scenes.frozen import freeze
