@@ -116,7 +116,7 @@ def shown(video: torch.Tensor) -> torch.Tensor:
 def test_what_it_shows_is_what_the_published_rule_calls_visible() -> None:
     for t, view in enumerate(source_views(SEEN)):
         pose = PAIR.source_from_target[t].numpy()
-        rule = visibility(view, pose, PAIR.target, width=WIDTH, height=HEIGHT)
+        rule = visibility(view, pose, PAIR.target, (WIDTH, HEIGHT))
         assert np.array_equal(shown(picture())[t].numpy(), rule)
 
 

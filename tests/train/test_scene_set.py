@@ -19,10 +19,10 @@ from gcd_model.weights.families import FAMILIES, FamilyName
 from gcd_train.cli.main import app
 from gcd_train.data.files import MANIFEST, SceneManifest
 from gcd_train.data.paths import FrameSampling, OrbitSampling
+from gcd_train.data.splits import RELEASED_SOURCE, SceneControls, public_split, public_splits, released_controls
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, SceneSet
-from gcd_train.evaluation.opening import ClipOptions, open_clips, public_split, public_splits
-from gcd_train.evaluation.protocol import RELEASED_SOURCE, SceneControls, released_controls
+from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.store import read_run
 
 SCENES = ("scn02900", "scene_000005")

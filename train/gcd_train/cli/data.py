@@ -19,7 +19,6 @@ from gcd_train.cli.common import (
     say,
     stop_as_by_ctrl_c,
 )
-from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.cache import CacheIndex, ClipPlan, only_writer, read_index
 from gcd_train.data.cache_writer import (
     CacheJob,
@@ -31,7 +30,7 @@ from gcd_train.data.cache_writer import (
     missing_scenes,
 )
 from gcd_train.data.compact import Compaction
-from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.dataset4d import Dataset4D, layout_of
 from gcd_train.data.files import MANIFEST, Skips, faults
 from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
@@ -125,18 +124,14 @@ def verify_command(
 
 def _scenes_of(place: Path) -> list[Path]:
     """The folder itself if it is a scene, else the scenes in it."""
-    if (place / MANIFEST).exists() or _is_scene_name(place.resolve().name):
+    if (place / MANIFEST).exists() or layout_of(place.resolve().name):
         return [place]
     if not place.is_dir():
         raise DataError(f"{place} is no folder; give scene folders, or the folder that `gcd-train generate` filled")
-    inside = sorted(path for path in place.iterdir() if _is_scene_name(path.name))
+    inside = sorted(path for path in place.iterdir() if layout_of(path.name))
     if not inside:
         raise DataError(f"{place} holds no scene (scnNNNNN, scene_NNNNNN) and is none; give another folder")
     return inside
-
-
-def _is_scene_name(name: str) -> bool:
-    return kubric4d.scene_number(name) is not None or parallel_domain4d.scene_number(name) is not None
 
 
 @export.command()

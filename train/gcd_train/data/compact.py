@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from gcd_train.data import encodings, kubric4d, parallel_domain4d
-from gcd_train.data.dataset4d import scene_names
+from gcd_train.data.dataset4d import layout_in, scene_names
 from gcd_train.data.encodings import FAR_M, NEAR_M
 from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, SceneFiles, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
@@ -51,21 +51,14 @@ class Compaction:
         source, out = source.resolve(), out.resolve()
         if source == out:
             raise RecipeError(f"{source} cannot be packed into itself; give another OUT")
-        try:
-            names = [path.name for path in source.iterdir()]
-        except OSError as error:
-            raise DataError(f"{source} cannot be read ({error}); give the folder that holds the scenes") from error
-        orbits = any(kubric4d.scene_number(name) is not None for name in names)
+        orbits = layout_in(source) == "kubric4d"
         usual = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
         return cls(source=source, out=out, orbits=orbits, cameras=cameras or usual, gaps=gaps)
 
     @property
     def scenes(self) -> tuple[str, ...]:
         """All there are, by number. Raises DataError for none."""
-        number, example = (
-            (kubric4d.scene_number, "scn00000") if self.orbits else (parallel_domain4d.scene_number, "scene_000000")
-        )
-        return tuple(scene_names(self.source, number, example))
+        return tuple(scene_names(self.source, "kubric4d" if self.orbits else "parallel_domain4d"))
 
     def __call__(self, scene: str) -> Packed:
         """Pack a scene unless it is there: its folder appears once everything in it was compared with the source.

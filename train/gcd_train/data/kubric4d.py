@@ -76,12 +76,6 @@ def scene_name(number: int) -> str:
     return f"scn{number:05d}"
 
 
-def scene_number(name: str) -> int | None:
-    """The number in a folder's name, None if it is no scene of this layout."""
-    named = re.fullmatch(r"scn(\d{5,})", name)
-    return None if named is None else int(named[1])
-
-
 def metadata_path(scene: Path, camera: str) -> Path:
     """JSON of `view3` of a scene folder, `scn00042/scn00042_p0_v3.json`."""
     return scene / f"{scene.name}_p0_v{camera.removeprefix('view')}.json"
@@ -143,7 +137,7 @@ class Kubric4D(Dataset4D):
         wrong = [camera for camera in cameras if re.fullmatch(r"view\d+", camera) is None]
         if wrong:
             raise DataError(f"Kubric-4D's cameras are called view0 to view15, got {wrong[0]!r}")
-        found = scene_names(Path(root), scene_number, "scn00000") if scenes is None else scenes
+        found = scene_names(Path(root), "kubric4d") if scenes is None else scenes
         super().__init__(Path(root), found, cameras, "view4" if "view4" in cameras else cameras[0])
         self._published, self._instances = published, instances
         self._views = Recent(self._read_views, KEPT_SCENES)

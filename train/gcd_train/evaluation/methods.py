@@ -35,7 +35,7 @@ from gcd_train.evaluation.baselines import (
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, names_of
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips
-from gcd_train.evaluation.opening import ClipOptions, data_kind, open_clips
+from gcd_train.evaluation.opening import SAMPLES, ClipOptions, open_clips, scene_layout
 from gcd_train.evaluation.predictors import (
     CameraPair,
     OpenedWeights,
@@ -45,7 +45,6 @@ from gcd_train.evaluation.predictors import (
     SourceClip,
     open_weights,
 )
-from gcd_train.evaluation.protocol import SAMPLES
 from gcd_train.evaluation.store import LPIPS, RunNote
 
 _SAME_PATH_M = 1e-3
@@ -221,7 +220,7 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
     if options.weights is not None:
         weights = partial(open_weights, _resolved(options.weights), options.device, options.dtype)
     clips, notes = open_clips(options, None if weights is None else weights().traits)
-    samples = options.samples or (1 if data_kind(options.data) == "pairs" else SAMPLES[options.protocol])
+    samples = options.samples or (1 if scene_layout(options.data) is None else SAMPLES[options.protocol])
     options, methods = replace(options, samples=samples), list[Predictor]()
     if weights is not None:
         sampling = RenderOptions(

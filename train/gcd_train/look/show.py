@@ -15,7 +15,7 @@ from gcd_model.errors import FileError
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics, from_pose, spherical_trajectory
 from gcd_model.small_files import decode_json, read_json
 from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.data.dataset4d import Dataset4D, OntologyItem, read_ontology
+from gcd_train.data.dataset4d import Dataset4D, OntologyItem, layout_of, read_ontology
 from gcd_train.data.files import GEOMETRY, MOST_TEXT, ZIP_FAULTS, read_manifest, read_member
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
@@ -69,10 +69,11 @@ def open_scene(path: Path, options: ShowOptions) -> Footage:
 
 def _data_set(path: Path) -> Dataset4D:
     """Of one scene, with the cameras that are there: to look at it not all are needed. Raises DataError, FileFault."""
-    if kubric4d.scene_number(path.name) is not None:
+    layout = layout_of(path.name)
+    if layout == "kubric4d":
         views = [camera for camera in kubric4d.CAMERAS if os.path.lexists(kubric4d.metadata_path(path, camera))]
         return Kubric4D(path.parent, [path.name], cameras=views or kubric4d.CAMERAS, instances=True)
-    if parallel_domain4d.scene_number(path.name) is not None:
+    if layout == "parallel_domain4d":
         cameras = [camera for camera in parallel_domain4d.CAMERAS if (path / "rgb" / camera).is_dir()]
         classes = (path / "semantic_segmentation_2d").is_dir()
         return ParallelDomain4D(
@@ -82,9 +83,7 @@ def _data_set(path: Path) -> Dataset4D:
             classes=classes,
             ontology=read_ontology(parallel_domain4d.ontology_folder(path)) if classes else None,
         )
-    layouts = (kubric4d, parallel_domain4d)
-    inside = sorted(child.name for child in path.iterdir() if child.is_dir())
-    scenes = [name for name in inside if any(layout.scene_number(name) is not None for layout in layouts)]
+    scenes = sorted(child.name for child in path.iterdir() if child.is_dir() and layout_of(child.name))
     if scenes:
         raise DataError(f"{path} is a set of {len(scenes)} scenes; show one, such as {path / scenes[0]}")
     raise DataError(
