@@ -113,8 +113,6 @@ class DrivingPictures:
             fps=self.data.fps,
             world_from_source=world_from_source,
             world_from_target=world_from_source @ self._source_from_target[list(positions)],
-            start=None,
-            deltas=None,
         )
         made = self._pictures.sample(scene, draw)
         if not self._options.exact:

@@ -83,6 +83,7 @@ class Pictures(ABC):
             scene=scene,
             frame_numbers=draw.frame_numbers,
             visible=np.stack(made.visible) if self._options.visible else None,
+            target_depth=np.stack(made.depth) if made.depth else None,
         )
 
     @abstractmethod
@@ -99,6 +100,7 @@ class _Drawn:
     target: list[Bytes] = field(default_factory=list[Bytes])
     classes: list[Bytes] = field(default_factory=list[Bytes])
     visible: list[NDArray[np.bool_]] = field(default_factory=list[NDArray[np.bool_]])
+    depth: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
 
 
 class SplatPictures(Pictures):
@@ -194,7 +196,7 @@ class ExactPictures(Pictures):
 
         folder, numbers = self._dataset.folder(scene), list(draw.frame_numbers)
         lens = render_lens(self._dataset.lens(scene), self._width, self._height)
-        renderer, still = self._own_renderer(), frames_of(folder, numbers, lens)
+        still, renderer = frames_of(folder, numbers, lens), self._own_renderer()
         geometry_from_world = geometry_poses(folder, numbers)
         cameras = {
             _SOURCE: geometry_from_world @ draw.world_from_source,
@@ -210,6 +212,7 @@ class ExactPictures(Pictures):
             if self._options.modality == "classes":
                 made.target = [self._ontology.encode(ids) for ids in made.classes]
         if self._options.visible:  # where the source saw the very surface of the target
+            made.depth = [each.depth for each in drawn[_TARGET]]
             each = zip(drawn[_SOURCE], cameras[_SOURCE], drawn[_TARGET], cameras[_TARGET], strict=True)
             made.visible = [
                 depth_visibility(_view(near.rgb, near.depth, at, lens), far.depth, aimed, lens)

@@ -12,7 +12,9 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Annotated, Literal, TypeAlias, get_args
+
+from typer import Option
 
 from gcd_model import Traits
 from gcd_model.small_files import read_small
@@ -60,23 +62,33 @@ _SMALL_BYTES = 4 << 20
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipOptions:
-    """Which clips are measured: one field for each of these options of `gcd-train evaluate`. None: left out."""
+    """Which clips are measured: options of `gcd-train evaluate`. None: left out."""
 
-    data: Sequence[Path]
-    split: str | None = None
-    listed: Path | None = None
-    limit: int | None = None
-    protocol: ProtocolName = "paper"
-    controls: Path | None = None
-    trajectories: int | None = None
-    frame_start: int | None = None
-    frame_skip: int | None = None
-    angles: Literal["max90", "max180"] | None = None
-    path: Literal["gradual", "direct"] | None = None
-    modality: Literal["rgb", "semantic"] | None = None
-    exact: bool = False
-    camera: Sequence[str] | None = None
-    seed: int = 0
+    data: Annotated[list[Path], Option(help="Folder of pairs (several may be given), or one of whole scenes.")]
+    protocol: Annotated[ProtocolName, Option(help="How clips are cut from whole scenes.")] = "paper"
+    controls: Annotated[Path | None, Option(help="Scenes: control list, JSON.")] = None
+    split: Annotated[str | None, Option(help="Only scenes of a split: a name as driving-test, or FILE:test.")] = None
+    listed: Annotated[Path | None, Option("--list", help="Scenes: only those of a list, one a line.")] = None
+    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes.")] = None
+    trajectories: Annotated[
+        int | None, Option(min=1, help="Scenes: clips of each; by default 4 (paper, Kubric-4D) or 1.")
+    ] = None
+    frame_start: Annotated[int | None, Option(min=0, help="Scenes: first frame of every clip.")] = None
+    frame_skip: Annotated[int | None, Option(min=1, help="Scenes: frames from one of the clip to the next.")] = None
+    angles: Annotated[
+        Literal["max90", "max180"] | None, Option(help="Scenes: how far goals are drawn; by default max90.")
+    ] = None
+    path: Annotated[Literal["gradual", "direct"] | None, Option(help="Scenes: as the weights by default.")] = None
+    modality: Annotated[
+        Literal["rgb", "semantic"] | None, Option(help="Scenes: targets; as the weights by default.")
+    ] = None
+    exact: Annotated[
+        bool, Option("--exact", help="Our scenes: targets from their geometry instead of from points.")
+    ] = False
+    camera: Annotated[list[str] | None, Option(help="Scenes: a camera to read; may be repeated. By default all.")] = (
+        None
+    )
+    seed: Annotated[int, Option(min=0, help="Of drawn clips and of all noise.")] = 0
 
 
 def wanted_scenes(folder: Path, there: Sequence[str], options: ClipOptions, notes: Skips) -> tuple[str, ...]:
