@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -18,6 +18,7 @@ from gcd_train.cli.common import (
     progress_bar,
     say,
     stop_as_by_ctrl_c,
+    with_fields_of,
 )
 from gcd_train.data.cache import CacheIndex, ClipPlan, only_writer, read_index
 from gcd_train.data.cache_writer import (
@@ -135,30 +136,13 @@ def _scenes_of(place: Path) -> list[Path]:
 
 
 @export.command()
+@with_fields_of(TabletopExport)
 def lerobot(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set, new or empty.")],
-    episodes: Annotated[int, typer.Option(min=1, help="How many episodes, one seed each.")] = 10,
-    first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
-    frames: Annotated[int, typer.Option(min=2, help="Time steps of an episode, at 24 Hz.")] = 120,
-    width: Annotated[int, typer.Option(min=32, help="Of the pictures, pixels, even.")] = 320,
-    height: Annotated[int, typer.Option(min=32, help="Of the pictures, pixels, even.")] = 240,
-    cameras: Annotated[
-        str, typer.Option(help="Two or more of view0 to view15 and wrist, with commas.")
-    ] = "view0,view4,view9,wrist",
-    oversample: Annotated[int, typer.Option(min=1, max=4, help="Anti-aliasing: pixels drawn per pixel and side.")] = 2,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set, new or empty.")], **options: Any
 ) -> None:
     """Tabletop episodes as a LeRobot data set (v3.0) with calibrated cameras (extras `scenes` and `lerobot`)."""
-    if width % 2 or height % 2:
-        raise typer.BadParameter(f"H.264 wants an even width and height, got {width} x {height}")
-    wanted = TabletopExport(
-        seeds=range(first_seed, first_seed + episodes),
-        frames=frames,
-        cameras=tuple(name.strip() for name in cameras.split(",")),
-        width=width,
-        height=height,
-        oversample=oversample,
-    )
-    with errors_shown(), progress_bar("episodes", episodes, keep=True) as show:
+    wanted = TabletopExport(**options)
+    with errors_shown(), progress_bar("episodes", wanted.episodes, keep=True) as show:
         for done in export_tabletop(out, wanted):
             show(done)
     say(f"wrote {out}; look at it with `gcd-train lerobot {out}`")
