@@ -131,7 +131,7 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     run = open_data(told, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
     assert run.batches is not None
     precision = Precision(torch.device("cpu"), half=False, channels_last=False)
-    batch = run.batches(networks, precision).whole_clips(Draws(1, "unet", 0, torch.device("cpu")), 2)
+    batch = run.batches(networks, precision).batch(Draws(1, "unet", 0, torch.device("cpu")), 2)
     assert batch.target.shape[0] == 2 * CLIP
     assert len(batch.ids) == 2
     assert batch.wait_s is not None

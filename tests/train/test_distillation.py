@@ -82,7 +82,7 @@ def batch(networks: Networks) -> Batch:
     recipe = UNetRecipe(
         budget=Budget(updates=1), optimiser=OptimiserRecipe(rate=1.0), source="pixels", dropout=0.0, augmentation=0.0
     )
-    return SampleBatches(TinyClips(1), networks, recipe, FAMILIES["driving"], CPU).whole_clips(
+    return SampleBatches(TinyClips(1), networks, recipe, FAMILIES["driving"], CPU).batch(
         Draws(1, "batch", 0, CPU.device), 1
     )
 

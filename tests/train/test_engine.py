@@ -33,7 +33,7 @@ def gradients(unet: VideoUNet) -> tuple[dict[str, torch.Tensor], int]:
     """The gradient of each weight, and how often a block was computed."""
     runs: list[int] = []
     watched = [stage.res.register_forward_pre_hook(lambda *_: runs.append(1)) for stage in stages_of(unet)]
-    batch = Noise().whole_clips(Draws(0, "x", 0, torch.device("cpu")), 1)
+    batch = Noise().batch(Draws(0, "x", 0, torch.device("cpu")), 1)
     plan = unet.plan(torch.ones(1, FRAMES), batch.vector, None, None)
     unet(batch.target, batch.condition, *plan.step(0)).square().mean().backward()
     for hook in watched:

@@ -131,7 +131,7 @@ def pixel_batch(augmentation: float, dropout: float = 0.0) -> tuple[Batch, Netwo
     )
     source = to_network(TinyClips(1).sample(0).source)
     batches = SampleBatches(TinyClips(1), networks, changed, FAMILIES["driving"], PRECISION)
-    return batches.whole_clips(draws(), 1), networks, source
+    return batches.batch(draws(), 1), networks, source
 
 
 @pytest.mark.parametrize("strength", [0.02, 0.0])

@@ -19,7 +19,6 @@ from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.batches import EncodedBatches
 from gcd_train.data.latents import Encodings, LatentClips, LatentRows
 from gcd_train.data.open import DataPlaces, open_data
 from gcd_train.data.sample import Clips, MadeClips, Sample, to_network
@@ -27,7 +26,7 @@ from gcd_train.data.sample import painted as painted_clips
 from gcd_train.errors import DataError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
-from gcd_train.training.conditioner import mirrored_path
+from gcd_train.training.conditioner import Conditioner, mirrored_path
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.setup import Precision, model_config, start_networks
 
@@ -216,7 +215,7 @@ def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run
     config, path = model_config(recipe.model), TinyOrbits().trajectory(1)
     traits = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu").traits
     told = micro_conditioning(12.0, traits.motion_bucket(path), 0.0, config.unet.vector_width)
-    torch.testing.assert_close(EncodedBatches(clips, config, recipe.unet, PRECISION).vector(rows)[0], told)
+    torch.testing.assert_close(Conditioner(config, recipe.unet, PRECISION).vector(rows.motion)[0], told)
     assert path.delta is not None
     assert rows.control is not None
     assert torch.equal(rows.control[0], spherical_features(path.delta)[2])

@@ -42,13 +42,8 @@ UPDATES = 3  # the first two on single frames, which leave out the layers across
 class Noise:
     """Batches of nothing but noise. See BatchSource."""
 
-    def single_frames(self, draws: Draws, count: int) -> Batch:
-        return self._batch(draws, count, 1)
-
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
-        return self._batch(draws, count * FRAMES, FRAMES)
-
-    def _batch(self, draws: Draws, rows: int, frames: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
+        rows, frames = (count, 1) if single else (count * FRAMES, FRAMES)
         unet = model_config(tiny_recipe().model).unet
         return Batch(
             target=draws.normal(rows, unet.latent_channels, 4, 8),
@@ -121,8 +116,8 @@ class TwiceTheBatch(Task):
         recipe = self._recipe
         draws = BothDraws([Draws(self._seed, "unet", 2 * progress.updates + part, CPU) for part in (0, 1)])
         single = progress.share < recipe.image_share
-        made = self._batches.single_frames if single else self._batches.whole_clips
-        batch = made(draws, 2 * (recipe.image_batch if single else recipe.clip_batch))  # pyright: ignore
+        count = 2 * (recipe.image_batch if single else recipe.clip_batch)
+        batch = self._batches.batch(draws, count, single=single)  # pyright: ignore
         return diffusion_loss(
             self.network, batch, draws, PRECISION,  # pyright: ignore
             noise=recipe.noise, loss=recipe.loss, channel_weights=None, step=progress.updates,

@@ -17,8 +17,8 @@ from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
 from gcd_model.weights.families import Family
 from gcd_train.data.cache import CachedLatents, FrozenEncoders, PathKind, encoders_digest
-from gcd_train.data.latents import LatentClips, LatentRows
-from gcd_train.data.loader import LoadedBatch, SampleLoader
+from gcd_train.data.latents import LatentClips
+from gcd_train.data.loader import SampleLoader
 from gcd_train.data.sample import Samples, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
@@ -28,8 +28,6 @@ from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.objective import Batch, drop_streams
 from gcd_train.training.setup import Precision
-
-_WHOLE_CLIPS = 'unet.source "pixels" and a latent cache take whole clips only; set image_share to 0'
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -75,29 +73,22 @@ class EncodedBatches:
         self._clips, self._recipe, self._precision = clips, recipe, precision
         self._conditioner = Conditioner(config, recipe, precision)
 
-    def single_frames(self, draws: Draws, count: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """See BatchSource."""
-        return self._batch(
-            draws, draws.below(self._clips.meta.clips, count), draws.below(self._clips.meta.frames, count), 1
-        )
-
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
-        """See BatchSource."""
-        frames = self._clips.meta.frames
-        return self._batch(
-            draws, draws.below(self._clips.meta.clips, count), torch.arange(frames).repeat(count), frames
-        )
-
-    def _batch(self, draws: Draws, clips: Tensor, frames: Tensor, per_clip: int) -> Batch:
-        flip = draws.below(self._clips.meta.flips, clips.shape[0]).bool()
+        meta = self._clips.meta
+        clips = draws.below(meta.clips, count)
+        frames = draws.below(meta.frames, count) if single else torch.arange(meta.frames).repeat(count)
+        per_clip = 1 if single else meta.frames
+        flip = draws.below(meta.flips, count).bool()
         rows = self._clips.rows(
             clips.repeat_interleave(per_clip), frames, flip.repeat_interleave(per_clip), self._precision.device
         )
-        condition, _ = drop_streams(self.condition(rows), None, per_clip, draws, self._recipe)
+        source = self._precision.frames(rows.source)
+        condition, _ = drop_streams(source, None, per_clip, draws, self._recipe)
         return Batch(
             target=self._precision.frames(rows.target),
             condition=condition,
-            vector=self.vector(rows),
+            vector=self._conditioner.vector(rows.motion),
             tokens=None,
             emphasis=rows.emphasis,
             frames=per_clip,
@@ -105,32 +96,12 @@ class EncodedBatches:
             ids=self._clips.names(clips),
         )
 
-    def vector(self, rows: LatentRows) -> Tensor:
-        """Micro-conditioning of some frames, [N, V]."""
-        return self._conditioner.vector(rows.motion, rows.target.shape[0])
 
-    def condition(self, rows: LatentRows) -> Tensor:
-        """Condition channels [N, C', h, w] of some frames."""
-        return self._conditioner.channels(rows.source)
-
-
-class WholeClips:
-    """What has no single frames. Raises RecipeError for a recipe that wants some."""
-
-    def __init__(self, recipe: UNetRecipe) -> None:
-        if recipe.image_share:
-            raise RecipeError(_WHOLE_CLIPS)
-        self._recipe = recipe
-
-    def single_frames(self, draws: Draws, count: int) -> Batch:
-        """Not offered; refused when this was made."""
-        raise RecipeError(_WHOLE_CLIPS)
-
-
-class SampleBatches(WholeClips):
+class SampleBatches:
     """A `BatchSource` of whole clips. Batch n, by `Draws.number`, always has the same samples.
 
     samples: `ViewPairs`, `LeRobotPairs`, or a set of clips. family: says what the network is told of a camera's way.
+    turns: see `SampleLoader`.
     """
 
     def __init__(
@@ -142,18 +113,16 @@ class SampleBatches(WholeClips):
         precision: Precision,
         loader: LoaderRecipe = LoaderRecipe(),  # noqa: B008  it is frozen
         seed: int = 0,
+        turns: Sequence[int] = (0,),
     ) -> None:
-        super().__init__(recipe)
-        self._networks, self._precision = networks, precision
+        self._networks, self._precision, self._recipe = networks, precision, recipe
         self._conditioner = Conditioner(networks.config, recipe, precision, family)
-        self._loader = SampleLoader(samples, seed, loader)
+        self._loader = SampleLoader(samples, seed, loader, turns, recipe.parts)
 
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """See BatchSource. Raises DataError if samples cannot be read or do not fit the model."""
-        return self.batch(self._loader.batch(draws.number, count), draws)
-
-    def batch(self, loaded: LoadedBatch, draws: Draws) -> Batch:
-        """The batch of some samples."""
+        assert not single, "the recipe refuses it"
+        loaded = self._loader.batch(draws.number, count)
         samples, config, recipe = loaded.samples, self._networks.config, self._recipe
         given = list(samples.source.shape[1:4])
         wanted = [config.frames, config.height, config.width]
@@ -191,7 +160,7 @@ class SampleBatches(WholeClips):
         return micro_conditioning(fps, motion, recipe.augmentation, width)
 
 
-class CachedBatches(WholeClips):
+class CachedBatches:
     """A `BatchSource` of whole clips: noise copy of every frame, posterior sample and dropout drawn anew each time.
 
     The frame rate of a clip is its own, after the stride; the recipe's `fps` is not used.
@@ -206,18 +175,18 @@ class CachedBatches(WholeClips):
         precision: Precision,
         path: PathKind,
     ) -> None:
-        super().__init__(recipe)
         kept, given = cache.index.identity.encoders, encoders_digest(networks)
         if kept != given:
             raise RecipeError(
                 f"{cache.folder} was made with other encoders ({kept}) than the run's ({given}); give the same "
                 "model.weights, or make the cache anew"
             )
-        self._cache, self._config, self._precision = cache, networks.config, precision
+        self._cache, self._config, self._precision, self._recipe = cache, networks.config, precision, recipe
         self._path: PathKind = path
 
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """See BatchSource."""
+        assert not single, "the recipe refuses it"
         started = time.perf_counter()
         on_cpu = Draws(int(draws.below(2**31, 1)), "latent cache", 0, torch.device("cpu"))
         clips = [self._cache.clip(*self._cache.drawn_place(on_cpu), self._path, on_cpu) for _ in range(count)]

@@ -1,5 +1,6 @@
 """From a recipe's [data] and the folders a user names to what a run learns from and is measured on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -168,7 +169,7 @@ class _Opening:
         require_apart(dict.fromkeys(cache.scenes, ""), dict.fromkeys(held.scenes, ""))
         clips = self._one_rate(held, held.fps)
 
-        def batches(networks: Networks, precision: Precision, /) -> BatchSource:
+        def batches(networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
             return CachedBatches(cache, networks, self.recipe.unet, precision, self._data.path)
 
         return RunData(clips=clips, valid=clips, batches=batches)
@@ -247,9 +248,9 @@ class _Opening:
         if recipe.data.task == "image-to-video":
             samples = VideoSamples(samples)
 
-        def batches(networks: Networks, precision: Precision, /) -> BatchSource:
-            loader = recipe.data.loader
-            return SampleBatches(samples, networks, recipe.unet, self.family, precision, loader, recipe.seed)
+        def batches(networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
+            loader, seed = recipe.data.loader, recipe.seed
+            return SampleBatches(samples, networks, recipe.unet, self.family, precision, loader, seed, turns)
 
         return batches
 
@@ -281,7 +282,6 @@ class _Opening:
             "model.camera": config.camera != "none",
             "model.frames": config.frames != kept.plan.clip_frames,
             "model.height and model.width": (config.height, config.width) != (kept.height, kept.width),
-            "unet.image_share": unet.image_share > 0,
             "unet.augmentation": unet.augmentation != kept.augmentation,
             "unet.loss.class_weights": unet.loss.class_weights != "none" and not kept.emphasis,
             "data.path": data.path not in kept.plan.paths,

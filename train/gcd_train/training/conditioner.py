@@ -33,18 +33,12 @@ class Conditioner:
         told = micro_conditioning(recipe.fps, recipe.motion_bucket, recipe.augmentation, width)
         self._vector = told.to(precision.device)
 
-    def vector(self, motion: Tensor | None, rows: int) -> Tensor:
-        """Micro-conditioning, [N, V]. motion: motion number of each row, [N]; None for the recipe's."""
-        vector = self._vector.expand(rows, -1)
-        if motion is None:
-            return vector
+    def vector(self, motion: Tensor) -> Tensor:
+        """Micro-conditioning, [N, V]. motion: motion number of each row, [N]."""
+        vector = self._vector.expand(len(motion), -1)
         third = vector.shape[1] // 3  # fps, motion, augmentation
         told = sinusoid(motion.to(self._precision.device).float(), third)
         return torch.cat([vector[:, :third], told, vector[:, 2 * third :]], dim=1)
-
-    def channels(self, latents: Tensor) -> Tensor:
-        """Source latents [N, C, h, w] as the network takes them."""
-        return self._precision.frames(latents)
 
     def motion(self, path: Trajectory) -> float:
         """The number that tells the network how far the camera goes: the family's for the path, else the recipe's.
