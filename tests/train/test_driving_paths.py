@@ -1,6 +1,5 @@
 """Driving pairs whose target camera stands at its goal from the first frame on, beside those where it moves there."""
 
-import json
 import zipfile
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from gcd_train.evaluation.clips import cameras_of
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import load_recipe
 from gcd_train.scenes.driving.world import driving_scene
-from gcd_train.scenes.worlds import CameraWay, PairForm, World, WorldOptions, agree, driving_world, read_world
+from gcd_train.scenes.worlds import CameraWay, PairForm, World, WorldOptions, agree, driving_world
 from gcd_train.training.setup import family_of, model_config
 
 FORM = PairForm(width=48, height=32, frames=3, oversample=1)
@@ -58,15 +57,6 @@ def test_clips_and_methods_follow_the_path_that_the_world_tells(path: CameraWay,
     lower = CameraMount(height_m=1.2)
     declared = cameras_of(clips, 0, lower).trajectory.source_from_target
     np.testing.assert_allclose(declared, driving_trajectory(frames=3, move_time=goal, mount=lower).source_from_target)
-
-
-def test_a_folder_says_which_path_its_target_camera_takes(tmp_path: Path) -> None:
-    for path in ("gradual", "direct"):
-        agree_in = tmp_path / path
-        agree_in.mkdir()
-        agree(agree_in, world(path))
-        assert read_world(agree_in) == world(path)
-        assert json.loads((agree_in / "world.json").read_text())["path"] == path
 
 
 def test_clips_of_both_paths_do_not_go_together(tmp_path: Path) -> None:

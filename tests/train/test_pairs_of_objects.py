@@ -220,16 +220,13 @@ def with_thing(scene: Scene, at: tuple[float, float, float], side: float = 2.0) 
     )
 
 
-@pytest.mark.parametrize(("world", "frames", "said"), [("driving", 14, "no stage"), ("stage", 40, "up to 30")])
+@pytest.mark.parametrize(
+    ("world", "frames", "said"), [("driving", 14, "no stage"), ("stage", 40, "up to 30"), ("sea", 14, "no world 'sea'")]
+)
 def test_worlds_that_give_no_such_clips_are_refused(world: str, frames: int, said: str) -> None:
     with pytest.raises(RecipeError, match=said):
         orbit_world(scene_world(world), PairForm(frames=frames))
     assert orbit_world(STAGE, PairForm(frames=30)).frames == 30
-
-
-def test_a_world_that_is_none_is_refused() -> None:
-    with pytest.raises(RecipeError, match="no world 'sea'"):
-        scene_world("sea")
 
 
 @needs_egl

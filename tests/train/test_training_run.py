@@ -76,14 +76,6 @@ def test_latents_have_zero_mean_and_unit_spread(run: Path) -> None:
     assert sum(meta.sensitivity) / len(meta.sensitivity) == pytest.approx(1.0)
 
 
-def test_rows_are_the_encoded_frames_and_mirroring_mirrors_the_rest(run: Path) -> None:
-    clips = LatentClips.open(run / "latents")
-    both, frame = torch.tensor([1, 1]), torch.tensor([2, 2])
-    rows = clips.rows(both, frame, torch.tensor([False, True]), torch.device("cpu"))
-    assert not torch.equal(rows.source[0], rows.source[1])
-    assert not torch.equal(rows.target[0], rows.target[1])
-
-
 def folder_with(run: Path, path: Path, *parts: str) -> Path:
     """A run folder that shares finished stages with another."""
     path.mkdir(parents=True, exist_ok=True)

@@ -249,16 +249,6 @@ def test_a_scene_without_its_class_layer_is_left_out(two_scenes: Path) -> None:
     assert "lacks its layer semantic_segmentation_2d" in sample.skipped[0].reason
 
 
-def test_a_sample_is_the_same_in_any_order(kubric: Kubric4D) -> None:
-    first, second = (ViewPairs(kubric, ORBIT, 2, PictureOptions(size=SIZE)) for _ in range(2))
-    ahead = [first.sample(index) for index in (0, 1)]
-    back = [second.sample(index) for index in (1, 0)][::-1]
-    for one, other in zip(ahead, back, strict=True):
-        np.testing.assert_array_equal(one.target, other.target)
-        assert one.frame_numbers == other.frame_numbers
-    assert not np.array_equal(ahead[0].target, ahead[1].target)
-
-
 def test_a_short_scene_is_left_out_by_name(two_scenes: Path) -> None:
     for path in (two_scenes / "scene_000004" / "rgb" / "yaw-0").iterdir():
         if int(path.stem) > 30:
