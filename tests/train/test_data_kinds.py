@@ -20,8 +20,7 @@ from gcd_train.data.paths import DrivingSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import LossRecipe, Recipe
 from gcd_train.recipe_data import DataRecipe, FramesRecipe, OrbitRecipe
-from gcd_train.training.draws import Draws
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CONFIG = ModelConfig(frames=3, height=32, width=48)

@@ -22,9 +22,8 @@ from gcd_train.data.sample import to_network
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import OptimiserRecipe, Recipe, StudentRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
-from gcd_train.training.draws import Draws
 from gcd_train.training.objective import Batch, denoiser_of, sampled, schedule_of
-from gcd_train.training.setup import Precision, loaded_base, run_config, student_config
+from gcd_train.training.setup import Draws, Precision, loaded_base, run_config, student_config
 
 CPU = Precision.of(ComputeRecipe(device="cpu"))
 

@@ -22,11 +22,10 @@ from gcd_train.recipe_data import Budget, ComputeRecipe
 from gcd_train.recipe_files import load_recipe, packaged_recipes
 from gcd_train.training.checkpoint import newest_weights
 from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, recompute_blocks, stages_of
-from gcd_train.training.draws import Draws
 from gcd_train.training.loop import Loop, Progress, StepLoss
 from gcd_train.training.loop import Task as BaseTask
 from gcd_train.training.monitor import RunFolder
-from gcd_train.training.setup import Precision, model_config
+from gcd_train.training.setup import Draws, Precision, model_config
 
 
 def gradients(unet: VideoUNet) -> tuple[dict[str, torch.Tensor], int]:

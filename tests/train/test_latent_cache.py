@@ -47,8 +47,7 @@ from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.recipe import LossRecipe
-from gcd_train.training.draws import Draws
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 
 CPU = torch.device("cpu")
 

@@ -15,9 +15,8 @@ from gcd_model.weights.families import FAMILIES
 from gcd_train.data.batches import SampleBatches
 from gcd_train.data.sample import to_network
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
-from gcd_train.training.draws import Draws
 from gcd_train.training.objective import Batch, Denoiser, diffusion_loss, draw_noise, draw_sigma, drop_streams
-from gcd_train.training.setup import Precision, model_config
+from gcd_train.training.setup import Draws, Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)

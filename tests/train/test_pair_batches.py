@@ -22,8 +22,7 @@ from gcd_train.errors import DataError, RunError
 from gcd_train.recipe import OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, LoaderRecipe
 from gcd_train.training.conditioner import Conditioner
-from gcd_train.training.draws import Draws
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
@@ -136,7 +135,7 @@ def test_batches_are_made_ahead_as_processes_share_them(
 @pytest.mark.slow
 def test_processes_give_the_batches_that_are_made_here() -> None:
     """Two spawned processes, batches in order and after a jump; what they cannot read ends as it does here."""
-    there = SampleLoader(CountedSamples(), 3, LoaderRecipe(workers=2, prefetch=2))
+    there = SampleLoader(CountedSamples(), 3, LoaderRecipe(workers=2))
     here = SampleLoader(CountedSamples(), 3, HERE)
     for number in (0, 1, 2, 9, 11, 13):
         one, other = there.batch(number, 2), here.batch(number, 2)

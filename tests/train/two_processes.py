@@ -27,11 +27,10 @@ from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, LogRecipe
 from gcd_train.training.checkpoint import SavedWeights
 from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, whole
-from gcd_train.training.draws import Draws
 from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import Batch, UNetTask, diffusion_loss
-from gcd_train.training.setup import Precision, model_config
+from gcd_train.training.setup import Draws, Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)  # one layout, so that all use the same kernels

@@ -122,13 +122,10 @@ class OrbitRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class LoaderRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How samples are made beside training.
 
-    workers: processes, 0 for none; they are started anew (spawn), so that OpenGL works in them. prefetch: batches that
-    each makes ahead. pin: hand them over in page-locked memory where there is CUDA.
+    workers: processes, 0 for none; they are started anew (spawn), so that OpenGL works in them.
     """
 
     workers: Annotated[int, Meta(ge=0)] = 0
-    prefetch: Count = 2
-    pin: bool = True
 
 
 class LeRobotRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -136,7 +133,6 @@ class LeRobotRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     cameras: tuple[str, ...] | None = None
     calibration: str | None = None
-    tolerance_s: Positive | None = None
 
 
 class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

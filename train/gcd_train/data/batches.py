@@ -6,7 +6,6 @@ augmentation noise, and targets drawn from their posterior. From latents and a c
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -24,46 +23,30 @@ from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.recipe_data import LoaderRecipe
 from gcd_train.training.conditioner import Conditioner
-from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.objective import Batch, drop_streams
-from gcd_train.training.setup import Precision
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class EncodedFrames:
-    """N frames. target: [N, C, h, w], scaled. source: [N, C, h, w], not scaled. tokens: [N, D] or None.
-
-    emphasis: [N, 1, h, w] of `class_emphasis`, or None.
-    """
-
-    target: Tensor
-    source: Tensor
-    tokens: Tensor | None
-    emphasis: Tensor | None
+from gcd_train.training.setup import Draws, Precision
 
 
 @torch.no_grad()
 def encode_frames(
     networks: Networks, recipe: UNetRecipe, source: Tensor, target: Tensor, draws: Draws
-) -> EncodedFrames:
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
     """What the frozen networks make of frames [N, 3, H, W] in [-1, 1].
 
     The augmentation is noise on the pixels that the condition encoder sees, and on nothing else; the image tower sees
-    clean frames. Source: Generative Camera Dolly, as released.
+    clean frames.
+
+    Returns: scaled target latents, source latents, image tokens [N, D] and the class emphasis of the targets, or None.
+    Source: Generative Camera Dolly, as released.
     """
     encoders = FrozenEncoders(networks=networks)
     noisy = source + recipe.augmentation * draws.normal(*source.shape)
     posterior = encoders.target(target)
     latents = posterior.sample(draws.normal(*posterior.mean.shape)) * networks.config.vae.scale
-    by_colour = COLOUR_WEIGHTS[recipe.loss.class_weights]
-    size = (latents.shape[-2], latents.shape[-1])
-    return EncodedFrames(
-        target=latents,
-        source=encoders.condition(noisy),
-        tokens=encoders.tokens(source),
-        emphasis=class_emphasis(target, by_colour, size) if by_colour else None,
-    )
+    by_colour, size = COLOUR_WEIGHTS[recipe.loss.class_weights], (latents.shape[-2], latents.shape[-1])
+    emphasis = class_emphasis(target, by_colour, size) if by_colour else None
+    return latents, encoders.condition(noisy), encoders.tokens(source), emphasis
 
 
 class EncodedBatches:
@@ -129,19 +112,18 @@ class SampleBatches:
         if given != wanted:
             raise DataError(f"samples must be T, H, W = {wanted} for this model, got {given}")
         frames, paths = config.frames, samples.paths
-        encoded = encode_frames(
-            self._networks, recipe, self._frames(samples.source), self._frames(samples.target), draws
-        )
-        condition, tokens = drop_streams(self._precision.frames(encoded.source), encoded.tokens, frames, draws, recipe)
+        pictures = self._frames(samples.source), self._frames(samples.target)
+        target, source, tokens, emphasis = encode_frames(self._networks, recipe, *pictures, draws)
+        condition, tokens = drop_streams(self._precision.frames(source), tokens, frames, draws, recipe)
         cameras = [camera for path in paths if (camera := self._conditioner.camera(path)) is not None]
         vectors = [self._vector(float(fps), path) for fps, path in zip(samples.fps, paths, strict=True)]
         names = zip(samples.scenes, loaded.numbers, strict=True)
         return Batch(
-            target=self._precision.frames(encoded.target),
+            target=self._precision.frames(target),
             condition=condition,
             vector=torch.stack(vectors).repeat_interleave(frames, dim=0).to(self._precision.device),
             tokens=tokens,
-            emphasis=encoded.emphasis,
+            emphasis=emphasis,
             frames=frames,
             camera=torch.cat(cameras).to(self._precision.device) if cameras else None,
             ids=tuple(f"{scene} (sample {number})" for scene, number in names),

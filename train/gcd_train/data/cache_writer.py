@@ -43,8 +43,8 @@ from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
 from gcd_train.data.sample import Bytes, to_network
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.parallel import Outcome, map_items
-from gcd_train.training.draws import Draws
 from gcd_train.training.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
+from gcd_train.training.setup import Draws
 
 _log = logging.getLogger(__name__)
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -114,7 +115,6 @@ class Compaction:
     def _write_views(self, reader: Kubric4D | ParallelDomain4D, scene: str, files: SceneFiles) -> list[tuple[int, str]]:
         """Time and camera of all that were written. Raises DataError."""
         written, faults = list[tuple[int, str]](), list[FileFault]()
-        encoded = self._orbit_view if self.orbits else self._street_view
         for time, camera in product(range(reader.frames(scene)), self.cameras):
             try:
                 (view,) = reader.views(scene, time, [camera])
@@ -123,7 +123,7 @@ class Compaction:
                     faults.append(fault)
                 continue
             if not faults:
-                for path, data in encoded(self.source / scene, files.folder, view, time, camera):
+                for path, data in self._encoded(self.source / scene, files.folder, view, time, camera):
                     files.write(path, data)
                 written.append((time, camera))
         if faults:
@@ -134,39 +134,27 @@ class Compaction:
             )
         return written
 
-    def _orbit_view(
+    def _encoded(
         self, source: Path, out: Path, view: SceneView, time: int, camera: str
     ) -> Iterator[tuple[Path, bytes]]:
-        def place(folder: Path, layer: kubric4d.Layer, *, compact: bool = False) -> Path:
-            return kubric4d.frame_path(folder, camera, layer, time, compact=compact)
+        """Where the pictures of a view go, and what is in them. source, out: folders of the scene."""
+        names: Any = kubric4d if self.orbits else parallel_domain4d
+        colour, ids = ("rgba", "segmentation") if self.orbits else ("rgb", "instance_segmentation_2d")
+        depth = encodings.depth_png if self.orbits else encodings.street_depth_png
 
-        _require_published(place(source, "rgba"))
-        yield place(out, "rgba", compact=True), encodings.webp(view.rgb, quality=kubric4d.WEBP_QUALITY)
-        yield place(out, "depth", compact=True), encodings.depth_png(view.depth)
-        if view.instances is not None:
-            yield place(out, "segmentation", compact=True), place(source, "segmentation").read_bytes()
+        def place(folder: Path, layer: str, *, compact: bool = True) -> Path:
+            return names.frame_path(folder, camera, layer, time, compact=compact)
 
-    def _street_view(
-        self, source: Path, out: Path, view: SceneView, time: int, camera: str
-    ) -> Iterator[tuple[Path, bytes]]:
-        def place(folder: Path, layer: parallel_domain4d.Layer, *, compact: bool = False) -> Path:
-            return parallel_domain4d.frame_path(folder, camera, layer, time, compact=compact)
-
-        _require_published(place(source, "rgb"))
-        yield place(out, "rgb", compact=True), encodings.webp(view.rgb, quality=parallel_domain4d.WEBP_QUALITY)
-        yield place(out, "depth", compact=True), encodings.street_depth_png(view.depth)
+        if not place(source, colour, compact=False).exists():
+            raise DataError(f"{place(source, colour, compact=False)} is not there: the scene is compact already")
+        yield place(out, colour), encodings.webp(view.rgb, quality=names.WEBP_QUALITY)
+        yield place(out, "depth"), depth(view.depth)
         if view.classes is not None:
             yield place(out, "semantic_segmentation_2d"), encodings.packed_id_png(view.classes)
         if view.instances is not None:
-            path = place(source, "instance_segmentation_2d")
-            small = int(view.instances.max()) < 256
-            data = encodings.packed_id_png(view.instances.astype(np.uint8)) if small else path.read_bytes()
-            yield place(out, "instance_segmentation_2d"), data
-
-
-def _require_published(path: Path) -> None:
-    if not path.exists():
-        raise DataError(f"{path} is not there: the scene is compact already")
+            small = not self.orbits and int(view.instances.max()) < 256
+            packed = encodings.packed_id_png(view.instances.astype(np.uint8)) if small else b""
+            yield place(out, ids), packed or place(source, ids).read_bytes()
 
 
 def _require_alike(packed: SceneView, view: SceneView, place: str, *, street: bool) -> None:

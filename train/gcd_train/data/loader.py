@@ -114,9 +114,8 @@ class SampleLoader:
             _Numbered(self._samples),
             batch_sampler=(order.batch(number, size) for number in numbers),
             num_workers=recipe.workers,
-            prefetch_factor=recipe.prefetch,
             collate_fn=_collated,
-            pin_memory=recipe.pin and torch.cuda.is_available(),
+            pin_memory=torch.cuda.is_available(),
             multiprocessing_context=get_context("spawn"),
             worker_init_fn=_settle,
         )

@@ -262,7 +262,6 @@ class _Opening:
             frames=self.config.frames,
             fps=self.recipe.unet.fps,
             size=(self.config.width, self.config.height),
-            tolerance_s=options.tolerance_s,
             cameras=options.cameras,
             calibration=None if options.calibration is None else Path(options.calibration),
             repeats=self._data.repeats,

@@ -18,11 +18,10 @@ from gcd_model.diffusion import RenderOptions, Schedule, preconditioning, sample
 from gcd_model.networks import Networks
 from gcd_model.unet import VideoUNet
 from gcd_train.recipe import FocalBlendName, LossRecipe, NoiseRecipe, StudentRecipe, UNetRecipe
-from gcd_train.training.draws import Draws
 from gcd_train.training.export import Validation
 from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.losses import PLAIN_BLEND, RELEASED_BLEND, FocalBlend, edm_weight, focal_fraction, frame_losses
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 from gcd_train.training.trainable import keep_trained_alone, plain_weights
 
 _BLENDS: dict[FocalBlendName, FocalBlend] = {"released": RELEASED_BLEND, "plain": PLAIN_BLEND}
