@@ -1,22 +1,55 @@
-"""A world that is made in a millisecond: a red box that stands, a green one that slides and turns, ground, sky."""
+"""Worlds that are made in a millisecond, without physics: boxes that stand, slide and turn, ground, sky."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from stage_world import LIGHT
 
 from gcd_train.data.files import SceneManifest, faults, read_manifest
 from gcd_train.errors import DataError
-from gcd_train.scenes.description import Paint, Part, Pattern, Scene, SceneObject, Sheet, square, upright
+from gcd_train.scenes.description import Light, Paint, Part, Pattern, Scene, SceneObject, Sheet, square, upright
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.worlds import SceneWorld
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneWorld
+
+LIGHT = Light(
+    sun_to=(0.0, 0.0, 1.0),
+    sun=(1.0, 1.0, 1.0),
+    sky=(0.4, 0.4, 0.4),
+    ground=(0.2, 0.2, 0.2),
+    horizon=(0.7, 0.8, 0.9),
+    zenith=(0.3, 0.5, 0.8),
+    fog_m=1e6,
+    cloud=0.0,
+    exposure=1.0,
+)
+
+
+def stage(seed: int, frames: int) -> Scene:
+    """A floor with a box that slides over it; no physics."""
+    path = np.zeros((frames, 2, 4), np.float32)
+    path[:, 1, 0] = np.arange(frames) + seed
+    floor = Part("box", (0, 0, -0.5), (60, 60, 1), Paint((0.5, 0.4, 0.3)), 1)
+    box = Part("box", (0, 0, 1), (2, 2, 2), Paint((0.2, 0.3, 0.8)), 2, instance=7, body=1)
+    return Scene(
+        parts=(floor, box),
+        sheets=(),
+        poses=upright(path),
+        focus=np.zeros((frames, 3), np.float32),
+        cameras=orbit_cameras(frames),
+        hfov_deg=HFOV_DEG,
+        light=LIGHT,
+    )
+
+
+STAGE = replace(SCENE_WORLDS["drop"], name="stage", make=stage)
+"""In Kubric-4D's layout."""
 
 RED, GREEN = 9, 4
 """Instance ids; out of order, so that renumbering shows."""
 
 
 def box_scene(seed: int, frames: int) -> Scene:
-    """Seed n: the green box is n / 10 m further to the left."""
+    """A red box that stands, a green one that slides and turns; seed n: that one is n / 10 m further to the left."""
     slide = np.zeros((frames, 3, 4), np.float32)
     slide[:, 1] = (2.0, -1.5, 1.0, 0.0)
     slide[:, 2, 0], slide[:, 2, 1], slide[:, 2, 3] = 0.5 * np.arange(frames), 2.0 + seed / 10, 0.3 * np.arange(frames)

@@ -8,10 +8,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from box_world import STAGE as FAST_STAGE
 from box_world import box_object
+from box_world import stage as fast_stage
 from headless import needs_egl
-from stage_world import STAGE as FAST_STAGE
-from stage_world import stage as fast_stage
 from tiny_world import TinyOrbits
 from typer.testing import CliRunner
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_world import STAGE, stage
 from headless import needs_egl
-from stage_world import STAGE, stage
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.encodings import SKY_M

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from box_world import LIGHT
 from headless import needs_egl
-from stage_world import LIGHT
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError

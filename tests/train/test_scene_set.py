@@ -179,22 +179,9 @@ def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
 
 def test_a_scene_of_ours_is_of_the_world_that_its_manifest_says(tmp_path: Path) -> None:
     write_kubric(tmp_path, 1_000_000, frames=4)
-    manifest = SceneManifest(
-        layout="kubric4d",
-        world="tabletop",
-        seed=1_000_000,
-        version="0",
-        edition=1,
-        frames=4,
-        fps=24.0,
-        width=48,
-        height=32,
-        oversample=1,
-        compact=False,
-        hfov_deg=53.1,
-        cameras=VIEWS,
-        files={},
-    )
+    size = {"frames": 4, "fps": 24.0, "width": 48, "height": 32, "oversample": 1, "hfov_deg": 53.1, "compact": False}
+    told = {"layout": "kubric4d", "world": "tabletop", "seed": 1_000_000, "version": "0", "edition": 1}
+    manifest = SceneManifest(**told, **size, cameras=VIEWS, files={})
     (tmp_path / "scn1000000" / MANIFEST).write_bytes(msgspec.json.encode(manifest))
     assert len(opened(tmp_path, KUBRIC, split="tabletop-test").keys) == 4
     for split in ("drop-test", "driving-test"):

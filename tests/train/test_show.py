@@ -9,9 +9,8 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from box_world import box_scene
+from box_world import STAGE, box_scene
 from headless import needs_egl
-from stage_world import STAGE
 from tiny_scenes4d import write_driving, write_kubric
 from typer.testing import CliRunner
 

@@ -1,6 +1,5 @@
 """Runs of small models that do more than show a road, at a tiny size: steered orbits, and painted classes."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from tiny_scenes4d import DRIVING_POSES, write_driving
-from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, TinyOrbits, tiny_recipe, trainer
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, TinyOrbits, measured, rendered, tiny_recipe, trainer
 from torch import Tensor
 
 from gcd_model import Clip, load_synthesizer
@@ -79,11 +78,6 @@ def painted_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def measured(run: Path) -> dict[str, dict[str, float]]:
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return {line["stage"]: line for line in lines if line["kind"] == "measured"}
-
-
 def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None:
     synthesizer = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu")
     traits, clips = synthesizer.traits, TinyOrbits(1, seed=4)
@@ -97,13 +91,10 @@ def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None
 
 
 def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run: Path) -> None:
-    synthesizer = load_synthesizer(painted_run / "tiny-painted.safetensors", device="cpu")
-    source = TinyClips(1, seed=4).sample(0).source
-    features = synthesizer.encode(Clip(video=to_network(source), fps=10.0))
-    view = synthesizer.render(features, [synthesizer.traits.plan_view()])[0]
+    view, traits = rendered(painted_run / "tiny-painted.safetensors")
     assert view.classes is not None
     assert view.classes.shape == (1, FRAMES, HEIGHT, WIDTH)
-    assert synthesizer.traits.classes == DRIVING_CLASSES
+    assert traits.classes == DRIVING_CLASSES
     assert all(0 <= measured(painted_run)[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
 
 

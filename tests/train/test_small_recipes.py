@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
+from box_world import STAGE
 from headless import needs_egl
-from stage_world import STAGE
 from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from typer.testing import CliRunner
 
