@@ -2,8 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,20 +10,15 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from fake_model import FakeModel
 from tiny_driving import write_untrained
 from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import (
-    Augmentation,
     CameraMount,
-    Clip,
-    RenderOptions,
-    SourceFeatures,
     SphericalDelta,
     Traits,
-    Trajectory,
-    View,
     load_synthesizer,
 )
 from gcd_model.config import SMALL
@@ -157,34 +151,6 @@ def test_what_is_no_video_or_too_narrow_is_refused_by_name(tmp_path: Path, conte
 # --- views ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Mirror:
-    """Gives the source back, each sample darker."""
-
-    traits: Traits
-    paths: list[Trajectory] = field(default_factory=list)
-    clips: list[Clip] = field(default_factory=list)
-
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
-    ) -> SourceFeatures:
-        self.clips.append(clip)
-        return SourceFeatures(tokens=None, latents=clip.video, extra=None, fps=clip.fps, augmentation=0.0)
-
-    def render(
-        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        self.paths += trajectories
-        assert options is not None
-        video = (features.latents + 1) / 2
-        samples = torch.stack([video * (1 - sample / 10) for sample in range(options.samples)])
-        scale = self.traits.uncertainty_scale
-        return [
-            View(samples=samples, latents=samples, trajectory=path, motion_bucket=0.0, uncertainty_scale=scale)
-            for path in trajectories
-        ]
-
-
 def a_window() -> Windowed:
     pictures = np.full((T, H, W, 3), 100, np.uint8)
     size = (W, H)
@@ -194,7 +160,7 @@ def a_window() -> Windowed:
 
 
 def test_each_angle_is_a_row_below_the_input_and_samples_come_with_their_uncertainty() -> None:
-    model = Mirror(traits())
+    model = FakeModel(traits())
     angles = (SphericalDelta(azimuth_deg=40.0), SphericalDelta(elevation_deg=20.0, radius_m=1.0))
     options = GalleryOptions(angles=["40", "0,20,1"], samples=2)
     strips = view_window(model, a_window(), options)
@@ -219,7 +185,7 @@ def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
 
 
 def test_the_live_model_knows_its_mount_where_one_is_declared_and_its_lens_without() -> None:
-    model = Mirror(load_synthesizer("random:live", device="cpu").traits)
+    model = FakeModel(load_synthesizer("random:live", device="cpu").traits)
     assert mounted(model.traits, GalleryOptions(), None) is None
     assert mounted(model.traits, GalleryOptions(mount_tilt=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
     assert mounted(traits(), GalleryOptions(mount_height=2.0), None) is None
