@@ -195,9 +195,8 @@ def _read_view(path: Path) -> _View:
     try:
         metadata = decode_json(read(path, MOST_TEXT), _Metadata)
         width, height = metadata.scene.resolution
-        (fx, _, cx), (_, fy, cy), _ = np.abs(
-            metadata.camera.K
-        ).tolist()  # shares of the picture, signs of Blender's axes
+        # shares of the picture, signs of Blender's axes
+        (fx, _, cx), (_, fy, cy), _ = np.abs(metadata.camera.K).tolist()
         lens = Intrinsics(fx=fx * width, fy=fy * height, cx=cx * width, cy=cy * height, width=width, height=height)
     except ModelError as error:
         raise FileFault(path, f"is damaged or lacks what Kubric-4D tells of a view ({error})") from error

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import torch
 
 from gcd_model.config import ModelConfig
@@ -347,17 +348,7 @@ def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sa
     move_time = data.goal_frame(frames)
     if not orbits:
         return DrivingSampling(move_time=move_time, frames=chosen)
-    orbit = data.orbit
-    return OrbitSampling(
-        max_azimuth_deg=orbit.max_azimuth_deg,
-        max_elevation_deg=orbit.max_elevation_deg,
-        max_radius_m=orbit.max_radius_m,
-        azimuth_deg=orbit.azimuth_deg,
-        elevation_deg=orbit.elevation_deg,
-        radius_m=orbit.radius_m,
-        move_time=move_time,
-        frames=chosen,
-    )
+    return OrbitSampling(**msgspec.structs.asdict(data.orbit), move_time=move_time, frames=chosen)
 
 
 def _splat_device(recipe: DataRecipe) -> str:

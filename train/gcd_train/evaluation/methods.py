@@ -356,11 +356,8 @@ def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: Evalua
         elif name in makers:
             found.append(makers[name]())
         else:
-            every = (
-                *makers,
-                VANILLA_SVD,
-                *(f"hexplane_{views}" for views in (1, 2, 4, 8)),
-            )  # any other number goes too
+            some = (f"hexplane_{number}" for number in (1, 2, 4, 8))  # any other number goes too
+            every = (*makers, VANILLA_SVD, *some)
             near = difflib.get_close_matches(name, every, n=1)
             meant = f"did you mean {near[0]}? " if near else ""
             raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")

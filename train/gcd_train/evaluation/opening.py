@@ -10,7 +10,7 @@ Release: the first clip of each scene's controls, or the script's own angles; fr
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias, get_args
 
@@ -28,6 +28,8 @@ from gcd_train.data.paths import (
     CLIP,
     DRIVING_FRAMES,
     KUBRIC_FRAMES,
+    MAX90,
+    MAX180,
     DrivingSampling,
     FrameSampling,
     OrbitSampling,
@@ -255,10 +257,7 @@ def _sampling(options: ClipOptions, clip: int, *, orbits: bool, gradual: bool) -
     move_time = None if gradual else 0
     if not orbits:
         return DrivingSampling(move_time=move_time, frames=frames)
-    azimuth_deg, elevation_deg = (180.0, 60.0) if options.angles == "max180" else (90.0, 30.0)
-    return OrbitSampling(
-        max_azimuth_deg=azimuth_deg, max_elevation_deg=elevation_deg, move_time=move_time, frames=frames
-    )
+    return replace(MAX180 if options.angles == "max180" else MAX90, move_time=move_time, frames=frames)
 
 
 def _identity(folder: Path, scenes: Sequence[str], cuts: Sequence[object], controls: Path | None) -> str:
