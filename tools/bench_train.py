@@ -29,11 +29,10 @@ from gcd_model.weights.families import FAMILIES
 from gcd_train.data.batches import encode_frames
 from gcd_train.recipe import LoraRecipe, LossRecipe, ModelRecipe, NoiseRecipe, OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
-from gcd_train.training.conditioner import Conditioner
 from gcd_train.training.distributed import recompute_blocks
 from gcd_train.training.objective import Batch, Denoiser, diffusion_loss, drop_streams
 from gcd_train.training.optimiser import ParameterGroup, build_optimiser
-from gcd_train.training.setup import Draws, Precision
+from gcd_train.training.setup import Conditioner, Draws, Precision
 from gcd_train.training.trainable import add_lora, halve_frozen, is_adapted, let_train
 
 KUBRIC_CLIPS = 10_000 * 56  # of the published recipe: iterations times batch

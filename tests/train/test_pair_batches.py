@@ -21,8 +21,7 @@ from gcd_train.data.sample import Sample
 from gcd_train.errors import DataError, RunError
 from gcd_train.recipe import OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, LoaderRecipe
-from gcd_train.training.conditioner import Conditioner
-from gcd_train.training.setup import Draws, Precision
+from gcd_train.training.setup import Conditioner, Draws, Precision
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)

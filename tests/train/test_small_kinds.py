@@ -25,9 +25,8 @@ from gcd_train.data.sample import painted as painted_clips
 from gcd_train.errors import DataError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
-from gcd_train.training.conditioner import Conditioner, mirrored_path
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.training.setup import Precision, model_config
+from gcd_train.training.setup import Conditioner, Precision, mirrored_path, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)

@@ -22,10 +22,9 @@ from gcd_train.data.sample import Samples, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.recipe_data import LoaderRecipe
-from gcd_train.training.conditioner import Conditioner
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.objective import Batch, drop_streams
-from gcd_train.training.setup import Draws, Precision
+from gcd_train.training.setup import Conditioner, Draws, Precision
 
 
 @torch.no_grad()

@@ -38,9 +38,8 @@ from gcd_train.data.cache import (
 from gcd_train.data.sample import Clips, numbers_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.recipe import LatentsRecipe, Recipe
-from gcd_train.training.conditioner import Conditioner, mirrored_path
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.training.setup import Draws, Precision, digest_of
+from gcd_train.training.setup import Conditioner, Draws, Precision, digest_of, mirrored_path
 
 _log = logging.getLogger(__name__)
 _SHARD = 32  # clips

@@ -19,6 +19,7 @@ from typer import Option
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.lerobot import CAMERA_FILE, CHUNK, CameraCalibration, CameraFile, extra
+from gcd_train.data.videos import FileLens
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.files import new_folder
 from gcd_train.scenes.drop import HFOV_DEG, orbit_cameras
@@ -326,12 +327,7 @@ def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[s
     for name in export.names:
         rows = None if name == WRIST else tuple(map(tuple, _in_metres(poses[name]).tolist()))
         made[_IMAGES + name] = CameraCalibration(
-            width=lens.width,
-            height=lens.height,
-            fx=lens.fx,
-            fy=lens.fy,
-            cx=lens.cx,
-            cy=lens.cy,
+            **{field: getattr(lens, field) for field in FileLens.__struct_fields__},
             base_from_camera=rows,
             pose_feature=_POSE_FEATURE if name == WRIST else None,
         )
