@@ -49,28 +49,25 @@ def evaluate_command(
     **options: Any,
 ) -> None:
     """Measure weights, baselines and others' frames on held-out clips, and say what is reached."""
+    asked = EvaluateOptions(**options)
     with errors_shown():
-        _evaluate(EvaluateOptions(**options), out, views=views, workers=workers, ray=ray)
-
-
-def _evaluate(options: EvaluateOptions, out: Path, *, views: KeptViews, workers: int, ray: str | None) -> None:
-    out.mkdir(parents=True, exist_ok=True)  # to know at once
-    clips, methods, notes = planned(options)
-    for line in notes:
-        say(line)
-    with RunKeeper(out).in_use(run_note(clips, methods, options, command_line())):
-        work = ClipWork(
-            folder=out.resolve(),
-            clips=clips,
-            methods={method.name: method for method in methods},
-            lpips=None if options.lpips is None else options.lpips.resolve(),
-            views=views,
-        )
-        account = _measured(work, workers, ray, options.device)
-    for line in account.lines():
-        say(line)
-    typer.echo(make_report([out], out, drawn=False).read_text())
-    say(f"wrote {out}/run.json, records, report.md, tables" + " and gallery" * (views != "none"))
+        out.mkdir(parents=True, exist_ok=True)  # to know at once
+        clips, methods, notes = planned(asked)
+        for line in notes:
+            say(line)
+        with RunKeeper(out).in_use(run_note(clips, methods, asked, command_line())):
+            work = ClipWork(
+                folder=out.resolve(),
+                clips=clips,
+                methods={method.name: method for method in methods},
+                lpips=None if asked.lpips is None else asked.lpips.resolve(),
+                views=views,
+            )
+            account = _measured(work, workers, ray, asked.device)
+        for line in account.lines():
+            say(line)
+        typer.echo(make_report([out], out, drawn=False).read_text())
+        say(f"wrote {out}/run.json, records, report.md, tables" + " and gallery" * (views != "none"))
     if account.failures:
         raise typer.Exit(TrainError.exit_code)
 

@@ -60,12 +60,8 @@ class CameraPair:
 
     @classmethod
     def orbit(cls, trajectory: Trajectory, *, hfov_deg: float, height: int, width: int) -> Self:
-        """A path over the sphere, both cameras with the same lens.
-
-        Raises: DataError if nobody says where the source camera stands.
-        """
-        if trajectory.source is None:
-            raise DataError("a path over the sphere begins at a camera: its trajectory must say where the source is")
+        """A path over the sphere, both cameras with the same lens."""
+        assert trajectory.source is not None, "a path over the sphere begins at a camera"
         lens = Intrinsics.from_hfov(hfov_deg, width, height)
         start = to_pose(trajectory.source)
         return cls(ground_from_source=start, source=lens, target=lens, trajectory=trajectory)
