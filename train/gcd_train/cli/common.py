@@ -23,10 +23,6 @@ Ray: TypeAlias = Annotated[
     str | None, typer.Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")
 ]
 Limit: TypeAlias = Annotated[int | None, typer.Option(min=1, help="Only the first so many scenes.")]
-Steps: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Steps of the sampler instead of the shipped number.")
-]
-NoiseSeed: TypeAlias = Annotated[int, typer.Option(min=0, help="Of the noise samples begin with.")]
 Device: TypeAlias = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
 Dtype: TypeAlias = Annotated[str | None, typer.Option(help="float32, bfloat16 or float16; by default as stored.")]
 FamilyName: TypeAlias = Annotated[

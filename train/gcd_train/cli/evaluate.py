@@ -14,7 +14,6 @@ from gcd_train.cli.common import (
     Device,
     Dtype,
     Limit,
-    NoiseSeed,
     Ray,
     command_line,
     errors_shown,
@@ -121,8 +120,8 @@ def calibrate_command(
         Path | None, Option(help="Also write the weights with the scale here, a new .safetensors file.")
     ] = None,
     samples: Annotated[int, Option(min=2, help="Draws of each view; the scale is for as many.")] = 4,
-    steps: common.Steps = None,
-    seed: NoiseSeed = 0,
+    steps: Annotated[int | None, Option(min=1, help="Steps of the sampler instead of the shipped number.")] = None,
+    seed: Annotated[int, Option(min=0, help="Of the noise samples begin with.")] = 0,
     split: Annotated[str | None, Option(help="Only scenes of a split, by its name such as driving-test.")] = None,
     limit: Limit = None,
     device: Device = "auto",

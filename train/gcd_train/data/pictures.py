@@ -262,15 +262,13 @@ class ViewPairs(DrawnSamples):
 
         Raises: DataError, FileFault: it cannot be read; nothing stands in for it.
         """
-        return self.pair(scene, self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps))
-
-    def pair(self, scene: str, draw: Draw) -> Sample:
-        """A sample drawn elsewhere. Raises DataError, FileFault: it cannot be read."""
+        draw = self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps)
         return self._pictures.sample(scene, draw)
 
     def _made(self, number: int, random: np.random.Generator) -> Sample:
         scene, _ = self._place(number)
-        return self.pair(scene, self.sampling.draw(random, self.dataset.frames(scene), self.dataset.fps))
+        draw = self.sampling.draw(random, self.dataset.frames(scene), self.dataset.fps)
+        return self._pictures.sample(scene, draw)
 
     def _place(self, number: int) -> tuple[str, Path]:
         scene = self.dataset.scenes[number % len(self.dataset.scenes)]
