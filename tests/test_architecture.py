@@ -28,7 +28,7 @@ MOST = [
     ("gcd_node", 59, 13_502),
     ("tests/node", 41, 12_332),
     ("train/gcd_train", 111, 26_528),
-    ("tests/train", 75, 13_690),
+    ("tests/train", 75, 13_672),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 

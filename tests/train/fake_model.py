@@ -7,7 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures, Trajectory, View
+from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures, Traits, Trajectory, View
+from gcd_model.config import ModelConfig
+from gcd_model.weights.families import FAMILIES, FamilyName
 
 Shows = Callable[[SourceFeatures, RenderOptions], Tensor]
 
@@ -49,3 +51,9 @@ class FakeModel:
         road = torch.ones(*made.shape[:2], *made.shape[-2:], dtype=torch.uint8) if self.classes else None
         given = {"samples": made, "latents": made, "classes": road, "uncertainty_scale": scale}
         return [View(**given, trajectory=path, motion_bucket=0.0) for path in trajectories]
+
+
+def traits_of(config: ModelConfig, family: FamilyName, **more: Any) -> Traits:
+    """Of a model that is at its goal in the last frame."""
+    usual = {"name": "fake", "move_time": config.frames - 1, "sha256_12": "0" * 12, "precision": "float32"}
+    return Traits(**{**usual, "device": "cpu", "config": config, "family": FAMILIES[family], **more})

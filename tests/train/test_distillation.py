@@ -6,10 +6,11 @@ from pathlib import Path
 import msgspec
 import pytest
 import torch
+from fake_model import traits_of
 from tiny_driving import smaller
 from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, measured, saved, trainer
 
-from gcd_model import Clip, RenderOptions, Traits, load_synthesizer
+from gcd_model import Clip, RenderOptions, load_synthesizer
 from gcd_model.config import SVD_14
 from gcd_model.networks import Networks, random_networks
 from gcd_model.synthesizer import Synthesizer
@@ -89,16 +90,7 @@ def test_the_student_samples_in_training_as_the_synthesizer_does(networks: Netwo
     noise = torch.randn(batch.target.shape, generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
         made = sampled(denoiser_of(deepcopy(networks).train()), batch, noise, schedule_of(networks.config, 3))
-    traits = Traits(
-        name="tiny",
-        config=networks.config,
-        family=FAMILIES["driving"],
-        move_time=FRAMES - 1,
-        sha256_12="0" * 12,
-        precision="float32",
-        device="cpu",
-    )
-    synthesizer = Synthesizer(deepcopy(networks), traits)
+    synthesizer = Synthesizer(deepcopy(networks), traits_of(networks.config, "driving"))
     features = synthesizer.encode(Clip(video=to_network(TinyClips(1).sample(0).source), fps=10.0))
     options = RenderOptions(steps=3, initial_noise=noise)
     view = synthesizer.render(features, [TinyClips(1).trajectory(0)], options)[0]

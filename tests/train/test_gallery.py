@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from fake_model import FakeModel
+from fake_model import FakeModel, traits_of
 from tiny_driving import write_untrained
 from typer import Typer
 from typer.testing import CliRunner
@@ -25,7 +25,7 @@ from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics
 from gcd_model.traits import ASSUMED_SOURCE
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.families import FAMILIES, FamilyName
 from gcd_train.cli.look import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import (
@@ -42,20 +42,12 @@ T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
 
 
-def traits(family: str = "kubric90") -> Traits:
+def traits(family: FamilyName = "kubric90") -> Traits:
     """Of a network that takes four small frames."""
     camera = FAMILIES[family].camera
     unet = SMALL.unet if camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
-    return Traits(
-        name="fake",
-        config=msgspec.structs.replace(SMALL, camera=camera, unet=unet, frames=T, height=H, width=W),
-        family=FAMILIES[family],
-        move_time=T - 1,
-        sha256_12="0" * 12,
-        precision="float32",
-        device="cpu",
-        uncertainty_scale=2.0,
-    )
+    config = msgspec.structs.replace(SMALL, camera=camera, unet=unet, frames=T, height=H, width=W)
+    return traits_of(config, family, uncertainty_scale=2.0)
 
 
 def write_video(path: Path, frames: int, fps: float, *, size: tuple[int, int] = (W, H)) -> Path:

@@ -9,13 +9,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from fake_model import traits_of
 from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
 from typer.testing import CliRunner
 
-from gcd_model import Traits
 from gcd_model.config import SVD_14
 from gcd_model.geometry import Spherical
-from gcd_model.weights.families import FAMILIES, FamilyName
+from gcd_model.weights.families import FamilyName
 from gcd_train.cli.main import app
 from gcd_train.data.files import MANIFEST, SceneManifest
 from gcd_train.data.paths import FrameSampling, OrbitSampling
@@ -83,24 +83,14 @@ def test_the_paper_goes_from_one_part_of_a_scene_seen_by_one_low_camera_to_four_
 def test_variants_of_one_table_are_measured_at_the_same_goals(kubric: Path) -> None:
     names: tuple[FamilyName, ...] = ("kubric90", "kubric180")
     options = replace(KUBRIC, data=(kubric,))
-    each = [open_clips(options, traits(name, move_time))[0] for name in names for move_time in (0, 13)]
+    each = [
+        open_clips(options, traits_of(SVD_14, name, move_time=move_time))[0] for name in names for move_time in (0, 13)
+    ]
     goals = [one.controls.control("scn02901", "sample_02", 60).goal for one in each if isinstance(one, SceneSet)]
     assert goals == [goals[0]] * 4
     assert [one.pairs.sampling.move_time for one in each if isinstance(one, SceneSet)] == [0, None] * 2
     change = goals[0] - each[0].controls.control("scn02901", "sample_02", 60).start
     assert abs(change.azimuth_deg) <= 90
-
-
-def traits(family: FamilyName, move_time: int) -> Traits:
-    return Traits(
-        name=family,
-        config=SVD_14,
-        family=FAMILIES[family],
-        move_time=move_time,
-        sha256_12="0" * 12,
-        precision="float32",
-        device="cpu",
-    )
 
 
 def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
