@@ -22,12 +22,12 @@ OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  #
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
     ("client/gcd_client", 7, 1_383),
-    ("model/gcd_model", 43, 9_603),
+    ("model/gcd_model", 43, 9_602),
     ("tests/model", 33, 6_561),
     ("gcd_node", 59, 13_501),
     ("tests/node", 37, 10_716),
-    ("train/gcd_train", 115, 25_935),
-    ("tests/train", 76, 13_875),
+    ("train/gcd_train", 110, 25_430),
+    ("tests/train", 75, 13_621),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 MOST_DOCS, MOST_README = (14, 1_900), 90

@@ -29,12 +29,10 @@ from gcd_model.weights.families import FAMILIES
 from gcd_train.data.batches import encode_frames
 from gcd_train.recipe import LoraRecipe, LossRecipe, ModelRecipe, NoiseRecipe, OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe
-from gcd_train.training.conditioner import Conditioner
 from gcd_train.training.distributed import recompute_blocks
-from gcd_train.training.draws import Draws
 from gcd_train.training.objective import Batch, Denoiser, diffusion_loss, drop_streams
 from gcd_train.training.optimiser import ParameterGroup, build_optimiser
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Conditioner, Draws, Precision
 from gcd_train.training.trainable import add_lora, halve_frozen, is_adapted, let_train
 
 KUBRIC_CLIPS = 10_000 * 56  # of the published recipe: iterations times batch
@@ -340,14 +338,14 @@ class Updates:
         source, target = (
             self.precision.frames(draws.normal(rows, 3, config.height, config.width).clamp(-1, 1)) for _ in range(2)
         )
-        made = encode_frames(self.networks, self.recipe, source, target, draws)
-        condition, tokens = drop_streams(made.source, made.tokens, config.frames, draws, self.recipe)
+        latents, encoded, images, emphasis = encode_frames(self.networks, self.recipe, source, target, draws)
+        condition, tokens = drop_streams(encoded, images, config.frames, draws, self.recipe)
         return Batch(
-            target=made.target,
+            target=latents,
             condition=condition,
-            vector=self.conditioner.vector(torch.full((rows,), 100.0), rows),
+            vector=self.conditioner.vector(torch.full((rows,), 100.0)),
             tokens=tokens,
-            emphasis=made.emphasis,
+            emphasis=emphasis,
             frames=config.frames,
             camera=draws.normal(rows, 13),
         )

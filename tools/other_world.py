@@ -18,7 +18,7 @@ from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_train.data.sample import to_network
 from gcd_train.live.clips import clip_paths, evenly, read_clip
 from gcd_train.live.training import live_model
-from gcd_train.look.gallery import WindowChoice, find_videos, read_windows
+from gcd_train.look.gallery import GalleryOptions, find_videos, read_windows
 
 _ASSUMED_HFOV_DEG = 70.0
 """Of a video whose lens nobody knows."""
@@ -50,7 +50,7 @@ def other_scores(synthesizer: LiveSynthesizer, paths: Sequence[Path], windows: i
     traits = synthesizer.traits
     lens = Intrinsics.from_hfov(_ASSUMED_HFOV_DEG, traits.config.width, traits.config.height)
     for video in find_videos(paths):
-        for window in read_windows(video, traits, WindowChoice(count=windows)):
+        for window in read_windows(video, traits, GalleryOptions(windows=windows)):
             yield f"{window.name} at {window.start_s:.1f} s", score(synthesizer, to_network(window.pictures), lens)
 
 

@@ -72,7 +72,7 @@ def cached(folder: Path, pictures: FakePictures | None = None, **identity: objec
     pictures = pictures or FakePictures()
     job = CacheJob(folder=folder, pictures=pictures, choice=CHOICE, identity=tiny_identity(**identity))  # pyright: ignore[reportArgumentType]
     with only_writer(folder):
-        return list(cache_scenes(job, missing_scenes(job, pictures.scenes)))
+        return list(cache_scenes(job, missing_scenes(job)))
 
 
 # a child that kills itself at the n-th time something settles on the disk

@@ -62,7 +62,6 @@ def plane_clip(cameras: CameraPair, phase: float = 0.0) -> PairedClip:
         source_classes=_bytes(s_labels),
         target_classes=_bytes(t_labels),
         source_instances=_bytes(0 * s_labels),
-        target_instances=_bytes(0 * t_labels),
         seed=0,
     )
 
@@ -142,7 +141,7 @@ def _strips(clip: PairedClip) -> dict[str, np.ndarray]:
         strips[f"{side}.rgb"] = getattr(clip, side)[..., ::-1]
         strips[f"{side}.depth"] = np.rint(getattr(clip, f"{side}_depth") / DEPTH_UNIT_M).astype(np.uint16)
         strips[f"{side}.classes"] = getattr(clip, f"{side}_classes")
-        strips[f"{side}.instances"] = getattr(clip, f"{side}_instances")
+        strips[f"{side}.instances"] = clip.source_instances
     return {kind: np.ascontiguousarray(np.concatenate(frames)) for kind, frames in strips.items()}
 
 

@@ -1,6 +1,5 @@
 """Baselines: the flat ground against rays, the published reprojections, Stable Video Diffusion; all by their names."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -9,15 +8,16 @@ import numpy as np
 import pytest
 import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, plane_clip, seen_of
+from fake_model import FakeModel
 from msgspec import structs
 from test_start import given, write
 
-from gcd_model import CheckpointError, RenderOptions, Traits, Trajectory, View, load_synthesizer
-from gcd_model.clip import Augmentation, Clip
+from gcd_model import CheckpointError, RenderOptions, load_synthesizer
 from gcd_model.conditioning import SourceFeatures
 from gcd_model.config import SamplingConfig
 from gcd_model.geometry import CameraMount, SphericalDelta, spherical_trajectory
 from gcd_train.data.pairs import PairedClip
+from gcd_train.data.visibility import visibility
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.baselines import (
     GroundHomography,
@@ -31,7 +31,6 @@ from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.methods import EvaluateOptions, baselines
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, Predictor, SourceClip, to_pictures
-from gcd_train.pointcloud import visibility
 
 FRAMES, HEIGHT, WIDTH = 3, 64, 96
 
@@ -116,7 +115,7 @@ def shown(video: torch.Tensor) -> torch.Tensor:
 def test_what_it_shows_is_what_the_published_rule_calls_visible() -> None:
     for t, view in enumerate(source_views(SEEN)):
         pose = PAIR.source_from_target[t].numpy()
-        rule = visibility(view, pose, PAIR.target, width=WIDTH, height=HEIGHT)
+        rule = visibility(view, pose, PAIR.target, (WIDTH, HEIGHT))
         assert np.array_equal(shown(picture())[t].numpy(), rule)
 
 
@@ -170,38 +169,15 @@ def first_of(frames: int = 4, key: str = "plane-0") -> SourceClip:
     return seen_of(PlaneClips.make(1, frames=frames)[0], source_classes=None, fps=7.0, key=key)
 
 
-class Told:
-    """Notes what a synthesizer is asked; shows the mean of what it was given, and noise by the seed."""
-
-    def __init__(self, traits: Traits) -> None:
-        self.traits = traits
-        self.clips: list[Clip] = []
-        self.features: list[SourceFeatures] = []
-        self.options: list[RenderOptions] = []
-
-    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
-        self.clips.append(clip)
-        assert augmentation.noise.shape == clip.video.shape
-        latents = clip.video.mean(dim=1, keepdim=True).expand(-1, 4, -1, -1)
-        return SourceFeatures(tokens=None, latents=latents, fps=clip.fps, augmentation=0.02)
-
-    def render(
-        self,
-        features: SourceFeatures,
-        trajectories: Sequence[Trajectory],
-        options: RenderOptions | None = None,
-    ) -> list[View]:
-        self.features.append(features)
-        self.options.append(options)
-        assert torch.equal(trajectories[0].source_from_target[-1], torch.eye(4, dtype=torch.float64))
-        noise = torch.rand(features.frames, 3, 8, 12, generator=torch.Generator().manual_seed(options.seed)) / 2
-        video = noise + (features.latents.mean() + 1) / 4
-        return [View(samples=video[None], latents=video[None], trajectory=trajectories[0], motion_bucket=0.0)]
+def by_the_seed(features: SourceFeatures, options: RenderOptions) -> torch.Tensor:
+    """Noise, and the mean of what was given: [1, T, 3, 8, 12]."""
+    noise = torch.rand(1, features.frames, 3, 8, 12, generator=torch.Generator().manual_seed(options.seed)) / 2
+    return noise + (features.latents.mean() + 1) / 4
 
 
 @pytest.fixture
-def told(opened: VanillaSVD) -> Told:
-    return Told(opened.weights().traits)
+def told(opened: VanillaSVD) -> FakeModel:
+    return FakeModel(opened.weights().traits, by_the_seed)
 
 
 def video(baseline: VanillaSVD, clip: SourceClip) -> torch.Tensor:
@@ -216,7 +192,7 @@ def test_the_published_layout_gives_a_video_of_the_clips_size_and_length(opened:
     assert (opened.name, opened.privileged) == ("vanilla_svd", False)
 
 
-def test_it_looks_at_the_first_frame_alone(told: Told) -> None:
+def test_it_looks_at_the_first_frame_alone(told: FakeModel) -> None:
     clip, baseline = first_of(), VanillaSVD(weights=lambda: told, size=SIZE)
     others = clip.source.copy()
     others[1:] = 255 - others[1:]
@@ -226,7 +202,7 @@ def test_it_looks_at_the_first_frame_alone(told: Told) -> None:
     assert not torch.equal(video(baseline, clip), video(baseline, blind))
 
 
-def test_draws_differ_and_come_again_with_the_seed(told: Told) -> None:
+def test_draws_differ_and_come_again_with_the_seed(told: FakeModel) -> None:
     baseline = VanillaSVD(weights=lambda: told, size=SIZE)
     several = replace(baseline, samples=3)
     draws = [draw.video for draw in several.predict(first_of()).draws if draw.video is not None]
@@ -240,10 +216,11 @@ def test_draws_differ_and_come_again_with_the_seed(told: Told) -> None:
     assert not torch.equal(draws[0], video(baseline, first_of(key="plane-1")))
 
 
-def test_the_network_is_told_what_was_published(told: Told) -> None:
+def test_the_network_is_told_what_was_published(told: FakeModel) -> None:
     VanillaSVD(weights=lambda: told).predict(first_of(frames=3))
     (clip,), (features,), (options,) = told.clips, told.features, told.options
-    assert clip.video.shape == (1, 3, 576, 1024)
+    assert clip.video.shape == told.noise[0].noise.shape == (1, 3, 576, 1024)
+    assert torch.equal(told.paths[0].source_from_target[-1], torch.eye(4, dtype=torch.float64))
     assert (clip.fps, options.motion_bucket, options.samples) == (7.0, 127.0, 1)
     assert features.frames == 14
     assert torch.equal(features.latents[13], features.latents[0])

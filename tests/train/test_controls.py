@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gcd_train.data.files import FileFault, Skips
+from gcd_train.data.files import Skips
 from gcd_train.data.splits import Part, kubric_split, read_controls, read_scene_list, read_split
 from gcd_train.errors import DataError
 
@@ -118,13 +118,6 @@ def test_skips_are_counted_logged_once_and_merged(caplog: pytest.LogCaptureFixtu
     assert skips.lines(most=1) == ["scene_a: a.png is missing", "and 1 more"]
     caplog.clear()
     assert [str(Skips(logged=False).add("scene_a", "a.png", "is gone")), caplog.text] == ["scene_a: a.png is gone", ""]
-
-
-def test_a_fault_survives_the_way_between_processes() -> None:
-    import pickle
-
-    fault = pickle.loads(pickle.dumps(FileFault(Path("a.png"), "is missing")))
-    assert (str(fault), fault.path, fault.reason) == ("a.png is missing", Path("a.png"), "is missing")
 
 
 @needs_official

@@ -20,8 +20,7 @@ from gcd_train.data.paths import DrivingSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import LossRecipe, Recipe
 from gcd_train.recipe_data import DataRecipe, FramesRecipe, OrbitRecipe
-from gcd_train.training.draws import Draws
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CONFIG = ModelConfig(frames=3, height=32, width=48)
@@ -131,7 +130,7 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     run = open_data(told, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
     assert run.batches is not None
     precision = Precision(torch.device("cpu"), half=False, channels_last=False)
-    batch = run.batches(networks, precision).whole_clips(Draws(1, "unet", 0, torch.device("cpu")), 2)
+    batch = run.batches(networks, precision).batch(Draws(1, "unet", 0, torch.device("cpu")), 2)
     assert batch.target.shape[0] == 2 * CLIP
     assert len(batch.ids) == 2
     assert batch.wait_s is not None

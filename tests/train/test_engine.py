@@ -22,18 +22,17 @@ from gcd_train.recipe_data import Budget, ComputeRecipe
 from gcd_train.recipe_files import load_recipe, packaged_recipes
 from gcd_train.training.checkpoint import newest_weights
 from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, recompute_blocks, stages_of
-from gcd_train.training.draws import Draws
 from gcd_train.training.loop import Loop, Progress, StepLoss
 from gcd_train.training.loop import Task as BaseTask
 from gcd_train.training.monitor import RunFolder
-from gcd_train.training.setup import Precision, model_config
+from gcd_train.training.setup import Draws, Precision, model_config
 
 
 def gradients(unet: VideoUNet) -> tuple[dict[str, torch.Tensor], int]:
     """The gradient of each weight, and how often a block was computed."""
     runs: list[int] = []
     watched = [stage.res.register_forward_pre_hook(lambda *_: runs.append(1)) for stage in stages_of(unet)]
-    batch = Noise().whole_clips(Draws(0, "x", 0, torch.device("cpu")), 1)
+    batch = Noise().batch(Draws(0, "x", 0, torch.device("cpu")), 1)
     plan = unet.plan(torch.ones(1, FRAMES), batch.vector, None, None)
     unet(batch.target, batch.condition, *plan.step(0)).square().mean().backward()
     for hook in watched:

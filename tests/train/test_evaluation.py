@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 from driving_plane import STAGE_SOURCE, PlaneClips, evaluated
+from fake_model import FakeModel
 
-from gcd_model import Clip, RenderOptions, Trajectory, View
-from gcd_model.clip import Augmentation
-from gcd_model.conditioning import SourceFeatures
+from gcd_model import Trajectory
 from gcd_model.config import DRIVING_CLASSES, SMALL, ModelConfig, SemanticClass
 from gcd_model.geometry import CameraMount, Spherical, SphericalDelta, driving_trajectory, spherical_trajectory
 from gcd_model.weights.families import FAMILIES, Family
@@ -49,52 +48,13 @@ class FakeTraits:
         return spherical_trajectory(source, delta, frames=frames, move_time=self.move_time)
 
 
-@dataclass
-class FakeSynthesizer:
-    """Gives the source back as view, and road everywhere as class map; keeps what it was asked."""
-
-    traits: FakeTraits
-    clips: list[Clip] = field(default_factory=list)
-    paths: list[Trajectory] = field(default_factory=list)
-    options: list[RenderOptions] = field(default_factory=list)
-
-    @property
-    def steps(self) -> list[int | None]:
-        return [each.steps for each in self.options]
-
-    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> Clip:
-        assert augmentation is None
-        self.clips.append(clip)
-        return clip
-
-    def render(
-        self, features: SourceFeatures, trajectories: list[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        (path,) = trajectories
-        self.paths.append(path)
-        self.options.append(options)
-        clip = self.clips[-1]
-        assert features is clip
-        classes = torch.ones(options.samples, clip.frames, *clip.video.shape[-2:], dtype=torch.uint8)
-        each = [(clip.video + 1) / 2 * (1 - 0.1 * number) for number in range(options.samples)]
-        return [
-            View(
-                samples=torch.stack(each),
-                latents=torch.zeros(1),
-                trajectory=path,
-                motion_bucket=0.0,
-                classes=classes if self.traits.classes else None,
-            )
-        ]
-
-
-def fake(clips: PlaneClips, classes: tuple[SemanticClass, ...] = DRIVING_CLASSES) -> FakeSynthesizer:
+def fake(clips: PlaneClips, classes: tuple[SemanticClass, ...] = DRIVING_CLASSES) -> FakeModel:
     config = msgspec.structs.replace(SMALL, frames=clips.frames, height=clips.height, width=clips.width)
     if clips.camera == "none":
         config = msgspec.structs.replace(
             config, camera="none", unet=msgspec.structs.replace(config.unet, camera_width=0)
         )
-    return FakeSynthesizer(FakeTraits(config=config, classes=classes))
+    return FakeModel(FakeTraits(config=config, classes=classes), classes=bool(classes))
 
 
 def test_the_target_itself_is_perfect_and_its_first_frame_is_not_looked_at() -> None:
@@ -127,7 +87,8 @@ def test_a_model_gets_the_clip_in_its_own_range_and_its_shipped_settings() -> No
     assert first.video.amin() >= -1
     assert first.video.amin() < 0
     assert synthesizer.traits.asked == [None, None]
-    assert synthesizer.steps == [None, None]
+    assert [each.steps for each in synthesizer.options] == [None, None]
+    assert synthesizer.noise == [None, None]
 
 
 def test_the_live_model_is_told_the_mount() -> None:
@@ -171,7 +132,10 @@ def test_a_model_that_paints_classes_is_compared_by_its_class_map_alone() -> Non
     (found,) = evaluated([SynthesizedViews.of(lambda: synthesizer, clips)], clips)
     assert np.isnan(found.value("psnr_db"))
     assert found.class_iou()[1] > 0
-    synthesizer.traits.classes = ()  # as in the published files: then the clips say what the colours mean
+    synthesizer.traits.classes, synthesizer.classes = (
+        (),
+        False,
+    )  # as in the published files: then the clips say what the colours mean
     (read,) = evaluated([SynthesizedViews.of(lambda: synthesizer, clips)], clips)
     assert np.isnan(read.value("psnr_db"))
     assert not np.isnan(read.value("miou_full"))

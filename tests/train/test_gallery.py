@@ -2,8 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,33 +10,26 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from fake_model import FakeModel, traits_of
 from tiny_driving import write_untrained
 from typer import Typer
 from typer.testing import CliRunner
 
 from gcd_model import (
-    Augmentation,
     CameraMount,
-    Clip,
-    RenderOptions,
-    SourceFeatures,
-    Spherical,
     SphericalDelta,
     Traits,
-    Trajectory,
-    View,
     load_synthesizer,
 )
 from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics
 from gcd_model.traits import ASSUMED_SOURCE
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.families import FAMILIES, FamilyName
 from gcd_train.cli.look import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import (
-    ViewRecipe,
-    WindowChoice,
+    GalleryOptions,
     Windowed,
     find_videos,
     mounted,
@@ -50,20 +42,12 @@ T, H, W = 4, 32, 64
 REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
 
 
-def traits(family: str = "kubric90") -> Traits:
+def traits(family: FamilyName = "kubric90") -> Traits:
     """Of a network that takes four small frames."""
     camera = FAMILIES[family].camera
     unet = SMALL.unet if camera != "none" else msgspec.structs.replace(SMALL.unet, camera_width=0)
-    return Traits(
-        name="fake",
-        config=msgspec.structs.replace(SMALL, camera=camera, unet=unet, frames=T, height=H, width=W),
-        family=FAMILIES[family],
-        move_time=T - 1,
-        sha256_12="0" * 12,
-        precision="float32",
-        device="cpu",
-        uncertainty_scale=2.0,
-    )
+    config = msgspec.structs.replace(SMALL, camera=camera, unet=unet, frames=T, height=H, width=W)
+    return traits_of(config, family, uncertainty_scale=2.0)
 
 
 def write_video(path: Path, frames: int, fps: float, *, size: tuple[int, int] = (W, H)) -> Path:
@@ -81,9 +65,9 @@ def numbers(window: Windowed) -> list[int]:
     return [round(float(frame.mean()) / 4) for frame in window.pictures]
 
 
-def windows_of(path: Path, choice: WindowChoice | None = None, family: str = "kubric90") -> tuple[Windowed, ...]:
+def windows_of(path: Path, options: GalleryOptions | None = None, family: str = "kubric90") -> tuple[Windowed, ...]:
     (video,) = find_videos([path])
-    return read_windows(video, traits(family), choice or WindowChoice())
+    return read_windows(video, traits(family), options or GalleryOptions())
 
 
 @pytest.mark.parametrize(
@@ -98,27 +82,27 @@ def windows_of(path: Path, choice: WindowChoice | None = None, family: str = "ku
 def test_frames_come_at_the_highest_trained_rate(
     tmp_path: Path, fps: float, family: str, told: float, expected: list[int]
 ) -> None:
-    (window,) = windows_of(write_video(tmp_path / "a.avi", 12, fps), WindowChoice(count=1), family)
+    (window,) = windows_of(write_video(tmp_path / "a.avi", 12, fps), GalleryOptions(windows=1), family)
     assert (window.fps, window.trained_rate) == (told, True)
     assert numbers(window) == expected
 
 
 def test_windows_reach_from_the_start_to_the_end_and_do_not_overlap(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.avi", 20, 10.0)
-    choice = WindowChoice(count=3, start_s=0.2)
+    choice = GalleryOptions(windows=3, start=0.2)
     assert [numbers(window) for window in windows_of(path, choice, "driving")] == [
         [2, 3, 4, 5],
         [9, 10, 11, 12],
         [16, 17, 18, 19],
     ]
-    many = windows_of(path, WindowChoice(count=99), "driving")
+    many = windows_of(path, GalleryOptions(windows=99), "driving")
     assert [number for window in many for number in numbers(window)] == list(range(20))
 
 
 def test_a_folder_of_pictures_is_a_video_in_the_order_of_names(tmp_path: Path) -> None:
     for number in (11, 9, 10, 8):
         cv2.imwrite(str(tmp_path / f"im_{number}.png"), np.full((H, W, 3), 4 * number, np.uint8))
-    (window,) = windows_of(tmp_path, WindowChoice(rate=10.0), "driving")
+    (window,) = windows_of(tmp_path, GalleryOptions(rate=10.0), "driving")
     assert numbers(window) == [8, 9, 10, 11]
     with pytest.raises(DataError, match="give it with --rate"):
         windows_of(tmp_path)
@@ -132,7 +116,7 @@ def test_what_is_wider_than_trained_is_cut_off(
     tmp_path: Path, hfov: float | None, width: int, kept: float | None
 ) -> None:
     path = write_video(tmp_path / "a.avi", 6, 24.0, size=(width, H))
-    window = windows_of(path, WindowChoice(hfov_deg=hfov))[0]
+    window = windows_of(path, GalleryOptions(hfov_deg=hfov))[0]
     assert window.pictures.shape == (T, H, W, 3)
     assert window.hfov_deg == (None if kept is None else pytest.approx(kept, abs=1.5))
 
@@ -153,36 +137,10 @@ def test_what_is_no_video_or_too_narrow_is_refused_by_name(tmp_path: Path, conte
     else:
         path.write_bytes(content)
     with pytest.raises(DataError, match=rf"broken.mp4:? {said}"):
-        windows_of(path, WindowChoice(rate=10.0))
+        windows_of(path, GalleryOptions(rate=10.0))
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Mirror:
-    """Gives the source back, each sample darker."""
-
-    traits: Traits
-    paths: list[Trajectory] = field(default_factory=list)
-    clips: list[Clip] = field(default_factory=list)
-
-    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
-        self.clips.append(clip)
-        return SourceFeatures(tokens=None, latents=clip.video, fps=clip.fps, augmentation=0.0)
-
-    def render(
-        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        self.paths += trajectories
-        assert options is not None
-        video = (features.latents + 1) / 2
-        samples = torch.stack([video * (1 - sample / 10) for sample in range(options.samples)])
-        scale = self.traits.uncertainty_scale
-        return [
-            View(samples=samples, latents=samples, trajectory=path, motion_bucket=0.0, uncertainty_scale=scale)
-            for path in trajectories
-        ]
 
 
 def a_window() -> Windowed:
@@ -194,9 +152,10 @@ def a_window() -> Windowed:
 
 
 def test_each_angle_is_a_row_below_the_input_and_samples_come_with_their_uncertainty() -> None:
-    model = Mirror(traits())
+    model = FakeModel(traits())
     angles = (SphericalDelta(azimuth_deg=40.0), SphericalDelta(elevation_deg=20.0, radius_m=1.0))
-    strips = view_window(model, a_window(), ViewRecipe(angles=angles, samples=2))
+    options = GalleryOptions(angles=["40", "0,20,1"], samples=2)
+    strips = view_window(model, a_window(), options)
     assert [path.goal_delta for path in model.paths] == list(angles)
     assert all(len(strip.frames) == T for strip in strips)
     assert np.array_equal(strips[1].frames[0], strips[0].frames[0])
@@ -209,23 +168,21 @@ def test_each_angle_is_a_row_below_the_input_and_samples_come_with_their_uncerta
 
 
 def test_goals_are_counted_from_where_the_source_camera_stands() -> None:
-    high = ViewRecipe(
-        angles=(SphericalDelta(azimuth_deg=40.0),), source=Spherical(azimuth_deg=0.0, elevation_deg=50.0, radius_m=15.0)
-    )
-    usual, told = (paths(traits(), each)[0][1] for each in (replace(high, source=None), high))
+    high = GalleryOptions(angles=["40"], source_elevation_deg=50.0)
+    usual, told = (paths(traits(), each)[0][1] for each in (replace(high, source_elevation_deg=None), high))
     assert (usual.source, told.source) == (ASSUMED_SOURCE, high.source)
     assert not torch.allclose(usual.source_from_target[-1], told.source_from_target[-1], atol=0.5)
     with pytest.raises(OptionError):
-        paths(traits("driving"), replace(high, angles=()))
+        paths(traits("driving"), replace(high, angles=None))
 
 
 def test_the_live_model_knows_its_mount_where_one_is_declared_and_its_lens_without() -> None:
-    model = Mirror(load_synthesizer("random:live", device="cpu").traits)
-    assert mounted(model.traits, ViewRecipe(), None) is None
-    assert mounted(model.traits, ViewRecipe(tilt_deg=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
-    assert mounted(traits(), ViewRecipe(height_m=2.0), None) is None
+    model = FakeModel(load_synthesizer("random:live", device="cpu").traits)
+    assert mounted(model.traits, GalleryOptions(), None) is None
+    assert mounted(model.traits, GalleryOptions(mount_tilt=4.0), 60.0) == CameraMount(tilt_deg=4.0, hfov_deg=60.0)
+    assert mounted(traits(), GalleryOptions(mount_height=2.0), None) is None
     for window in (replace(a_window(), hfov_deg=60.0), a_window()):
-        view_window(model, window, ViewRecipe())
+        view_window(model, window, GalleryOptions())
     assert [clip.lens for clip in model.clips] == [Intrinsics.from_hfov(60.0, W, H), None]
 
 

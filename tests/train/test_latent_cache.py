@@ -47,8 +47,7 @@ from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.recipe import LossRecipe
-from gcd_train.training.draws import Draws
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 
 CPU = torch.device("cpu")
 
@@ -139,7 +138,7 @@ def test_batches_tell_each_clip_its_own_frame_rate(folder: Path) -> None:
     networks = random_weights("driving", frames=CLIP).networks
     precision = Precision(CPU, half=False, channels_last=False)
     source = CachedBatches(cache, networks, unet, precision, "gradual")
-    batch = source.whole_clips(draws(), 6)
+    batch = source.batch(draws(), 6)
     assert batch.target.shape == batch.condition.shape == (6 * CLIP, 4, HEIGHT // 8, WIDTH // 8)
     assert batch.tokens is not None
     assert batch.tokens.shape[0] == 6 * CLIP
@@ -147,7 +146,7 @@ def test_batches_tell_each_clip_its_own_frame_rate(folder: Path) -> None:
     per_clip = batch.vector.unflatten(0, (6, CLIP))
     assert bool((per_clip == per_clip[:, :1]).all())
     assert len(set(per_clip[:, 0].sum(-1).tolist())) == 2  # 10 and 5 frames a second
-    again = source.whole_clips(draws(), 6)
+    again = source.batch(draws(), 6)
     assert torch.equal(batch.target, again.target)
     assert torch.equal(batch.condition, again.condition)
 

@@ -13,6 +13,7 @@ from box_world import HFOV_DEG, box_scene
 
 from gcd_model.geometry import Intrinsics, sphere_poses
 from gcd_train.data import encodings, kubric4d, parallel_domain4d
+from gcd_train.data.dataset4d import layout_of
 from gcd_train.data.encodings import (
     FAR_M,
     NEAR_M,
@@ -80,8 +81,7 @@ class TestNames:
 
     @pytest.mark.parametrize("name", ["scn1", "scene_12", ".scn00001.partial", "scn00001x", "test"])
     def test_other_folders_are_no_scenes(self, name: str) -> None:
-        assert kubric4d.scene_number(name) is None
-        assert parallel_domain4d.scene_number(name) is None
+        assert layout_of(name) is None
 
 
 class TestDepthCode:

@@ -21,7 +21,6 @@ from gcd_train.data.files import FileFault
 from gcd_train.data.lerobot import CAMERA_FILE, CameraCalibration, LeRobotPairs
 from gcd_train.data.lerobot_export import (
     LeRobotWriter,
-    LoggedEpisode,
     TabletopExport,
     export_tabletop,
 )
@@ -67,27 +66,37 @@ def _pictures(episode: int, rows: int) -> Iterator[Mapping[str, np.ndarray]]:
         yield {name: _picture(episode, row, camera) for camera, name in enumerate((LEFT, RIGHT, HAND))}
 
 
-def _episode(number: int) -> LoggedEpisode:
+def _episode(number: int) -> tuple[dict[str, np.ndarray], str]:
+    """Features and task."""
     poses = np.stack([_pose(0.05 * row + number) for row in range(ROWS)])
     state = np.arange(ROWS * 2).reshape(ROWS, 2) / 10
-    return LoggedEpisode(
-        features={"observation.state": state, "action": state + 0.1, POSE: poses.reshape(ROWS, 16)},
-        task=f"task {number % 2}",
-    )
+    return {"observation.state": state, "action": state + 0.1, POSE: poses.reshape(ROWS, 16)}, f"task {number % 2}"
 
 
-def _write(folder: Path, episodes: int = 3, episodes_a_file: int = 2) -> Path:
-    with LeRobotWriter(
-        folder, _calibrations(), robot="test", fps=FPS, names={}, episodes_a_file=episodes_a_file, crf=4
-    ) as writer:
-        for number in range(episodes):
-            writer.add(_episode(number), _pictures(number, ROWS))
+def _write(folder: Path, *numbers: int) -> Path:
+    with LeRobotWriter(folder, _calibrations(), robot="test", fps=FPS, names={}, crf=4) as writer:
+        for number in numbers:
+            writer.add(*_episode(number), _pictures(number, ROWS))
     return folder
 
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _write(tmp_path_factory.mktemp("lerobot") / "set")
+    """Episodes 0 and 1 in the first files, 2 in files of its own, as LeRobot goes on after so many bytes."""
+    folder, other = (tmp_path_factory.mktemp("lerobot") / name for name in ("set", "other"))
+    _write(folder, 0, 1)
+    _write(other, 2)
+    first, second = "chunk-000/file-000", "chunk-000/file-001"
+    rows = pq.read_table(other / f"meta/episodes/{first}.parquet").to_pylist()
+    rows = [row | {"episode_index": 2} | {key: 1 for key in row if key.endswith("file_index")} for row in rows]
+    pq.write_table(pa.Table.from_pylist(rows), folder / f"meta/episodes/{second}.parquet")
+    data = pq.read_table(other / f"data/{first}.parquet")
+    number = pa.array(np.full(ROWS, 2))
+    data = data.set_column(data.column_names.index("episode_index"), "episode_index", number)
+    pq.write_table(data, folder / f"data/{second}.parquet")
+    for name in (LEFT, RIGHT, HAND):
+        shutil.copy(other / f"videos/{name}/{first}.mp4", folder / f"videos/{name}/{second}.mp4")
+    return folder
 
 
 @pytest.fixture
@@ -127,7 +136,7 @@ def test_an_episode_that_is_learned_from_is_never_measured_on(made: Path, copied
     for same in (made, copied):
         with pytest.raises(DataError, match="episode_000000, episode_000001, episode_000002"):
             opened(same)
-    other = _write(tmp_path / "other", episodes=1)
+    other = _write(tmp_path / "other", 0)
     assert (len(opened(other).clips), len(opened(other).valid)) == (3 * data.repeats, 1)
 
 
@@ -155,24 +164,25 @@ def test_a_lower_rate_takes_the_rows_nearest_in_time(made: Path) -> None:
         _only(made, LEFT, RIGHT, fps=30.0)
 
 
-def test_the_layout_is_that_of_version_three(made: Path) -> None:
+def test_the_layout_is_that_of_version_three(tmp_path: Path) -> None:
+    made = _write(tmp_path, 0, 1)
     info = json.loads((made / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0"
-    assert [info["total_episodes"], info["total_frames"], info["total_tasks"]] == [3, 60, 2]
+    assert [info["total_episodes"], info["total_frames"], info["total_tasks"]] == [2, 40, 2]
     files = {str(path.relative_to(made)) for path in made.rglob("*") if path.is_file()}
     assert files == {
         "meta/info.json",
         "meta/stats.json",
         "meta/tasks.parquet",
         CAMERA_FILE,
-        *(f"{room}/chunk-000/file-00{k}.parquet" for room in ("data", "meta/episodes") for k in (0, 1)),
-        *(f"videos/{name}/chunk-000/file-00{k}.mp4" for name in (LEFT, RIGHT, HAND) for k in (0, 1)),
+        *(f"{room}/chunk-000/file-000.parquet" for room in ("data", "meta/episodes")),
+        *(f"videos/{name}/chunk-000/file-000.mp4" for name in (LEFT, RIGHT, HAND)),
     }
     rows = pq.read_table(made / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [row["dataset_from_index"] for row in rows] == [0, 20]
     assert [row[f"videos/{LEFT}/from_timestamp"] for row in rows] == [0.0, 1.0]
-    data = pq.read_table(made / "data/chunk-000/file-001.parquet")
-    assert data["index"].to_pylist() == list(range(40, 60))
+    data = pq.read_table(made / "data/chunk-000/file-000.parquet")
+    assert data["index"].to_pylist() == list(range(40))
     assert set(data.column_names) | {LEFT, RIGHT, HAND} == set(info["features"])
     tasks = pq.read_table(made / "meta/tasks.parquet")
     assert tasks.to_pydict() == {"task_index": [0, 1], "task": ["task 0", "task 1"]}
@@ -240,16 +250,6 @@ def test_a_wrong_calibration_is_named(copied: Path, change: dict[str, Any], said
     with pytest.raises(FileFault, match=said) as caught:
         LeRobotPairs(copied)
     assert caught.value.path == copied / CAMERA_FILE
-
-
-def _skipped(folder: Path, **changes: Any) -> str:
-    """What sample 0 says was left out; its episode is the first, the others are whole."""
-    pairs = _only(folder, LEFT, RIGHT, **changes)
-    assert pairs.episodes[0].name == "episode_000000"
-    sample = pairs.sample(0)
-    assert sample.scene == "episode_000002"
-    assert pairs.skips.total == len(sample.skipped) > 0
-    return str(sample.skipped[0])
 
 
 @pytest.mark.parametrize("package", ["av", "pyarrow"])
@@ -324,7 +324,12 @@ SPOILT: dict[str, tuple[str, Callable[[Path], object], str]] = {
 def test_what_cannot_be_read_is_skipped_and_named(name: str, copied: Path) -> None:
     file, spoil, said = SPOILT[name]
     spoil(copied / file)
-    skipped = _skipped(copied, tolerance_s=0.01)
+    pairs = _only(copied, LEFT, RIGHT)
+    assert pairs.episodes[0].name == "episode_000000"
+    sample = pairs.sample(0)  # of the first episode; of the others the last is whole
+    assert sample.scene == "episode_000002"
+    assert pairs.skips.total == len(sample.skipped) > 0
+    skipped = str(sample.skipped[0])
     assert str(copied / file) in skipped
     assert said in skipped
 
@@ -357,7 +362,9 @@ def test_a_wrong_description_is_named(copied: Path, change: dict[str, object], s
 def test_a_tabletop_episode_is_exported_and_read_back(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
     out = tmp_path / "robot"
-    export = TabletopExport(seeds=range(3, 4), frames=20, cameras=("view0", "wrist"), width=64, height=48, oversample=1)
+    export = TabletopExport(
+        episodes=1, first_seed=3, frames=20, cameras="view0,wrist", width=64, height=48, oversample=1
+    )
     assert list(export_tabletop(out, export)) == [1]
     assert [path.name for path in tmp_path.iterdir()] == ["robot"]
     sample = LeRobotPairs(out, size=(64, 48)).sample(0)

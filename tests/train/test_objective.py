@@ -15,9 +15,8 @@ from gcd_model.weights.families import FAMILIES
 from gcd_train.data.batches import SampleBatches
 from gcd_train.data.sample import to_network
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe
-from gcd_train.training.draws import Draws
 from gcd_train.training.objective import Batch, Denoiser, diffusion_loss, draw_noise, draw_sigma, drop_streams
-from gcd_train.training.setup import Precision, model_config
+from gcd_train.training.setup import Draws, Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
@@ -115,14 +114,6 @@ def test_frames_of_a_clip_share_as_much_noise_as_the_recipe_says(shared: float, 
     assert (noise[0] * noise[1]).mean().item() == pytest.approx(0.0, abs=0.05)
 
 
-def test_conditioning_is_dropped_frame_by_frame_one_time_in_ten() -> None:
-    recipe = tiny_recipe().unet
-    assert recipe.dropout == 0.1
-    kept, _ = drop_streams(torch.ones(20000, 2, 1, 1), None, 4, draws(), recipe)
-    assert torch.equal(kept[:, 0], kept[:, 1])  # the whole row or nothing
-    assert 1 - kept.mean().item() == pytest.approx(0.1, abs=0.01)
-
-
 def pixel_batch(augmentation: float, dropout: float = 0.0) -> tuple[Batch, Networks, Tensor]:
     networks = tiny_networks("v")
     recipe = tiny_recipe().unet
@@ -131,7 +122,7 @@ def pixel_batch(augmentation: float, dropout: float = 0.0) -> tuple[Batch, Netwo
     )
     source = to_network(TinyClips(1).sample(0).source)
     batches = SampleBatches(TinyClips(1), networks, changed, FAMILIES["driving"], PRECISION)
-    return batches.whole_clips(draws(), 1), networks, source
+    return batches.batch(draws(), 1), networks, source
 
 
 @pytest.mark.parametrize("strength", [0.02, 0.0])

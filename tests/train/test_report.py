@@ -10,14 +10,10 @@ import numpy as np
 import pytest
 from driving_plane import PlaneClips
 from made_records import FRAMES, note, record, region
+from tiny_driving import write_untrained
 from typer.testing import CliRunner
 
-from gcd_model.config import PLAIN_SMALL
 from gcd_model.geometry import SphericalDelta
-from gcd_model.networks import random_networks
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
-from gcd_model.weights.load import save_weights
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
@@ -402,12 +398,8 @@ def evaluated(out: Path, *arguments: object) -> tuple[dict[str, float], str]:
 
 
 def test_weights_are_evaluated_from_the_command_line(tmp_path: Path) -> None:
-    once = msgspec.structs.replace(PLAIN_SMALL.sampling, steps=1)
-    config = msgspec.structs.replace(PLAIN_SMALL, frames=4, height=32, width=64, sampling=once)
-    card = Card(name="untrained", config=config, family=FAMILIES["driving"], move_time=3, trained=False)
-    save_weights(random_networks(config, seed=0), tmp_path / "untrained.safetensors", card)
     held_out = PlaneClips.make(1, width=64).write(tmp_path / "a")
-    given = ("--weights", tmp_path / "untrained.safetensors", "--no-baselines", "--views", "none")
+    given = ("--weights", write_untrained(tmp_path), "--no-baselines", "--views", "none")
     found, output = evaluated(tmp_path / "out", "--data", held_out, *given, "--steps", 1, "--steps", 2)  # 1 as shipped
     assert list(found) == ["untrained", "untrained (2 steps)"]
     assert 0 < found["untrained"] < 30

@@ -9,20 +9,20 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from fake_model import traits_of
 from tiny_scenes4d import draw, kubric_poses, write_driving, write_kubric
 from typer.testing import CliRunner
 
-from gcd_model import Traits
 from gcd_model.config import SVD_14
 from gcd_model.geometry import Spherical
-from gcd_model.weights.families import FAMILIES, FamilyName
+from gcd_model.weights.families import FamilyName
 from gcd_train.cli.main import app
 from gcd_train.data.files import MANIFEST, SceneManifest
 from gcd_train.data.paths import FrameSampling, OrbitSampling
+from gcd_train.data.splits import RELEASED_SOURCE, SceneControls, public_split, public_splits, released_controls
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, SceneSet
-from gcd_train.evaluation.opening import ClipOptions, open_clips, public_split, public_splits
-from gcd_train.evaluation.protocol import RELEASED_SOURCE, SceneControls, released_controls
+from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.store import read_run
 
 SCENES = ("scn02900", "scene_000005")
@@ -83,24 +83,14 @@ def test_the_paper_goes_from_one_part_of_a_scene_seen_by_one_low_camera_to_four_
 def test_variants_of_one_table_are_measured_at_the_same_goals(kubric: Path) -> None:
     names: tuple[FamilyName, ...] = ("kubric90", "kubric180")
     options = replace(KUBRIC, data=(kubric,))
-    each = [open_clips(options, traits(name, move_time))[0] for name in names for move_time in (0, 13)]
+    each = [
+        open_clips(options, traits_of(SVD_14, name, move_time=move_time))[0] for name in names for move_time in (0, 13)
+    ]
     goals = [one.controls.control("scn02901", "sample_02", 60).goal for one in each if isinstance(one, SceneSet)]
     assert goals == [goals[0]] * 4
     assert [one.pairs.sampling.move_time for one in each if isinstance(one, SceneSet)] == [0, None] * 2
     change = goals[0] - each[0].controls.control("scn02901", "sample_02", 60).start
     assert abs(change.azimuth_deg) <= 90
-
-
-def traits(family: FamilyName, move_time: int) -> Traits:
-    return Traits(
-        name=family,
-        config=SVD_14,
-        family=FAMILIES[family],
-        move_time=move_time,
-        sha256_12="0" * 12,
-        precision="float32",
-        device="cpu",
-    )
 
 
 def test_the_released_script_makes_one_clip_of_its_own_angles() -> None:
@@ -179,22 +169,9 @@ def test_lists_and_splits_choose_scenes(kubric: Path, tmp_path: Path) -> None:
 
 def test_a_scene_of_ours_is_of_the_world_that_its_manifest_says(tmp_path: Path) -> None:
     write_kubric(tmp_path, 1_000_000, frames=4)
-    manifest = SceneManifest(
-        layout="kubric4d",
-        world="tabletop",
-        seed=1_000_000,
-        version="0",
-        edition=1,
-        frames=4,
-        fps=24.0,
-        width=48,
-        height=32,
-        oversample=1,
-        compact=False,
-        hfov_deg=53.1,
-        cameras=VIEWS,
-        files={},
-    )
+    size = {"frames": 4, "fps": 24.0, "width": 48, "height": 32, "oversample": 1, "hfov_deg": 53.1, "compact": False}
+    told = {"layout": "kubric4d", "world": "tabletop", "seed": 1_000_000, "version": "0", "edition": 1}
+    manifest = SceneManifest(**told, **size, cameras=VIEWS, files={})
     (tmp_path / "scn1000000" / MANIFEST).write_bytes(msgspec.json.encode(manifest))
     assert len(opened(tmp_path, KUBRIC, split="tabletop-test").keys) == 4
     for split in ("drop-test", "driving-test"):

@@ -188,7 +188,7 @@ def test_a_scene_of_ours_is_wholly_seen_from_where_its_source_stands(compact: bo
     footage = opened(tmp_path / "scn00000")
     assert footage.target_is.startswith("rendered")
     assert footage.seen_shares[0] > 0.9
-    points = opened(tmp_path / "scn00000", exact=False)
+    points = opened(tmp_path / "scn00000", points=True)
     assert points.target_depth is None
     assert np.abs(points.target[0].astype(int) - footage.target[0]).mean() < 8
 

@@ -113,7 +113,7 @@ def test_lerobot_trains_on_pairs_of_cameras(tmp_path: Path) -> None:
     pytest.importorskip("av", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
     from test_lerobot import _write  # pyright: ignore[reportPrivateUsage]
 
-    folder = _write(tmp_path / "data")
+    folder = _write(tmp_path / "data", 0, 1, 2)
     require_learned(trained("lerobot", folder, tmp_path / "run", {"data.held_out": 1}))
     traits = load_synthesizer(tmp_path / "run" / "lerobot-small.safetensors").traits
     assert traits.config.camera == "relative_pose"

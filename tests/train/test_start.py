@@ -18,9 +18,8 @@ from gcd_model.weights.save import gcd_state, write_published
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import LossRecipe, ModelRecipe, NoiseRecipe
 from gcd_train.recipe_files import load_recipe
-from gcd_train.training.draws import Draws
 from gcd_train.training.objective import Batch, Denoiser, diffusion_loss
-from gcd_train.training.setup import Precision, fresh_networks, model_config, start_networks
+from gcd_train.training.setup import Draws, Precision, fresh_networks, model_config, start_networks
 from gcd_train.training.trainable import is_temporal, keep_trained_alone, let_train
 
 CPU = torch.device("cpu")

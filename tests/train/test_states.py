@@ -74,15 +74,15 @@ def states(path: Path) -> list[str]:
     return sorted(file.name for file in (path / "unet" / "states").iterdir())
 
 
-def test_the_newest_states_are_kept_and_those_of_every_so_many_updates(tmp_path: Path) -> None:
-    run(tmp_path, 9, msgspec.structs.replace(LOG, keep=2, keep_every=4))
-    assert states(tmp_path) == ["0000004", "0000008", "0000009"]
-
-
-def test_without_keep_every_only_the_newest_stay(tmp_path: Path) -> None:
-    for updates in range(1, 6):
-        run(tmp_path, updates, msgspec.structs.replace(LOG, keep_every=None))
-    assert states(tmp_path) == ["0000003", "0000004", "0000005"]
+@pytest.mark.parametrize(
+    ("keep_every", "kept"), [(4, ["0000004", "0000008", "0000009"]), (None, ["0000008", "0000009"])]
+)
+def test_the_newest_states_are_kept_and_those_of_every_so_many_updates(
+    tmp_path: Path, keep_every: int | None, kept: list[str]
+) -> None:
+    for updates in (8, 9) if keep_every is None else (9,):
+        run(tmp_path, updates, msgspec.structs.replace(LOG, keep=2, keep_every=keep_every))
+    assert states(tmp_path) == kept
 
 
 def truncate(path: Path) -> None:

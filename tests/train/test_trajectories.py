@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -168,23 +169,20 @@ def test_a_driving_control_says_frames_only() -> None:
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("sampling", "options"),
     [
-        {"elevation_deg": (50.0, 0.0)},
-        {"elevation_deg": (0.0, 91.0)},
-        {"radius_m": (0.0, 5.0)},
-        {"max_azimuth_deg": -1.0},
+        (OrbitSampling, {"elevation_deg": (50.0, 0.0)}),
+        (OrbitSampling, {"elevation_deg": (0.0, 91.0)}),
+        (OrbitSampling, {"radius_m": (0.0, 5.0)}),
+        (OrbitSampling, {"max_azimuth_deg": -1.0}),
+        *((FrameSampling, options) for options in ({"clip": 0}, {"strides": ()}, {"strides": (0,)}, {"reverse": 1.5})),
     ],
 )
-def test_bounds_that_mean_nothing_are_refused(options: dict[str, object]) -> None:
+def test_bounds_and_clips_that_mean_nothing_are_refused(
+    sampling: type[OrbitSampling | FrameSampling], options: dict[str, Any]
+) -> None:
     with pytest.raises(RecipeError):
-        OrbitSampling(**options)  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize("options", [{"clip": 0}, {"strides": ()}, {"strides": (0,)}, {"reverse": 1.5}])
-def test_clips_that_mean_nothing_are_refused(options: dict[str, object]) -> None:
-    with pytest.raises(RecipeError):
-        FrameSampling(**options)  # pyright: ignore[reportArgumentType]
+        sampling(**options)
 
 
 def test_short_scenes_take_the_strides_that_fit() -> None:

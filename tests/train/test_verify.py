@@ -37,7 +37,7 @@ def test_whole_scenes_are_counted(scenes: Path) -> None:
 
 
 @needs_egl
-def test_every_damaged_file_is_named(scenes: Path) -> None:
+def test_every_damaged_file_and_a_scene_without_a_manifest_are_named(scenes: Path) -> None:
     changed, missing = (kubric4d.frame_path(scenes / "scn00001", view, "depth", 0) for view in ("view0", "view1"))
     changed.write_bytes(changed.read_bytes()[:-1] + b"x")
     missing.unlink()
@@ -50,14 +50,9 @@ def test_every_damaged_file_is_named(scenes: Path) -> None:
         "1 of 2 scenes are as they were written; delete the others and run the line that made them again"
     ]
     assert verified(scenes / "scn00000").exit_code == 0
-
-
-@needs_egl
-def test_a_scene_without_a_manifest_is_named(scenes: Path) -> None:
     (scenes / "scn00000" / MANIFEST).unlink()
     told = verified(scenes)
-    assert told.exit_code == DataError.exit_code
-    assert f"{scenes / 'scn00000'} has no {MANIFEST}" in told.stdout
+    assert (told.exit_code, f"{scenes / 'scn00000'} has no {MANIFEST}" in told.stdout) == (DataError.exit_code, True)
 
 
 def test_folders_without_scenes_are_refused(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, Control, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, ViewPairs, trained_lens, trained_picture
 from gcd_train.data.sample import Sample, collate
+from gcd_train.data.visibility import render_lens
 from gcd_train.errors import DataError, RenderError
-from gcd_train.pointcloud import render_lens
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CAMERAS = tuple(DRIVING_POSES)
@@ -247,16 +247,6 @@ def test_a_scene_without_its_class_layer_is_left_out(two_scenes: Path) -> None:
     sample = driving_pairs(two_scenes, modality="classes").sample(0)
     assert sample.scene == "scene_000009"
     assert "lacks its layer semantic_segmentation_2d" in sample.skipped[0].reason
-
-
-def test_a_sample_is_the_same_in_any_order(kubric: Kubric4D) -> None:
-    first, second = (ViewPairs(kubric, ORBIT, 2, PictureOptions(size=SIZE)) for _ in range(2))
-    ahead = [first.sample(index) for index in (0, 1)]
-    back = [second.sample(index) for index in (1, 0)][::-1]
-    for one, other in zip(ahead, back, strict=True):
-        np.testing.assert_array_equal(one.target, other.target)
-        assert one.frame_numbers == other.frame_numbers
-    assert not np.array_equal(ahead[0].target, ahead[1].target)
 
 
 def test_a_short_scene_is_left_out_by_name(two_scenes: Path) -> None:

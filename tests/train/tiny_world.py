@@ -1,5 +1,6 @@
 """Clips, networks and recipes small enough to train in a second."""
 
+import json
 from pathlib import Path
 from threading import Event
 
@@ -8,6 +9,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
+from gcd_model import Clip, Traits, View, load_synthesizer
 from gcd_model.config import DRIVING_CLASSES, CameraControl
 from gcd_model.geometry import (
     CameraMount,
@@ -18,7 +20,7 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_train.data.open import RunData
-from gcd_train.data.sample import Clips, Sample
+from gcd_train.data.sample import Clips, Sample, to_network
 from gcd_train.recipe import Recipe
 from gcd_train.training.checkpoint import SavedWeights, newest_weights
 from gcd_train.training.monitor import RunFolder
@@ -144,6 +146,20 @@ def trainer(
         stop=stop or Event(),
         latents=latents,
     )
+
+
+def measured(run: Path) -> dict[str, dict[str, float]]:
+    """The last measurement of each stage of a run."""
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return {line["stage"]: line for line in lines if line["kind"] == "measured"}
+
+
+def rendered(weights: Path, number: int = 0) -> tuple[View, Traits]:
+    """What a weight file makes of a clip that it has not seen."""
+    synthesizer = load_synthesizer(weights, device="cpu")
+    source = to_network(TinyClips(1, seed=4).sample(number).source)
+    features = synthesizer.encode(Clip(video=source, fps=10.0))
+    return synthesizer.render(features, [synthesizer.traits.plan_view()])[0], synthesizer.traits
 
 
 def saved(stage_folder: Path, stage: str) -> SavedWeights:

@@ -27,11 +27,10 @@ from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, LogRecipe
 from gcd_train.training.checkpoint import SavedWeights
 from gcd_train.training.distributed import ALONE, Engine, Processes, processes_of, whole
-from gcd_train.training.draws import Draws
 from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import Batch, UNetTask, diffusion_loss
-from gcd_train.training.setup import Precision, model_config
+from gcd_train.training.setup import Draws, Precision, model_config
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)  # one layout, so that all use the same kernels
@@ -42,13 +41,8 @@ UPDATES = 3  # the first two on single frames, which leave out the layers across
 class Noise:
     """Batches of nothing but noise. See BatchSource."""
 
-    def single_frames(self, draws: Draws, count: int) -> Batch:
-        return self._batch(draws, count, 1)
-
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
-        return self._batch(draws, count * FRAMES, FRAMES)
-
-    def _batch(self, draws: Draws, rows: int, frames: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
+        rows, frames = (count, 1) if single else (count * FRAMES, FRAMES)
         unet = model_config(tiny_recipe().model).unet
         return Batch(
             target=draws.normal(rows, unet.latent_channels, 4, 8),
@@ -121,8 +115,8 @@ class TwiceTheBatch(Task):
         recipe = self._recipe
         draws = BothDraws([Draws(self._seed, "unet", 2 * progress.updates + part, CPU) for part in (0, 1)])
         single = progress.share < recipe.image_share
-        made = self._batches.single_frames if single else self._batches.whole_clips
-        batch = made(draws, 2 * (recipe.image_batch if single else recipe.clip_batch))  # pyright: ignore
+        count = 2 * (recipe.image_batch if single else recipe.clip_batch)
+        batch = self._batches.batch(draws, count, single=single)  # pyright: ignore
         return diffusion_loss(
             self.network, batch, draws, PRECISION,  # pyright: ignore
             noise=recipe.noise, loss=recipe.loss, channel_weights=None, step=progress.updates,

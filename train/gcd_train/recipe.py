@@ -294,6 +294,8 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     export: ExportRecipe = ExportRecipe()
 
     def __post_init__(self) -> None:
+        if self.unet.source != "latents" and self.unet.image_share:
+            raise ValueError('unet.source "pixels" and a latent cache take whole clips only; set image_share to 0')
         if self.unet.source == "latents" and self.latents is None:
             raise ValueError('unet.source "latents" needs a [latents] table')
         if self.unet.source == "latents" and self.latents is not None:

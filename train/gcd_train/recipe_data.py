@@ -122,13 +122,10 @@ class OrbitRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class LoaderRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How samples are made beside training.
 
-    workers: processes, 0 for none; they are started anew (spawn), so that OpenGL works in them. prefetch: batches that
-    each makes ahead. pin: hand them over in page-locked memory where there is CUDA.
+    workers: processes, 0 for none; they are started anew (spawn), so that OpenGL works in them.
     """
 
     workers: Annotated[int, Meta(ge=0)] = 0
-    prefetch: Count = 2
-    pin: bool = True
 
 
 class LeRobotRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -136,7 +133,6 @@ class LeRobotRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     cameras: tuple[str, ...] | None = None
     calibration: str | None = None
-    tolerance_s: Positive | None = None
 
 
 class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -150,7 +146,7 @@ class DataRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     path: "gradual" moves all the way through the clip, "direct" stands at the goal from the first frame on.
     move_time: the frame in which a gradual move is done, the last if left out.
     exact: draw from the geometry that our own scenes keep, instead of from points. published: points with the
-    approximations of the release (distance to depth, see `pointcloud`); otherwise without.
+    approximations of the release (distance to depth, see `data.visibility`); otherwise without.
     splat_device: where points are drawn; "cuda" is the process's own GPU.
     cameras: views to draw points from, all published ones if left out.
     split, split_file, held_out: what is measured on where no --valid is given. "published": Kubric-4D by number (0-2799

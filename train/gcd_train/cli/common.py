@@ -6,8 +6,10 @@ import sys
 from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import MISSING, fields
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias, get_type_hints
 
 import typer
 from rich.console import Console
@@ -21,10 +23,6 @@ Ray: TypeAlias = Annotated[
     str | None, typer.Option("--ray", help="Run on this Ray cluster (auto, HOST:PORT; extra `cluster`).")
 ]
 Limit: TypeAlias = Annotated[int | None, typer.Option(min=1, help="Only the first so many scenes.")]
-Steps: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Steps of the sampler instead of the shipped number.")
-]
-NoiseSeed: TypeAlias = Annotated[int, typer.Option(min=0, help="Of the noise samples begin with.")]
 Device: TypeAlias = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:N.")]
 Dtype: TypeAlias = Annotated[str | None, typer.Option(help="float32, bfloat16 or float16; by default as stored.")]
 FamilyName: TypeAlias = Annotated[
@@ -97,3 +95,29 @@ def stop_as_by_ctrl_c() -> None:
 def command_line() -> str:
     """As it could be typed again."""
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def with_fields_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command, beside its own options, one for each field of a dataclass, which it gets by keyword.
+
+    A field is annotated as an option of a command: `Annotated[int, typer.Option(help=...)]`.
+    """
+
+    def changed(command: Callable[..., None]) -> Callable[..., None]:
+        hints, own = get_type_hints(kind, include_extras=True), list(signature(command).parameters.values())
+        more = [
+            Parameter(
+                field.name,
+                Parameter.KEYWORD_ONLY,
+                default=Parameter.empty if field.default is MISSING else field.default,
+                annotation=hints[field.name],
+            )
+            for field in fields(kind)
+        ]
+        each = [*more, *(parameter for parameter in own if parameter.kind is not Parameter.VAR_KEYWORD)]
+        each = [parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in each]
+        command.__signature__ = Signature(each)  # pyright: ignore[reportFunctionMemberAccess]
+        command.__annotations__ = {parameter.name: parameter.annotation for parameter in each}
+        return command
+
+    return changed

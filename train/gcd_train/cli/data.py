@@ -2,15 +2,13 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from gcd_model import printable
 from gcd_train.cli.common import (
-    Device,
-    FamilyName,
     Limit,
     Ray,
     Workers,
@@ -18,27 +16,16 @@ from gcd_train.cli.common import (
     progress_bar,
     say,
     stop_as_by_ctrl_c,
+    with_fields_of,
 )
-from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.data.cache import CacheIndex, ClipPlan, only_writer, read_index
-from gcd_train.data.cache_writer import (
-    CacheJob,
-    DrivingPictures,
-    EncoderChoice,
-    cache_scenes,
-    identity_of,
-    load_encoders,
-    missing_scenes,
-)
+from gcd_train.data.cache import CacheIndex, only_writer, read_index
+from gcd_train.data.cache_writer import CacheJob, CacheOptions, cache_job, cache_scenes, missing_scenes
 from gcd_train.data.compact import Compaction
-from gcd_train.data.dataset4d import Dataset4D
-from gcd_train.data.files import MANIFEST, Skips, faults
+from gcd_train.data.dataset4d import layout_of
+from gcd_train.data.files import MANIFEST, faults
 from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
-from gcd_train.data.parallel_domain4d import ParallelDomain4D
-from gcd_train.data.pictures import PictureOptions
-from gcd_train.data.splits import Part, present, read_split
-from gcd_train.errors import DataError, RecipeError
+from gcd_train.errors import DataError
 from gcd_train.files import remove_leftovers
 from gcd_train.parallel import map_items, one_thread_each
 
@@ -125,45 +112,24 @@ def verify_command(
 
 def _scenes_of(place: Path) -> list[Path]:
     """The folder itself if it is a scene, else the scenes in it."""
-    if (place / MANIFEST).exists() or _is_scene_name(place.resolve().name):
+    if (place / MANIFEST).exists() or layout_of(place.resolve().name):
         return [place]
     if not place.is_dir():
         raise DataError(f"{place} is no folder; give scene folders, or the folder that `gcd-train generate` filled")
-    inside = sorted(path for path in place.iterdir() if _is_scene_name(path.name))
+    inside = sorted(path for path in place.iterdir() if layout_of(path.name))
     if not inside:
         raise DataError(f"{place} holds no scene (scnNNNNN, scene_NNNNNN) and is none; give another folder")
     return inside
 
 
-def _is_scene_name(name: str) -> bool:
-    return kubric4d.scene_number(name) is not None or parallel_domain4d.scene_number(name) is not None
-
-
 @export.command()
+@with_fields_of(TabletopExport)
 def lerobot(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set, new or empty.")],
-    episodes: Annotated[int, typer.Option(min=1, help="How many episodes, one seed each.")] = 10,
-    first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
-    frames: Annotated[int, typer.Option(min=2, help="Time steps of an episode, at 24 Hz.")] = 120,
-    width: Annotated[int, typer.Option(min=32, help="Of the pictures, pixels, even.")] = 320,
-    height: Annotated[int, typer.Option(min=32, help="Of the pictures, pixels, even.")] = 240,
-    cameras: Annotated[
-        str, typer.Option(help="Two or more of view0 to view15 and wrist, with commas.")
-    ] = "view0,view4,view9,wrist",
-    oversample: Annotated[int, typer.Option(min=1, max=4, help="Anti-aliasing: pixels drawn per pixel and side.")] = 2,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set, new or empty.")], **options: Any
 ) -> None:
     """Tabletop episodes as a LeRobot data set (v3.0) with calibrated cameras (extras `scenes` and `lerobot`)."""
-    if width % 2 or height % 2:
-        raise typer.BadParameter(f"H.264 wants an even width and height, got {width} x {height}")
-    wanted = TabletopExport(
-        seeds=range(first_seed, first_seed + episodes),
-        frames=frames,
-        cameras=tuple(name.strip() for name in cameras.split(",")),
-        width=width,
-        height=height,
-        oversample=oversample,
-    )
-    with errors_shown(), progress_bar("episodes", episodes, keep=True) as show:
+    wanted = TabletopExport(**options)
+    with errors_shown(), progress_bar("episodes", wanted.episodes, keep=True) as show:
         for done in export_tabletop(out, wanted):
             show(done)
     say(f"wrote {out}; look at it with `gcd-train lerobot {out}`")
@@ -194,73 +160,25 @@ def lerobot_command(
             tell(line)
 
 
+@with_fields_of(CacheOptions)
 def cache(
     data: Annotated[
         Path, typer.Argument(metavar="DATA", help="Folder with scene_000000 and so on (ParallelDomain-4D's layout).")
     ],
-    weights: Annotated[
-        str,
-        typer.Option(
-            help="Checkpoint with the encoders: a path, package:NAME; random:driving, small ones, to try it out."
-        ),
-    ],
     out: Annotated[Path, typer.Option(help="Folder of the cache; run the same line again to go on.")],
     workers: Workers = 1,
     ray: Ray = None,
-    split: Annotated[
-        Part | None, typer.Option(help="Part of the set, needs --split-file; the whole set if left out.")
-    ] = None,
-    split_file: Annotated[Path | None, typer.Option(help="JSON with the scenes of train, val and test.")] = None,
-    copies: Annotated[int, typer.Option(min=1, help="Differently noised latents of every source frame.")] = 4,
-    path: Annotated[
-        Literal["gradual", "direct", "both"],
-        typer.Option(help="Clips to encode for: the camera moves (gradual), or is there at once (direct)."),
-    ] = "both",
-    semantic: Annotated[bool, typer.Option("--semantic", help="Targets show the classes instead of colour.")] = False,
-    exact: Annotated[
-        bool, typer.Option("--exact", help="Draw targets from geometry.npz, which generated scenes have.")
-    ] = False,
-    limit: Limit = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the pixel noise.")] = 0,
-    family: FamilyName = None,
-    device: Device = "auto",
-    dtype: Annotated[str, typer.Option(help="Type the encoders run in: float32, bfloat16 or float16.")] = "float32",
-    batch: Annotated[
-        int, typer.Option(min=1, help="Pictures in one call of the encoder; changes memory, not the latents.")
-    ] = 2,
+    **options: Any,
 ) -> None:
     """Encode a driving set once, so that training never runs the frozen encoders again."""
     with errors_shown():
-        choice = EncoderChoice(weights=weights, family=family, device=device, dtype=dtype, batch=batch)
-        config = load_encoders(choice)[0].networks.config
-        plan = ClipPlan(clip_frames=config.frames, paths=("gradual", "direct") if path == "both" else (path,))
-        scenes = _cached_set(data, split, split_file, limit, semantic)
-        modality = "classes" if semantic else "rgb"
-        drawn = PictureOptions(size=(config.width, config.height), modality=modality, exact=exact)
-        pictures = DrivingPictures(scenes, config.frames, drawn)
-        identity = identity_of(choice, pictures, plan, copies=copies, seed=seed)
-        _cache(CacheJob(folder=out, pictures=pictures, choice=choice, identity=identity), workers, ray)
-
-
-def _cached_set(
-    root: Path, split: Part | None, split_file: Path | None, limit: int | None, semantic: bool
-) -> Dataset4D:
-    data = ParallelDomain4D(root, classes=semantic)
-    if (split is None) != (split_file is None):
-        raise RecipeError("a part of the set is named with both --split and --split-file; give both or neither")
-    scenes = data.scenes
-    if split_file is not None and split is not None:
-        skips = Skips()
-        scenes = present(read_split(split_file, split), data.scenes, skips, split_file)
-        for line in skips.lines():
-            say(line)
-    return data.only(scenes[:limit])
+        _cache(cache_job(data, out, CacheOptions(**options)), workers, ray)
 
 
 def _cache(job: CacheJob, workers: int, ray: str | None) -> None:
     folder, scenes, failed = job.folder, job.pictures.scenes, 0
     with only_writer(folder), progress_bar("scenes", len(scenes), keep=True) as show:
-        missing = missing_scenes(job, scenes)
+        missing = missing_scenes(job)
         show(there := len(scenes) - len(missing))
         outcomes = cache_scenes(job, missing, workers=workers, ray_address=ray)
         for number, outcome in enumerate(outcomes, start=there + 1):

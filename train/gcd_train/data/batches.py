@@ -6,7 +6,6 @@ augmentation noise, and targets drawn from their posterior. From latents and a c
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,55 +16,36 @@ from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
 from gcd_model.weights.families import Family
 from gcd_train.data.cache import CachedLatents, FrozenEncoders, PathKind, encoders_digest
-from gcd_train.data.latents import LatentClips, LatentRows
-from gcd_train.data.loader import LoadedBatch, SampleLoader
+from gcd_train.data.latents import LatentClips
+from gcd_train.data.loader import SampleLoader
 from gcd_train.data.sample import Samples, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import UNetRecipe
 from gcd_train.recipe_data import LoaderRecipe
-from gcd_train.training.conditioner import Conditioner
-from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.objective import Batch, drop_streams
-from gcd_train.training.setup import Precision
-
-_WHOLE_CLIPS = 'unet.source "pixels" and a latent cache take whole clips only; set image_share to 0'
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class EncodedFrames:
-    """N frames. target: [N, C, h, w], scaled. source: [N, C, h, w], not scaled. tokens: [N, D] or None.
-
-    emphasis: [N, 1, h, w] of `class_emphasis`, or None.
-    """
-
-    target: Tensor
-    source: Tensor
-    tokens: Tensor | None
-    emphasis: Tensor | None
+from gcd_train.training.setup import Conditioner, Draws, Precision
 
 
 @torch.no_grad()
 def encode_frames(
     networks: Networks, recipe: UNetRecipe, source: Tensor, target: Tensor, draws: Draws
-) -> EncodedFrames:
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
     """What the frozen networks make of frames [N, 3, H, W] in [-1, 1].
 
     The augmentation is noise on the pixels that the condition encoder sees, and on nothing else; the image tower sees
-    clean frames. Source: Generative Camera Dolly, as released.
+    clean frames.
+
+    Returns: scaled target latents, source latents, image tokens [N, D] and the class emphasis of the targets, or None.
+    Source: Generative Camera Dolly, as released.
     """
     encoders = FrozenEncoders(networks=networks)
     noisy = source + recipe.augmentation * draws.normal(*source.shape)
     posterior = encoders.target(target)
     latents = posterior.sample(draws.normal(*posterior.mean.shape)) * networks.config.vae.scale
-    by_colour = COLOUR_WEIGHTS[recipe.loss.class_weights]
-    size = (latents.shape[-2], latents.shape[-1])
-    return EncodedFrames(
-        target=latents,
-        source=encoders.condition(noisy),
-        tokens=encoders.tokens(source),
-        emphasis=class_emphasis(target, by_colour, size) if by_colour else None,
-    )
+    by_colour, size = COLOUR_WEIGHTS[recipe.loss.class_weights], (latents.shape[-2], latents.shape[-1])
+    emphasis = class_emphasis(target, by_colour, size) if by_colour else None
+    return latents, encoders.condition(noisy), encoders.tokens(source), emphasis
 
 
 class EncodedBatches:
@@ -75,29 +55,22 @@ class EncodedBatches:
         self._clips, self._recipe, self._precision = clips, recipe, precision
         self._conditioner = Conditioner(config, recipe, precision)
 
-    def single_frames(self, draws: Draws, count: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """See BatchSource."""
-        return self._batch(
-            draws, draws.below(self._clips.meta.clips, count), draws.below(self._clips.meta.frames, count), 1
-        )
-
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
-        """See BatchSource."""
-        frames = self._clips.meta.frames
-        return self._batch(
-            draws, draws.below(self._clips.meta.clips, count), torch.arange(frames).repeat(count), frames
-        )
-
-    def _batch(self, draws: Draws, clips: Tensor, frames: Tensor, per_clip: int) -> Batch:
-        flip = draws.below(self._clips.meta.flips, clips.shape[0]).bool()
+        meta = self._clips.meta
+        clips = draws.below(meta.clips, count)
+        frames = draws.below(meta.frames, count) if single else torch.arange(meta.frames).repeat(count)
+        per_clip = 1 if single else meta.frames
+        flip = draws.below(meta.flips, count).bool()
         rows = self._clips.rows(
             clips.repeat_interleave(per_clip), frames, flip.repeat_interleave(per_clip), self._precision.device
         )
-        condition, _ = drop_streams(self.condition(rows), None, per_clip, draws, self._recipe)
+        source = self._precision.frames(rows.source)
+        condition, _ = drop_streams(source, None, per_clip, draws, self._recipe)
         return Batch(
             target=self._precision.frames(rows.target),
             condition=condition,
-            vector=self.vector(rows),
+            vector=self._conditioner.vector(rows.motion),
             tokens=None,
             emphasis=rows.emphasis,
             frames=per_clip,
@@ -105,32 +78,12 @@ class EncodedBatches:
             ids=self._clips.names(clips),
         )
 
-    def vector(self, rows: LatentRows) -> Tensor:
-        """Micro-conditioning of some frames, [N, V]."""
-        return self._conditioner.vector(rows.motion, rows.target.shape[0])
 
-    def condition(self, rows: LatentRows) -> Tensor:
-        """Condition channels [N, C', h, w] of some frames."""
-        return self._conditioner.channels(rows.source)
-
-
-class WholeClips:
-    """What has no single frames. Raises RecipeError for a recipe that wants some."""
-
-    def __init__(self, recipe: UNetRecipe) -> None:
-        if recipe.image_share:
-            raise RecipeError(_WHOLE_CLIPS)
-        self._recipe = recipe
-
-    def single_frames(self, draws: Draws, count: int) -> Batch:
-        """Not offered; refused when this was made."""
-        raise RecipeError(_WHOLE_CLIPS)
-
-
-class SampleBatches(WholeClips):
+class SampleBatches:
     """A `BatchSource` of whole clips. Batch n, by `Draws.number`, always has the same samples.
 
     samples: `ViewPairs`, `LeRobotPairs`, or a set of clips. family: says what the network is told of a camera's way.
+    turns: see `SampleLoader`.
     """
 
     def __init__(
@@ -142,37 +95,34 @@ class SampleBatches(WholeClips):
         precision: Precision,
         loader: LoaderRecipe = LoaderRecipe(),  # noqa: B008  it is frozen
         seed: int = 0,
+        turns: Sequence[int] = (0,),
     ) -> None:
-        super().__init__(recipe)
-        self._networks, self._precision = networks, precision
+        self._networks, self._precision, self._recipe = networks, precision, recipe
         self._conditioner = Conditioner(networks.config, recipe, precision, family)
-        self._loader = SampleLoader(samples, seed, loader)
+        self._loader = SampleLoader(samples, seed, loader, turns, recipe.parts)
 
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """See BatchSource. Raises DataError if samples cannot be read or do not fit the model."""
-        return self.batch(self._loader.batch(draws.number, count), draws)
-
-    def batch(self, loaded: LoadedBatch, draws: Draws) -> Batch:
-        """The batch of some samples."""
+        assert not single, "the recipe refuses it"
+        loaded = self._loader.batch(draws.number, count)
         samples, config, recipe = loaded.samples, self._networks.config, self._recipe
         given = list(samples.source.shape[1:4])
         wanted = [config.frames, config.height, config.width]
         if given != wanted:
             raise DataError(f"samples must be T, H, W = {wanted} for this model, got {given}")
         frames, paths = config.frames, samples.paths
-        encoded = encode_frames(
-            self._networks, recipe, self._frames(samples.source), self._frames(samples.target), draws
-        )
-        condition, tokens = drop_streams(self._precision.frames(encoded.source), encoded.tokens, frames, draws, recipe)
+        pictures = self._frames(samples.source), self._frames(samples.target)
+        target, source, tokens, emphasis = encode_frames(self._networks, recipe, *pictures, draws)
+        condition, tokens = drop_streams(self._precision.frames(source), tokens, frames, draws, recipe)
         cameras = [camera for path in paths if (camera := self._conditioner.camera(path)) is not None]
         vectors = [self._vector(float(fps), path) for fps, path in zip(samples.fps, paths, strict=True)]
         names = zip(samples.scenes, loaded.numbers, strict=True)
         return Batch(
-            target=self._precision.frames(encoded.target),
+            target=self._precision.frames(target),
             condition=condition,
             vector=torch.stack(vectors).repeat_interleave(frames, dim=0).to(self._precision.device),
             tokens=tokens,
-            emphasis=encoded.emphasis,
+            emphasis=emphasis,
             frames=frames,
             camera=torch.cat(cameras).to(self._precision.device) if cameras else None,
             ids=tuple(f"{scene} (sample {number})" for scene, number in names),
@@ -191,7 +141,7 @@ class SampleBatches(WholeClips):
         return micro_conditioning(fps, motion, recipe.augmentation, width)
 
 
-class CachedBatches(WholeClips):
+class CachedBatches:
     """A `BatchSource` of whole clips: noise copy of every frame, posterior sample and dropout drawn anew each time.
 
     The frame rate of a clip is its own, after the stride; the recipe's `fps` is not used.
@@ -206,18 +156,18 @@ class CachedBatches(WholeClips):
         precision: Precision,
         path: PathKind,
     ) -> None:
-        super().__init__(recipe)
         kept, given = cache.index.identity.encoders, encoders_digest(networks)
         if kept != given:
             raise RecipeError(
                 f"{cache.folder} was made with other encoders ({kept}) than the run's ({given}); give the same "
                 "model.weights, or make the cache anew"
             )
-        self._cache, self._config, self._precision = cache, networks.config, precision
+        self._cache, self._config, self._precision, self._recipe = cache, networks.config, precision, recipe
         self._path: PathKind = path
 
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """See BatchSource."""
+        assert not single, "the recipe refuses it"
         started = time.perf_counter()
         on_cpu = Draws(int(draws.below(2**31, 1)), "latent cache", 0, torch.device("cpu"))
         clips = [self._cache.clip(*self._cache.drawn_place(on_cpu), self._path, on_cpu) for _ in range(count)]

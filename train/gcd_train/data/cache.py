@@ -42,7 +42,7 @@ from gcd_model.vae import Posterior
 from gcd_train.data.files import Recent
 from gcd_train.errors import DataError, RunError
 from gcd_train.files import write_whole
-from gcd_train.training.draws import Draws
+from gcd_train.training.setup import Draws
 
 FORMAT = 2
 _INDEX, _MOST_INDEX = "index.json", 1 << 26

@@ -13,10 +13,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Annotated, Literal
 
 import msgspec
 import torch
 from torch import Tensor
+from typer import Option
 
 from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
@@ -38,28 +40,53 @@ from gcd_train.data.cache import (
     write_shard,
 )
 from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.files import Skips
+from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import Draw
 from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
 from gcd_train.data.sample import Bytes, to_network
+from gcd_train.data.splits import Part, present, read_split
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.parallel import Outcome, map_items
-from gcd_train.training.draws import Draws
 from gcd_train.training.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
+from gcd_train.training.setup import Draws
 
 _log = logging.getLogger(__name__)
 
 
-class EncoderChoice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """weights: a path, package:NAME or random:FAMILY. device: auto, cpu or cuda[:N]. dtype: the networks' precision.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EncoderChoice:
+    """Which encoders, run where and how."""
 
-    family: where the file does not tell. batch: pictures a call; it does not change the result.
-    """
+    weights: Annotated[
+        str,
+        Option(help="Checkpoint with the encoders: a path, package:NAME; random:driving, small ones, to try it out."),
+    ]
+    family: Annotated[str | None, Option(help="Family of the weights, where their file does not tell.")] = None
+    device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
+    dtype: Annotated[str, Option(help="Type the encoders run in: float32, bfloat16 or float16.")] = "float32"
+    batch: Annotated[
+        int, Option(min=1, help="Pictures in one call of the encoder; changes memory, not the latents.")
+    ] = 2
 
-    weights: str
-    family: str | None = None
-    device: str = "auto"
-    dtype: str = "float32"
-    batch: int = 2
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CacheOptions(EncoderChoice):
+    """What is cached: options of `gcd-train cache`."""
+
+    split: Annotated[Part | None, Option(help="Part of the set, needs --split-file; the whole set if left out.")] = None
+    split_file: Annotated[Path | None, Option(help="JSON with the scenes of train, val and test.")] = None
+    copies: Annotated[int, Option(min=1, help="Differently noised latents of every source frame.")] = 4
+    path: Annotated[
+        Literal["gradual", "direct", "both"],
+        Option(help="Clips to encode for: the camera moves (gradual), or is there at once (direct)."),
+    ] = "both"
+    semantic: Annotated[bool, Option("--semantic", help="Targets show the classes instead of colour.")] = False
+    exact: Annotated[bool, Option("--exact", help="Draw targets from geometry.npz, which generated scenes have.")] = (
+        False
+    )
+    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes.")] = None
+    seed: Annotated[int, Option(min=0, help="Seed of the pixel noise.")] = 0
 
 
 @lru_cache(maxsize=1)
@@ -113,8 +140,6 @@ class DrivingPictures:
             fps=self.data.fps,
             world_from_source=world_from_source,
             world_from_target=world_from_source @ self._source_from_target[list(positions)],
-            start=None,
-            deltas=None,
         )
         made = self._pictures.sample(scene, draw)
         if not self._options.exact:
@@ -216,35 +241,58 @@ class CacheJob:
         )
 
 
-def identity_of(
-    choice: EncoderChoice, pictures: DrivingPictures, plan: ClipPlan, *, copies: int = 4, seed: int = 0
-) -> CacheIdentity:
-    """What a cache made now would say of itself; its pixel noise is as strong as the checkpoint is sampled with."""
-    encoders, digest = load_encoders(choice)
-    config = encoders.networks.config
-    return CacheIdentity(
+def cache_job(data: Path, out: Path, options: CacheOptions) -> CacheJob:
+    """What is to be done; its pixel noise is as strong as the checkpoint is sampled with.
+
+    Raises: DataError where there are no such scenes; RecipeError, CheckpointError for options that do not fit.
+    """
+    if (options.split is None) != (options.split_file is None):
+        raise RecipeError("a part of the set is named with both --split and --split-file; give both or neither")
+    encoders, digest = load_encoders(options)
+    config, whole = encoders.networks.config, ParallelDomain4D(data, classes=options.semantic)
+    scenes = whole.scenes
+    if options.split_file is not None and options.split is not None:
+        scenes = present(read_split(options.split_file, options.split), scenes, Skips(), options.split_file)
+    plan = ClipPlan(
+        clip_frames=config.frames, paths=("gradual", "direct") if options.path == "both" else (options.path,)
+    )
+    modality = "classes" if options.semantic else "rgb"
+    drawn = PictureOptions(size=(config.width, config.height), modality=modality, exact=options.exact)
+    pictures = DrivingPictures(whole.only(scenes[: options.limit]), config.frames, drawn)
+    identity = CacheIdentity(
         encoders=digest,
-        dtype=choice.dtype,
+        dtype=options.dtype,
         pictures=pictures.origin,
         fps=pictures.fps,
         plan=plan,
-        copies=copies,
+        copies=options.copies,
         augmentation=config.sampling.augmentation,
-        seed=seed,
+        seed=options.seed,
         height=config.height,
         width=config.width,
         scale=config.vae.scale,
-        emphasis=pictures.semantic,
+        emphasis=options.semantic,
     )
+    return CacheJob(folder=out, pictures=pictures, choice=options, identity=identity)
 
 
-def missing_scenes(job: CacheJob, scenes: Sequence[str]) -> list[str]:
-    """Those whose shards are missing or damaged. The caller holds `only_writer`.
+def missing_scenes(job: CacheJob) -> list[str]:
+    """Those whose shards are missing or damaged; the index is without the damaged ones from now on. The caller holds
+    `only_writer`.
 
-    Raises: RunError if the folder holds another cache or cannot be written.
+    Raises: RunError if the folder holds another cache, naming what differs, or cannot be written.
     """
-    index = _begun(job)
-    return [scene for scene in scenes if scene not in index.scenes]
+    index = read_index(job.folder, CacheIndex) or CacheIndex(identity=job.identity)
+    there, wanted = (msgspec.structs.asdict(identity) for identity in (index.identity, job.identity))
+    differs = [f"{name} {there[name]!r}, now {wanted[name]!r}" for name in there if there[name] != wanted[name]]
+    if differs:
+        raise RunError(f"{job.folder} was cached with {'; '.join(differs)}: choose another --out, or delete the folder")
+    faults = {scene: fault(job.folder, entry) for scene, entry in index.scenes.items()}
+    for reason in filter(None, faults.values()):
+        _log.warning("made anew: %s", reason)
+    whole = {scene: entry for scene, entry in index.scenes.items() if faults[scene] is None}
+    write_index(job.folder, msgspec.structs.replace(index, scenes=whole))
+    return [scene for scene in job.pictures.scenes if scene not in whole]
 
 
 def cache_scenes(
@@ -258,19 +306,3 @@ def cache_scenes(
             index = msgspec.structs.replace(index, scenes=dict(scenes_now))
             write_index(job.folder, index)
         yield outcome
-
-
-def _begun(job: CacheJob) -> CacheIndex:
-    """The index without damaged scenes. Raises RunError, naming what differs, for a cache that was made otherwise."""
-    index = read_index(job.folder, CacheIndex) or CacheIndex(identity=job.identity)
-    there, wanted = (msgspec.structs.asdict(identity) for identity in (index.identity, job.identity))
-    differs = [f"{name} {there[name]!r}, now {wanted[name]!r}" for name in there if there[name] != wanted[name]]
-    if differs:
-        raise RunError(f"{job.folder} was cached with {'; '.join(differs)}: choose another --out, or delete the folder")
-    faults = {scene: fault(job.folder, entry) for scene, entry in index.scenes.items()}
-    for reason in filter(None, faults.values()):
-        _log.warning("made anew: %s", reason)
-    whole = {scene: entry for scene, entry in index.scenes.items() if faults[scene] is None}
-    index = msgspec.structs.replace(index, scenes=whole)
-    write_index(job.folder, index)
-    return index

@@ -4,12 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from gcd_train.data import encodings, kubric4d, parallel_domain4d
-from gcd_train.data.dataset4d import scene_names
+from gcd_train.data.dataset4d import layout_in, scene_names
 from gcd_train.data.encodings import FAR_M, NEAR_M
 from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, SceneFiles, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
@@ -51,21 +52,14 @@ class Compaction:
         source, out = source.resolve(), out.resolve()
         if source == out:
             raise RecipeError(f"{source} cannot be packed into itself; give another OUT")
-        try:
-            names = [path.name for path in source.iterdir()]
-        except OSError as error:
-            raise DataError(f"{source} cannot be read ({error}); give the folder that holds the scenes") from error
-        orbits = any(kubric4d.scene_number(name) is not None for name in names)
+        orbits = layout_in(source) == "kubric4d"
         usual = kubric4d.CAMERAS if orbits else parallel_domain4d.CAMERAS
         return cls(source=source, out=out, orbits=orbits, cameras=cameras or usual, gaps=gaps)
 
     @property
     def scenes(self) -> tuple[str, ...]:
         """All there are, by number. Raises DataError for none."""
-        number, example = (
-            (kubric4d.scene_number, "scn00000") if self.orbits else (parallel_domain4d.scene_number, "scene_000000")
-        )
-        return tuple(scene_names(self.source, number, example))
+        return tuple(scene_names(self.source, "kubric4d" if self.orbits else "parallel_domain4d"))
 
     def __call__(self, scene: str) -> Packed:
         """Pack a scene unless it is there: its folder appears once everything in it was compared with the source.
@@ -121,7 +115,6 @@ class Compaction:
     def _write_views(self, reader: Kubric4D | ParallelDomain4D, scene: str, files: SceneFiles) -> list[tuple[int, str]]:
         """Time and camera of all that were written. Raises DataError."""
         written, faults = list[tuple[int, str]](), list[FileFault]()
-        encoded = self._orbit_view if self.orbits else self._street_view
         for time, camera in product(range(reader.frames(scene)), self.cameras):
             try:
                 (view,) = reader.views(scene, time, [camera])
@@ -130,7 +123,7 @@ class Compaction:
                     faults.append(fault)
                 continue
             if not faults:
-                for path, data in encoded(self.source / scene, files.folder, view, time, camera):
+                for path, data in self._encoded(self.source / scene, files.folder, view, time, camera):
                     files.write(path, data)
                 written.append((time, camera))
         if faults:
@@ -141,39 +134,27 @@ class Compaction:
             )
         return written
 
-    def _orbit_view(
+    def _encoded(
         self, source: Path, out: Path, view: SceneView, time: int, camera: str
     ) -> Iterator[tuple[Path, bytes]]:
-        def place(folder: Path, layer: kubric4d.Layer, *, compact: bool = False) -> Path:
-            return kubric4d.frame_path(folder, camera, layer, time, compact=compact)
+        """Where the pictures of a view go, and what is in them. source, out: folders of the scene."""
+        names: Any = kubric4d if self.orbits else parallel_domain4d
+        colour, ids = ("rgba", "segmentation") if self.orbits else ("rgb", "instance_segmentation_2d")
+        depth = encodings.depth_png if self.orbits else encodings.street_depth_png
 
-        _require_published(place(source, "rgba"))
-        yield place(out, "rgba", compact=True), encodings.webp(view.rgb, quality=kubric4d.WEBP_QUALITY)
-        yield place(out, "depth", compact=True), encodings.depth_png(view.depth)
-        if view.instances is not None:
-            yield place(out, "segmentation", compact=True), place(source, "segmentation").read_bytes()
+        def place(folder: Path, layer: str, *, compact: bool = True) -> Path:
+            return names.frame_path(folder, camera, layer, time, compact=compact)
 
-    def _street_view(
-        self, source: Path, out: Path, view: SceneView, time: int, camera: str
-    ) -> Iterator[tuple[Path, bytes]]:
-        def place(folder: Path, layer: parallel_domain4d.Layer, *, compact: bool = False) -> Path:
-            return parallel_domain4d.frame_path(folder, camera, layer, time, compact=compact)
-
-        _require_published(place(source, "rgb"))
-        yield place(out, "rgb", compact=True), encodings.webp(view.rgb, quality=parallel_domain4d.WEBP_QUALITY)
-        yield place(out, "depth", compact=True), encodings.street_depth_png(view.depth)
+        if not place(source, colour, compact=False).exists():
+            raise DataError(f"{place(source, colour, compact=False)} is not there: the scene is compact already")
+        yield place(out, colour), encodings.webp(view.rgb, quality=names.WEBP_QUALITY)
+        yield place(out, "depth"), depth(view.depth)
         if view.classes is not None:
             yield place(out, "semantic_segmentation_2d"), encodings.packed_id_png(view.classes)
         if view.instances is not None:
-            path = place(source, "instance_segmentation_2d")
-            small = int(view.instances.max()) < 256
-            data = encodings.packed_id_png(view.instances.astype(np.uint8)) if small else path.read_bytes()
-            yield place(out, "instance_segmentation_2d"), data
-
-
-def _require_published(path: Path) -> None:
-    if not path.exists():
-        raise DataError(f"{path} is not there: the scene is compact already")
+            small = not self.orbits and int(view.instances.max()) < 256
+            packed = encodings.packed_id_png(view.instances.astype(np.uint8)) if small else b""
+            yield place(out, ids), packed or place(source, ids).read_bytes()
 
 
 def _require_alike(packed: SceneView, view: SceneView, place: str, *, street: bool) -> None:

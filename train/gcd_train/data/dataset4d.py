@@ -1,12 +1,13 @@
 """Scenes seen by several cameras at once: what both published sets have in common, and the classes of one."""
 
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import msgspec
 import numpy as np
@@ -229,15 +230,44 @@ class Dataset4D(ABC):
         return [self.view(scene, camera, time) for camera in cameras or self.cameras]
 
 
-def scene_names(root: Path, number: Callable[[str], int | None], example: str) -> list[str]:
-    """The scenes of a folder by number. Raises DataError if there is none."""
+LayoutName = Literal["kubric4d", "parallel_domain4d"]
+_NAMES: dict[LayoutName, tuple[str, str]] = {
+    "kubric4d": (r"scn(\d{5,})", "scn00000"),
+    "parallel_domain4d": (r"scene_(\d{6,})", "scene_000000"),
+}
+"""Folders of scenes by their layout, and the first of them."""
+
+
+def layout_of(name: str) -> LayoutName | None:
+    """The layout of a scene whose folder has this name; None for another folder."""
+    return next((layout for layout, (named, _) in _NAMES.items() if re.fullmatch(named, name)), None)
+
+
+def scene_number(name: str) -> int:
+    """The number in the name of a scene's folder, in either layout. Raises DataError for another name."""
+    layout = layout_of(name)
+    if layout is None:
+        raise DataError(f"{name} is no scene's name; wanted scn00042 or scene_000042")
+    return int(re.sub(r"\D", "", name))
+
+
+def layout_in(root: Path) -> LayoutName | None:
+    """The layout of the scenes in a folder; None if there is none. Raises DataError if it cannot be read."""
     try:
-        found = [path.name for path in root.iterdir() if number(path.name) is not None]
+        found = {layout_of(path.name) for path in root.iterdir()}
     except OSError as error:
-        raise DataError(f"{root} cannot be read ({error}); give the folder that holds {example}") from error
+        raise DataError(f"{root} cannot be read ({error}); give the folder that holds the scenes, or pairs") from error
+    return next((layout for layout in _NAMES if layout in found), None)
+
+
+def scene_names(root: Path, layout: LayoutName) -> list[str]:
+    """The scenes of a folder by number. Raises DataError if there is none."""
+    layout_in(root)
+    found = [path.name for path in root.iterdir() if layout_of(path.name) == layout]
     if not found:
+        example = _NAMES[layout][1]
         raise DataError(f"{root} holds no scene of this layout; give the folder that holds {example} and so on")
-    return sorted(found, key=lambda name: number(name) or 0)
+    return sorted(found, key=scene_number)
 
 
 def pose_from_quaternion(quaternions: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.float64]:

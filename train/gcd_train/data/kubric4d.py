@@ -31,7 +31,6 @@ from gcd_train.data import encodings
 from gcd_train.data.dataset4d import KEPT_SCENES, Dataset4D, pose_from_quaternion, scene_names
 from gcd_train.data.encodings import (
     Doubles,
-    Floats,
     quaternions,
     read_colour,
     read_depth,
@@ -41,8 +40,8 @@ from gcd_train.data.encodings import (
 )
 from gcd_train.data.files import MOST_TEXT, FileFault, Recent, SceneFiles, one_of, read
 from gcd_train.data.sample import SceneView
+from gcd_train.data.splat import ray_lengths
 from gcd_train.errors import DataError
-from gcd_train.pointcloud import planar_from_distance
 from gcd_train.scenes.description import Scene, SceneObject, rotations
 
 if TYPE_CHECKING:
@@ -75,12 +74,6 @@ _BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # axes x right, y up, looking along 
 def scene_name(number: int) -> str:
     """Folder of a scene, `scn00042`."""
     return f"scn{number:05d}"
-
-
-def scene_number(name: str) -> int | None:
-    """The number in a folder's name, None if it is no scene of this layout."""
-    named = re.fullmatch(r"scn(\d{5,})", name)
-    return None if named is None else int(named[1])
 
 
 def metadata_path(scene: Path, camera: str) -> Path:
@@ -144,7 +137,7 @@ class Kubric4D(Dataset4D):
         wrong = [camera for camera in cameras if re.fullmatch(r"view\d+", camera) is None]
         if wrong:
             raise DataError(f"Kubric-4D's cameras are called view0 to view15, got {wrong[0]!r}")
-        found = scene_names(Path(root), scene_number, "scn00000") if scenes is None else scenes
+        found = scene_names(Path(root), "kubric4d") if scenes is None else scenes
         super().__init__(Path(root), found, cameras, "view4" if "view4" in cameras else cameras[0])
         self._published, self._instances = published, instances
         self._views = Recent(self._read_views, KEPT_SCENES)
@@ -178,7 +171,7 @@ class Kubric4D(Dataset4D):
             instances = sized(path, read_palette_indices(path), *size).astype(np.uint16)
         return SceneView(
             rgb=rgb,
-            depth=depth if far.suffix == _PLANAR else planar_from_distance(depth, view.lens, published=self._published),
+            depth=depth if far.suffix == _PLANAR else depth / ray_lengths(view.lens, published=self._published),
             classes=None,
             instances=instances,
             world_from_camera=view.poses[time],
@@ -202,9 +195,8 @@ def _read_view(path: Path) -> _View:
     try:
         metadata = decode_json(read(path, MOST_TEXT), _Metadata)
         width, height = metadata.scene.resolution
-        (fx, _, cx), (_, fy, cy), _ = np.abs(
-            metadata.camera.K
-        ).tolist()  # shares of the picture, signs of Blender's axes
+        # shares of the picture, signs of Blender's axes
+        (fx, _, cx), (_, fy, cy), _ = np.abs(metadata.camera.K).tolist()
         lens = Intrinsics(fx=fx * width, fy=fy * height, cx=cx * width, cy=cy * height, width=width, height=height)
     except ModelError as error:
         raise FileFault(path, f"is damaged or lacks what Kubric-4D tells of a view ({error})") from error
@@ -266,13 +258,6 @@ class Kubric4DWriter:
 
     def _write(self, view: str, layer: Layer, time: int, data: bytes) -> None:
         self._files.write(frame_path(self._files.folder, view, layer, time, compact=self._compact), data)
-
-
-def ray_lengths(lens: Intrinsics) -> Floats:
-    """[H, W]: distance to the camera centre over depth along the axis, for the middle of every pixel."""
-    x = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
-    y = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
-    return np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2).astype(np.float32)
 
 
 def segment_ids(instances: tuple[int, ...]) -> encodings.Bytes:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
+from gcd_model.vae import Posterior
 from gcd_model.weights.families import Family
 from gcd_train.data.cache import (
     FrozenEncoders,
@@ -37,10 +38,8 @@ from gcd_train.data.cache import (
 from gcd_train.data.sample import Clips, numbers_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.recipe import LatentsRecipe, Recipe
-from gcd_train.training.conditioner import Conditioner, mirrored_path
-from gcd_train.training.draws import Draws
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.training.setup import Precision, digest_of
+from gcd_train.training.setup import Conditioner, Draws, Precision, digest_of, mirrored_path
 
 _log = logging.getLogger(__name__)
 _SHARD = 32  # clips
@@ -252,10 +251,20 @@ class Encodings:
         path, draws = sample.trajectory, Draws(self.recipe.seed, "latents", number, self.precision.device)
         source, target = (self.precision.frames(to_network(side)) for side in (sample.source, sample.target))
         sources, targets = ([side, side.flip(-1)][:flips] for side in (source, target))
-        encoders = FrozenEncoders(networks=networks, at_once=len(source))
+        encoders, recipe = FrozenEncoders(networks=networks, at_once=len(source)), self._latents
+
+        def noisy(frames: Tensor) -> Tensor:
+            return frames + recipe.augmentation * draws.normal(*frames.shape) if recipe.augmentation else frames
+
+        def drawn(posterior: Posterior) -> Tensor:
+            return posterior.sample(draws.normal(*posterior.mean.shape)) if recipe.sample else posterior.mean
+
+        with self.precision.arithmetic():
+            conditions = [encoders.condition(noisy(frames)) for frames in sources]
+            posteriors = [encoders.target(frames) for frames in targets]
         rows = {
-            "source": torch.stack([self._condition(encoders, frames, draws) for frames in sources]).half(),
-            "target": torch.stack([self._target(encoders, frames, draws) for frames in targets]).half(),
+            "source": torch.stack(conditions).half(),
+            "target": torch.stack([drawn(each) * self.config.vae.scale for each in posteriors]).half(),
             "motion": torch.tensor(conditioner.motion(path), dtype=torch.float32),
         }
         features = [conditioner.camera(each) for each in (path, mirrored_path(path))[:flips]]
@@ -266,18 +275,6 @@ class Encodings:
             size = (rows["target"].shape[-2], rows["target"].shape[-1])
             rows["emphasis"] = class_emphasis(target, class_weights, size).half()
         return {name: value.cpu() for name, value in rows.items()}
-
-    def _condition(self, encoders: FrozenEncoders, frames: Tensor, draws: Draws) -> Tensor:
-        if self._latents.augmentation:
-            frames = frames + self._latents.augmentation * draws.normal(*frames.shape)
-        with self.precision.arithmetic():
-            return encoders.condition(frames)
-
-    def _target(self, encoders: FrozenEncoders, frames: Tensor, draws: Draws) -> Tensor:
-        with self.precision.arithmetic():
-            posterior = encoders.target(frames)
-        latents = posterior.sample(draws.normal(*posterior.mean.shape)) if self._latents.sample else posterior.mean
-        return latents * encoders.networks.config.vae.scale
 
     @torch.no_grad()
     def _sensitivity(self, networks: Networks, latents: Tensor) -> Tensor:

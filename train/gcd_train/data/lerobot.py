@@ -255,8 +255,8 @@ class LeRobotPairs(DrawnSamples):
 
     frames: T. fps: of the clips, at most the set's own, which is the default; rows and pictures are taken that are
     nearest in time. size: width and height of the samples; pictures are cropped about their middle to its shape and
-    resized; of two lenses both sides have the narrower one. tolerance_s: how far a row or picture may be from the
-    time it is taken for; by default half a frame of the set.
+    resized; of two lenses both sides have the narrower one. A row or picture may lie half a frame of the set from
+    the time it is taken for.
     cameras: features to choose from, by default all that are calibrated; source and target are drawn from them.
     calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
     episodes: which of the set's, from the first number up to the second, as in a slice: (-10, None) are the last ten.
@@ -272,7 +272,6 @@ class LeRobotPairs(DrawnSamples):
         frames: int = 14,
         fps: float | None = None,
         size: tuple[int, int] = (384, 256),
-        tolerance_s: float | None = None,
         cameras: tuple[str, ...] | None = None,
         calibration: Path | None = None,
         repeats: int = 400,
@@ -291,7 +290,7 @@ class LeRobotPairs(DrawnSamples):
         self.fps = fps or self.info.fps
         if self.fps > self.info.fps * 1.001:
             raise DataError(f"clips of {self.fps:g} frames per second were wanted, {folder} has {self.info.fps:g}")
-        self._frames, self._size, self._tolerance_s = frames, size, tolerance_s or 0.5 / self.info.fps + _SLACK_S
+        self._frames, self._size, self._tolerance_s = frames, size, 0.5 / self.info.fps + _SLACK_S
 
     def _place(self, number: int) -> tuple[str, Path]:
         episode = self.episodes[number % len(self.episodes)]

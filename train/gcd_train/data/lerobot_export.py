@@ -1,7 +1,7 @@
 """Episodes of a robot, as those of the tabletop world, as a LeRobot data set (format v3.0) with calibrated cameras.
 
-Source: the LeRobotDataset v3.0 format as its documentation describes it: many episodes a file, `meta/episodes` says
-where each begins. The calibration is ours, see `lerobot`.
+Source: the LeRobotDataset v3.0 format as its documentation describes it: many episodes a file, here all of them, and
+`meta/episodes` says where each begins. The calibration is ours, see `lerobot`.
 """
 
 import json
@@ -10,14 +10,16 @@ from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from typer import Option
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.lerobot import CAMERA_FILE, CHUNK, CameraCalibration, CameraFile, extra
+from gcd_train.data.videos import FileLens
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.files import new_folder
 from gcd_train.scenes.drop.world import HFOV_DEG, orbit_cameras
@@ -33,19 +35,8 @@ _IMAGES = "observation.images."
 _POSE_FEATURE = f"observation.camera_pose.{WRIST}"
 _SAMPLED = 8
 """Every so many frames' pictures go into the statistics."""
-_FILE = "chunk-{chunk:03d}/file-{file:03d}"
+_FILE = "chunk-000/file-000"
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LoggedEpisode:
-    """What one episode adds.
-
-    features: name -> [T, N] numbers, joint positions and what else there is a name for. task: in words.
-    """
-
-    features: Mapping[str, NDArray[np.floating[Any]]]
-    task: str
 
 
 Statistics = dict[str, NDArray[np.float64]]
@@ -73,21 +64,11 @@ def _together(parts: Sequence[Statistics]) -> Statistics:
     }
 
 
-@dataclass(slots=True)
-class _Video:
-    """The file a camera is writing now, and how many frames it has."""
-
-    container: Any
-    stream: Any
-    frames: int = 0
-
-
 class LeRobotWriter:
     """Writes a data set episode by episode into an empty folder; complete when it is closed.
 
     robot: its name. fps: of rows and videos. names: what the numbers of a feature are called. crf: quality of H.264,
-    lower is better. episodes_a_file: after so many, the next files begin.
-    Raises DataError without the extra `lerobot`, or if an episode does not fit the others.
+    lower is better. Raises DataError without the extra `lerobot`, or if an episode does not fit the others.
     """
 
     def __init__(
@@ -99,27 +80,39 @@ class LeRobotWriter:
         fps: int,
         names: Mapping[str, Sequence[str]],
         crf: int = 18,
-        episodes_a_file: int = 100,
     ) -> None:
-        self._folder, self._cameras, self._robot, self._fps = folder, cameras, robot, fps
-        self._names, self._crf, self._episodes_a_file = names, crf, episodes_a_file
+        self._folder, self._cameras, self._robot, self._fps, self._names = folder, cameras, robot, fps, names
         self._arrow, self._parquet, self._av = extra("pyarrow"), extra("pyarrow.parquet"), extra("av")
-        self._count, self._frames, self._tasks = 0, 0, dict[str, int]()
-        self._statistics: dict[str, list[Statistics]] = {}
-        self._videos: dict[str, _Video] = {}
-        self._tables: list[Any] = []
-        self._episodes: list[dict[str, Any]] = []
+        self._frames, self._tasks, self._statistics = 0, dict[str, int](), dict[str, list[Statistics]]()
+        self._tables, self._episodes = list[Any](), list[dict[str, Any]]()
+        self._videos: dict[str, tuple[Any, Any]] = {}
         (folder / "meta").mkdir(parents=True, exist_ok=True)
+        for name, camera in cameras.items():
+            path = self._place(f"videos/{name}", "mp4")
+            container = self._av.open(str(path), "w")
+            stream = container.add_stream("libx264", rate=fps)
+            stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
+            stream.time_base = Fraction(1, fps)
+            stream.codec_context.gop_size = 2  # as LeRobot's own: any frame is near a key frame
+            stream.options = {"crf": str(crf), "preset": "fast", "bf": "0"}
+            self._videos[name] = container, stream
 
-    def add(self, episode: LoggedEpisode, pictures: Iterator[Mapping[str, Bytes]]) -> None:
-        """Append an episode; `pictures` gives a picture [H, W, 3] of every camera for each of its rows."""
-        lengths = {len(rows) for rows in episode.features.values()}
-        begins = {name: self._video(name).frames for name in self._cameras}
-        statistics = self._encode(pictures)
-        frames = next(iter(self._videos.values())).frames - next(iter(begins.values()))
+    def add(
+        self,
+        features: Mapping[str, NDArray[np.floating[Any]]],
+        task: str,
+        pictures: Iterator[Mapping[str, Bytes]],
+    ) -> None:
+        """Append an episode.
+
+        features: name -> [T, N] numbers, joint positions and what else there is a name for. task: in words. pictures:
+        gives one [H, W, 3] of every camera for each of its rows.
+        """
+        lengths = {len(rows) for rows in features.values()}
+        frames, statistics = self._encode(pictures)
         if lengths != {frames}:
             raise DataError(f"an episode has {frames} pictures and {sorted(lengths)} rows; give one for each")
-        columns = self._columns(episode, frames)
+        columns = self._columns(features, task, frames)
         statistics |= {name: _statistics(values) for name, values in columns.items()}
         pa = self._arrow
         flat = {name: pa.array(values.reshape(-1)) for name, values in columns.items()}
@@ -129,92 +122,83 @@ class LeRobotWriter:
             if name not in _OWN
         }
         self._tables.append(pa.table(flat | lists))
-        self._episodes.append(self._episode(episode, frames, begins, statistics))
-        self._count, self._frames = self._count + 1, self._frames + frames
-        if self._count % self._episodes_a_file == 0:
-            self._finish_files()
+        self._episodes.append(self._episode(task, frames, statistics))
+        self._frames += frames
 
     def close(self) -> None:
-        """Write what describes the set."""
-        self._finish_files()
+        """Write all but the pictures."""
+        for container, stream in self._videos.values():
+            container.mux(stream.encode())
+            container.close()
+        pa, tasks = self._arrow, self._tasks
+        for table, room in (
+            (pa.concat_tables(self._tables), "data"),
+            (pa.Table.from_pylist(self._episodes), "meta/episodes"),
+        ):
+            self._parquet.write_table(table, self._place(room, "parquet"))
+        columns = [  # of a table whose index is the task's words, as pandas writes it
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
+            for name, kind, stored in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+        ]
+        index = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
+        table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
+        table = table.replace_schema_metadata({"pandas": json.dumps(index)})
+        self._parquet.write_table(table, self._folder / "meta/tasks.parquet")
         statistics = {name: self._listed(name, _together(parts)) for name, parts in self._statistics.items()}
         for name, told in (("stats", statistics), ("info", self._info())):
             (self._folder / f"meta/{name}.json").write_text(json.dumps(told, indent=4) + "\n", encoding="utf-8")
-        self._write_tasks()
         calibration = msgspec.json.format(msgspec.json.encode(CameraFile(cameras=self._cameras)), indent=1)
         (self._folder / CAMERA_FILE).write_bytes(calibration)
 
-    @property
-    def _place(self) -> dict[str, int]:
-        number = self._count // self._episodes_a_file
-        return {"chunk": number // CHUNK, "file": number % CHUNK}
+    def _place(self, room: str, suffix: str) -> Path:
+        path = self._folder / room / f"{_FILE}.{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
 
-    def _video(self, name: str) -> _Video:
-        if name not in self._videos:
-            path = self._folder / "videos" / name / f"{_FILE.format(**self._place)}.mp4"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            container = self._av.open(str(path), "w")
-            stream = container.add_stream("libx264", rate=self._fps)
-            camera = self._cameras[name]
-            stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
-            stream.time_base = Fraction(1, self._fps)
-            stream.codec_context.gop_size = 2  # as LeRobot's own: any frame is near a key frame
-            stream.options = {"crf": str(self._crf), "preset": "fast", "bf": "0"}
-            self._videos[name] = _Video(container, stream)
-        return self._videos[name]
-
-    def _encode(self, pictures: Iterator[Mapping[str, Bytes]]) -> dict[str, Statistics]:
-        """Append the pictures to the videos; statistics of the colours of some."""
+    def _encode(self, pictures: Iterator[Mapping[str, Bytes]]) -> tuple[int, dict[str, Statistics]]:
+        """Append the pictures to the videos: how many, and statistics of the colours of some."""
         sampled: dict[str, list[NDArray[np.float64]]] = {name: [] for name in self._cameras}
-        for number, seen in enumerate(pictures):
+        frames = 0
+        for frames, seen in enumerate(pictures, start=1):
             for name, camera in self._cameras.items():
-                picture = seen[name]
+                picture, (container, stream) = seen[name], self._videos[name]
                 if picture.shape != (camera.height, camera.width, 3):
                     raise DataError(f"{name} must be {camera.width} x {camera.height}, got a picture {picture.shape}")
-                video, frame = (
-                    self._video(name),
-                    self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24"),
-                )
-                frame.pts, frame.time_base = video.frames, Fraction(1, self._fps)
-                video.container.mux(video.stream.encode(frame))
-                video.frames += 1
-                if number % _SAMPLED == 0:
+                frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24")
+                frame.pts, frame.time_base = self._frames + frames - 1, Fraction(1, self._fps)
+                container.mux(stream.encode(frame))
+                if frames % _SAMPLED == 1:
                     sampled[name].append(picture[::4, ::4].reshape(-1, 3) / 255)
-        return {name: _statistics(np.concatenate(rows)) for name, rows in sampled.items() if rows}
+        return frames, {name: _statistics(np.concatenate(rows)) for name, rows in sampled.items() if rows}
 
-    def _columns(self, episode: LoggedEpisode, frames: int) -> dict[str, NDArray[Any]]:
+    def _columns(
+        self, features: Mapping[str, NDArray[np.floating[Any]]], task: str, frames: int
+    ) -> dict[str, NDArray[Any]]:
         """Rows [T, N] of an episode by name: its features and LeRobot's own numbers."""
-        columns = {name: np.ascontiguousarray(rows, np.float32) for name, rows in episode.features.items()}
+        columns = {name: np.ascontiguousarray(rows, np.float32) for name, rows in features.items()}
         for name, rows in columns.items():
             width = self._statistics[name][0]["mean"].shape[0] if name in self._statistics else rows.shape[1]
             if width != rows.shape[1]:
                 raise DataError(f"{name} had {width} numbers in the first episode and has {rows.shape[1]} in this one")
-        task, steps = self._tasks.setdefault(episode.task, len(self._tasks)), np.arange(frames)
-        numbers = (steps, np.full(frames, self._count), self._frames + steps, np.full(frames, task))
+        number, steps = self._tasks.setdefault(task, len(self._tasks)), np.arange(frames)
+        numbers = (steps, np.full(frames, len(self._episodes)), self._frames + steps, np.full(frames, number))
         own = [(steps / self._fps).astype(np.float32), *(row.astype(np.int64) for row in numbers)]
         return columns | {name: row[:, None] for name, row in zip(_OWN, own, strict=True)}
 
-    def _episode(
-        self, episode: LoggedEpisode, frames: int, begins: dict[str, int], statistics: dict[str, Statistics]
-    ) -> dict[str, Any]:
+    def _episode(self, task: str, frames: int, statistics: dict[str, Statistics]) -> dict[str, Any]:
         """The episode's row in meta/episodes."""
-        place, fps = self._place, self._fps
         row: dict[str, Any] = {
-            "episode_index": self._count,
-            "tasks": [episode.task],
+            "episode_index": len(self._episodes),
+            "tasks": [task],
             "length": frames,
             "dataset_from_index": self._frames,
             "dataset_to_index": self._frames + frames,
-            "data/chunk_index": place["chunk"],
-            "data/file_index": place["file"],
-            "meta/episodes/chunk_index": place["chunk"],
-            "meta/episodes/file_index": place["file"],
         }
-        for name, first in begins.items():
-            row[f"videos/{name}/chunk_index"] = place["chunk"]
-            row[f"videos/{name}/file_index"] = place["file"]
-            row[f"videos/{name}/from_timestamp"] = first / fps
-            row[f"videos/{name}/to_timestamp"] = (first + frames) / fps
+        rooms = ["data", "meta/episodes", *(f"videos/{name}" for name in self._cameras)]
+        row |= {f"{room}/{part}_index": 0 for room in rooms for part in ("chunk", "file")}
+        for name in self._cameras:
+            row[f"videos/{name}/from_timestamp"] = self._frames / self._fps
+            row[f"videos/{name}/to_timestamp"] = (self._frames + frames) / self._fps
         for name, seen in statistics.items():
             row.update({f"stats/{name}/{key}": value for key, value in self._listed(name, seen).items()})
             self._statistics.setdefault(name, []).append(seen)
@@ -228,50 +212,18 @@ class LeRobotWriter:
             for key, row in statistics.items()
         }
 
-    def _finish_files(self) -> None:
-        """Close the videos and write the tables of the episodes since the last time."""
-        for video in self._videos.values():
-            video.container.mux(video.stream.encode())
-            video.container.close()
-        self._videos = {}
-        if not self._tables:
-            return
-        number = (self._count - 1) // self._episodes_a_file
-        name = f"{_FILE.format(chunk=number // CHUNK, file=number % CHUNK)}.parquet"
-        for table, room in (
-            (self._arrow.concat_tables(self._tables), "data"),
-            (self._arrow.Table.from_pylist(self._episodes), "meta/episodes"),
-        ):
-            path = self._folder / room / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._parquet.write_table(table, path)
-        self._tables, self._episodes = [], []
-
-    def _write_tasks(self) -> None:
-        """A table whose index is the task's words, as pandas writes it."""
-        tasks, pa = self._tasks, self._arrow
-        table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
-        columns = [
-            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
-            for name, kind, stored in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
-        ]
-        index = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
-        self._parquet.write_table(
-            table.replace_schema_metadata({"pandas": json.dumps(index)}), self._folder / "meta/tasks.parquet"
-        )
-
     def _info(self) -> dict[str, Any]:
         return {
             "codebase_version": "v3.0",
             "robot_type": self._robot,
-            "total_episodes": self._count,
+            "total_episodes": len(self._episodes),
             "total_frames": self._frames,
             "total_tasks": len(self._tasks),
             "chunks_size": CHUNK,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": self._fps,
-            "splits": {"train": f"0:{self._count}"},
+            "splits": {"train": f"0:{len(self._episodes)}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
             "features": self._features(),
@@ -300,35 +252,44 @@ class LeRobotWriter:
         if kind is None:
             self.close()
         else:
-            for video in self._videos.values():
-                video.container.close()
+            for container, _ in self._videos.values():
+                container.close()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TabletopExport:
-    """How episodes are made.
+    """How episodes are made: options of `gcd-train export lerobot`.
 
-    seeds: one an episode. frames: of an episode, at 24 Hz. cameras: of view0..view15 and wrist, which moves with the
-    hand; the others stand where Kubric-4D has them, turned so that they look at every episode's robot alike.
-    width, height: pixels. oversample: as in `Renderer`.
+    The wrist's camera moves with the hand; the others stand where Kubric-4D has them, turned so that they look at every
+    episode's robot alike.
     """
 
-    seeds: range
-    frames: int = 120
-    cameras: tuple[str, ...] = ("view0", "view4", "view9", WRIST)
-    width: int = 320
-    height: int = 240
-    oversample: int = 2
+    episodes: Annotated[int, Option(min=1, help="How many episodes, one seed each.")] = 10
+    first_seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 0
+    frames: Annotated[int, Option(min=2, help="Time steps of an episode, at 24 Hz.")] = 120
+    width: Annotated[int, Option(min=32, help="Of the pictures, pixels, even.")] = 320
+    height: Annotated[int, Option(min=32, help="Of the pictures, pixels, even.")] = 240
+    cameras: Annotated[str, Option(help="Two or more of view0 to view15 and wrist, with commas.")] = (
+        "view0,view4,view9,wrist"
+    )
+    oversample: Annotated[int, Option(min=1, max=4, help="Anti-aliasing: pixels drawn per pixel and side.")] = 2
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the cameras."""
+        return tuple(name.strip() for name in self.cameras.split(","))
 
 
 def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
     """Write the data set `out`; yields how many episodes are done. The folder appears when all are.
 
     Raises:
-        RecipeError: no such camera. RunError: `out` is there already, or cannot be written.
+        RecipeError: no such camera, or an odd size. RunError: `out` is there already, or cannot be written.
         RenderError, DataError: an extra is not installed.
     """
-    poses = _base_from_cameras(export.cameras)
+    if export.width % 2 or export.height % 2:
+        raise RecipeError(f"H.264 wants an even width and height, got {export.width} x {export.height}")
+    poses = _base_from_cameras(export.names)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out} is there already; choose another folder, or remove it")
     names = {_POSE_FEATURE: [f"base_from_camera_{row}{column}" for row in range(4) for column in range(4)]}
@@ -339,14 +300,13 @@ def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
             folder, _calibrations(export, poses), robot="tabletop primitive", fps=round(FPS), names=names
         ) as writer,
     ):
-        for done, seed in enumerate(export.seeds, start=1):
-            episode = tabletop_episode(seed, frames=export.frames, skipped_s=0.0)
+        for done in range(1, export.episodes + 1):
+            episode = tabletop_episode(export.first_seed + done - 1, frames=export.frames, skipped_s=0.0)
             features = {"observation.state": episode.motion.state, "action": episode.motion.action}
-            if WRIST in export.cameras:
+            if WRIST in export.names:
                 base_from_wrist = np.linalg.inv(episode.world_from_base) @ episode.wrist
                 features[_POSE_FEATURE] = _in_metres(base_from_wrist).reshape(-1, 16)
-            logged = LoggedEpisode(features=features, task=episode.task)
-            writer.add(logged, _pictures(renderer, episode, poses, export))
+            writer.add(features, episode.task, _pictures(renderer, episode, poses, export))
             yield done
 
 
@@ -365,15 +325,10 @@ def _base_from_cameras(names: tuple[str, ...]) -> dict[str, Floats]:
 def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[str, CameraCalibration]:
     lens = Intrinsics.from_hfov(HFOV_DEG, export.width, export.height)
     made: dict[str, CameraCalibration] = {}
-    for name in export.cameras:
+    for name in export.names:
         rows = None if name == WRIST else tuple(map(tuple, _in_metres(poses[name]).tolist()))
         made[_IMAGES + name] = CameraCalibration(
-            width=lens.width,
-            height=lens.height,
-            fx=lens.fx,
-            fy=lens.fy,
-            cx=lens.cx,
-            cy=lens.cy,
+            **{field: getattr(lens, field) for field in FileLens.__struct_fields__},
             base_from_camera=rows,
             pose_feature=_POSE_FEATURE if name == WRIST else None,
         )
@@ -385,7 +340,7 @@ def _pictures(
 ) -> Iterator[Mapping[str, NDArray[np.uint8]]]:
     """A picture of every camera, frame by frame."""
     cameras = {name: np.tile(episode.world_from_base @ pose, (export.frames, 1, 1)) for name, pose in poses.items()}
-    if WRIST in export.cameras:
+    if WRIST in export.names:
         cameras[WRIST] = episode.wrist
     views = renderer.views(freeze(episode.scene), cameras)
     while seen := list(islice(views, len(cameras))):

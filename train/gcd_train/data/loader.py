@@ -4,7 +4,7 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, cycle
+from itertools import count, islice
 from multiprocessing import get_context
 
 import cv2
@@ -51,39 +51,36 @@ class LoadedBatch:
     wait_s: float
 
 
-_LONGEST = 64  # steps of a process from batch to batch within one update
-
-
 class SampleLoader:
-    """Batches by number. Those that follow are made ahead, as long as the steps from number to number repeat.
+    """Batches by number; those that follow are made ahead.
 
+    turns, parts: of an update's `parts` batches this process computes those of these numbers, see `Processes.batches`.
     Worker processes are spawned, not forked: a fork would share OpenGL's and torch's state.
     """
 
-    def __init__(self, samples: Samples, seed: int, recipe: LoaderRecipe) -> None:
-        self._samples, self._recipe = samples, recipe
+    def __init__(
+        self, samples: Samples, seed: int, recipe: LoaderRecipe, turns: Sequence[int] = (0,), parts: int = 1
+    ) -> None:
+        self._samples, self._recipe, self._turns, self._parts = samples, recipe, turns, parts
         self._order = SampleOrder(len(samples), seed)
-        self._count, self._last, self._steps = 0, 0, list[int]()
-        self._numbers: Iterator[int] = iter(())
-        self._batches: Iterator[SampleBatch | TrainError] | None = None
+        self._count = 0
+        self._expected: Iterator[int] = iter(())
+        self._batches: Iterator[SampleBatch | TrainError] = iter(())
 
     def batch(self, number: int, count: int) -> LoadedBatch:
         """Batch `number` of `count` samples. Raises: as `Samples.sample`; RunError if a process was killed."""
         started = time.perf_counter()
-        if len(self._steps) <= _LONGEST:
-            self._steps.append(number - self._last)
-        if self._batches is None or count != self._count or number != next(self._numbers):
+        if count != self._count or number != next(self._expected):
             self._start(number, count)
-        assert self._batches is not None, "just started"
-        samples, self._last = self._following(self._batches), number
+        samples = self._following()
         if self._recipe.workers:
             self._samples.skips.extend(samples.skipped)  # each worker has its own account
         numbers = tuple(self._order.batch(number, count))
         return LoadedBatch(samples, numbers, time.perf_counter() - started)
 
-    def _following(self, batches: "Iterator[SampleBatch | TrainError]") -> SampleBatch:
+    def _following(self) -> SampleBatch:
         try:
-            samples = next(batches)
+            samples = next(self._batches)
         except RuntimeError as error:  # what torch makes of a process that is gone
             raise RunError(
                 f"a process that makes samples was killed, most likely for want of memory ({error}); give fewer "
@@ -94,37 +91,34 @@ class SampleLoader:
         return samples
 
     def _start(self, number: int, count: int) -> None:
-        """From this number on, in the steps that were taken so far: processes of a group take turns, if need be
-        unevenly, and an update's steps are those of the one before. Later, or backwards, it is a jump."""
-        known = self._batches is not None and count == self._count and number >= self._last
-        if not known or len(self._steps) > _LONGEST:
-            self._steps = []
-        steps, self._count = tuple(self._steps) or (1,), count
-        self._numbers, numbers = _numbered(number + steps[0], (*steps[1:], steps[0])), _numbered(number, steps)
-        self._batches = iter(self._loader(numbers)) if self._recipe.workers else self._here(numbers)
+        """From this number on, in this process's turns."""
+        self._count = count
+        self._expected, numbers = islice(self._from(number), 1, None), self._from(number)
+        if self._recipe.workers:
+            self._batches = iter(self._loader(numbers))
+        else:
+            ahead = (self._order.batch(each, count) for each in numbers)
+            self._batches = (collate([self._samples.sample(index) for index in batch]) for batch in ahead)
 
-    def _here(self, numbers: Iterator[int]) -> Iterator[SampleBatch | TrainError]:
-        for number in numbers:
-            yield collate([self._samples.sample(index) for index in self._order.batch(number, self._count)])
+    def _from(self, number: int) -> Iterator[int]:
+        update, part = divmod(number, self._parts)
+        first = self._turns.index(part) if part in self._turns else 0
+        yield from (update * self._parts + turn for turn in self._turns[first:])
+        for later in count(update + 1):
+            yield from (later * self._parts + turn for turn in self._turns)
 
     def _loader(self, numbers: Iterator[int]) -> DataLoader[Sample | TrainError]:
-        recipe, count = self._recipe, self._count
+        recipe, size = self._recipe, self._count
         order = SampleOrder(self._order.length, self._order.seed)  # read ahead, so not the one that is looked up
         return DataLoader(
             _Numbered(self._samples),
-            batch_sampler=(order.batch(number, count) for number in numbers),
+            batch_sampler=(order.batch(number, size) for number in numbers),
             num_workers=recipe.workers,
-            prefetch_factor=recipe.prefetch,
             collate_fn=_collated,
-            pin_memory=recipe.pin and torch.cuda.is_available(),
+            pin_memory=torch.cuda.is_available(),
             multiprocessing_context=get_context("spawn"),
             worker_init_fn=_settle,
         )
-
-
-def _numbered(first: int, steps: Sequence[int]) -> Iterator[int]:
-    """`first`, then on and on by the steps in turn."""
-    return accumulate(cycle(steps), initial=first)
 
 
 class _Numbered(Dataset[Sample | TrainError]):

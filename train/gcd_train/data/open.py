@@ -1,9 +1,11 @@
 """From a recipe's [data] and the folders a user names to what a run learns from and is measured on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import torch
 
 from gcd_model.config import ModelConfig
@@ -168,7 +170,7 @@ class _Opening:
         require_apart(dict.fromkeys(cache.scenes, ""), dict.fromkeys(held.scenes, ""))
         clips = self._one_rate(held, held.fps)
 
-        def batches(networks: Networks, precision: Precision, /) -> BatchSource:
+        def batches(networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
             return CachedBatches(cache, networks, self.recipe.unet, precision, self._data.path)
 
         return RunData(clips=clips, valid=clips, batches=batches)
@@ -247,9 +249,9 @@ class _Opening:
         if recipe.data.task == "image-to-video":
             samples = VideoSamples(samples)
 
-        def batches(networks: Networks, precision: Precision, /) -> BatchSource:
-            loader = recipe.data.loader
-            return SampleBatches(samples, networks, recipe.unet, self.family, precision, loader, recipe.seed)
+        def batches(networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
+            loader, seed = recipe.data.loader, recipe.seed
+            return SampleBatches(samples, networks, recipe.unet, self.family, precision, loader, seed, turns)
 
         return batches
 
@@ -261,7 +263,6 @@ class _Opening:
             frames=self.config.frames,
             fps=self.recipe.unet.fps,
             size=(self.config.width, self.config.height),
-            tolerance_s=options.tolerance_s,
             cameras=options.cameras,
             calibration=None if options.calibration is None else Path(options.calibration),
             repeats=self._data.repeats,
@@ -281,7 +282,6 @@ class _Opening:
             "model.camera": config.camera != "none",
             "model.frames": config.frames != kept.plan.clip_frames,
             "model.height and model.width": (config.height, config.width) != (kept.height, kept.width),
-            "unet.image_share": unet.image_share > 0,
             "unet.augmentation": unet.augmentation != kept.augmentation,
             "unet.loss.class_weights": unet.loss.class_weights != "none" and not kept.emphasis,
             "data.path": data.path not in kept.plan.paths,
@@ -348,17 +348,7 @@ def sampling_of(recipe: Recipe, frames: int, *, stride: int | None = None) -> Sa
     move_time = data.goal_frame(frames)
     if not orbits:
         return DrivingSampling(move_time=move_time, frames=chosen)
-    orbit = data.orbit
-    return OrbitSampling(
-        max_azimuth_deg=orbit.max_azimuth_deg,
-        max_elevation_deg=orbit.max_elevation_deg,
-        max_radius_m=orbit.max_radius_m,
-        azimuth_deg=orbit.azimuth_deg,
-        elevation_deg=orbit.elevation_deg,
-        radius_m=orbit.radius_m,
-        move_time=move_time,
-        frames=chosen,
-    )
+    return OrbitSampling(**msgspec.structs.asdict(data.orbit), move_time=move_time, frames=chosen)
 
 
 def _splat_device(recipe: DataRecipe) -> str:

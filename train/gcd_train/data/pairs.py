@@ -48,7 +48,6 @@ class PairedClip:
     source_classes: Bytes
     target_classes: Bytes
     source_instances: Bytes
-    target_instances: Bytes
     seed: int
 
 
@@ -128,7 +127,6 @@ class PairedClips(Clips):
             source_classes=self._classes(index, "source"),
             target_classes=self._classes(index, "target"),
             source_instances=self._strip(index, "source.instances"),
-            target_instances=self._strip(index, "target.instances"),
             seed=self.seeds[index],
         )
 

@@ -73,12 +73,6 @@ def scene_name(number: int) -> str:
     return f"scene_{number:06d}"
 
 
-def scene_number(name: str) -> int | None:
-    """The number in a folder's name, None if it is no scene of this layout."""
-    named = re.fullmatch(r"scene_(\d{6,})", name)
-    return None if named is None else int(named[1])
-
-
 def frame_stem(time: int) -> str:
     """File name without suffix of frame number `time`."""
     return f"{10 * time + 5:018d}"
@@ -139,7 +133,7 @@ class ParallelDomain4D(Dataset4D):
         source_camera: str = FORWARD,
     ) -> None:
         root = Path(root)
-        found = scene_names(root, scene_number, "scene_000000") if scenes is None else scenes
+        found = scene_names(root, "parallel_domain4d") if scenes is None else scenes
         super().__init__(root, found, cameras, source_camera)
         if source_camera not in self.cameras:
             raise DataError(f"the source camera {source_camera} is none of {', '.join(self.cameras)}")

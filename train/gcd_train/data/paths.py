@@ -128,8 +128,8 @@ class Draw:
     fps: float
     world_from_source: NDArray[np.float64]
     world_from_target: NDArray[np.float64]
-    start: Spherical | None
-    deltas: NDArray[np.float64] | None
+    start: Spherical | None = None
+    deltas: NDArray[np.float64] | None = None
 
 
 def generator(seed: int, index: int, attempt: int = 0) -> np.random.Generator:
@@ -251,14 +251,13 @@ class DrivingSampling:
         last = len(numbers) - 1
         move_time = last if self.move_time is None else self.move_time
         path = driving_trajectory(frames=len(numbers), move_time=move_time)
-        vehicle_from_source = _vehicle_from_source()
+        ends = DRIVING_SOURCE_POSITION, DRIVING_SOURCE_TARGET
+        vehicle_from_source = look_at(*(torch.tensor(point, dtype=torch.float64) for point in ends)).numpy()
         return Draw(
             frame_numbers=numbers,
             fps=fps,
             world_from_source=vehicle_from_source,
             world_from_target=vehicle_from_source @ path.source_from_target.numpy(),
-            start=None,
-            deltas=None,
         )
 
 
@@ -268,11 +267,6 @@ DRIVING = DrivingSampling()
 
 Sampling: TypeAlias = OrbitSampling | DrivingSampling
 """Draws samples."""
-
-
-def _vehicle_from_source() -> NDArray[np.float64]:
-    position, target = (torch.tensor(p, dtype=torch.float64) for p in (DRIVING_SOURCE_POSITION, DRIVING_SOURCE_TARGET))
-    return look_at(position, target).numpy()
 
 
 def _step(rng: np.random.Generator, at: float, most: float, bounds: Range) -> float:

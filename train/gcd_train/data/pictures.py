@@ -23,8 +23,9 @@ from gcd_train.data.dataset4d import VOID, Dataset4D
 from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_manifest
 from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
+from gcd_train.data.splat import Splatted, splat
+from gcd_train.data.visibility import depth_visibility, published_picture, render_lens, visibility
 from gcd_train.errors import DataError, RenderError
-from gcd_train.pointcloud import SplatOptions, depth_visibility, published_picture, render_lens, splat, visibility
 
 if TYPE_CHECKING:
     from gcd_train.scenes.frozen import FrozenScene
@@ -82,6 +83,7 @@ class Pictures(ABC):
             scene=scene,
             frame_numbers=draw.frame_numbers,
             visible=np.stack(made.visible) if self._options.visible else None,
+            target_depth=np.stack(made.depth) if made.depth else None,
         )
 
     @abstractmethod
@@ -98,6 +100,7 @@ class _Drawn:
     target: list[Bytes] = field(default_factory=list[Bytes])
     classes: list[Bytes] = field(default_factory=list[Bytes])
     visible: list[NDArray[np.bool_]] = field(default_factory=list[NDArray[np.bool_]])
+    depth: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
 
 
 class SplatPictures(Pictures):
@@ -124,21 +127,14 @@ class SplatPictures(Pictures):
             if self._options.class_ids:
                 made.classes.append(self._target_ids(views, world_from_target, lens))
             if self._options.visible:
-                made.visible.append(
-                    visibility(seen, world_from_target, lens, width=across, height=along, options=self._points)
-                )
+                size, published = self._options.size, self._options.published
+                made.visible.append(visibility(seen, world_from_target, lens, size, published=published))
         return made
-
-    @property
-    def _points(self) -> SplatOptions:
-        return SplatOptions(published=self._options.published)
 
     def _target_ids(self, views: Sequence[SceneView], world_from_target: Doubles, lens: Intrinsics) -> Bytes:
         """The class of the point that shows most in each pixel, `VOID` where none does: colours of edges are mixed, and
         read back as a third class."""
-        smaller = render_lens(lens, self._width, self._height)
-        labels, device = self._ids(views), self._options.device
-        drawn = splat(views, world_from_target, smaller, labels=labels, options=self._points, device=device)
+        drawn = self._splat(views, world_from_target, lens, self._ids(views))
         return drawn.labels.masked_fill(~drawn.covered, VOID).byte().cpu().numpy()
 
     def _ids(self, views: Sequence[SceneView]) -> list[Bytes]:
@@ -156,23 +152,28 @@ class SplatPictures(Pictures):
         lens: Intrinsics,
         values: Sequence[Bytes] | None = None,
     ) -> Bytes:
+        options = self._options
         return published_picture(
             views,
             world_from_camera,
             lens,
-            width=self._width,
-            height=self._height,
+            options.size,
             values=values,
-            options=self._points,
-            device=self._options.device,
+            published=options.published,
+            device=options.device,
         )
 
     def _seen(self, views: Sequence[SceneView], world_from_source: Doubles, lens: Intrinsics) -> SceneView:
         """What a camera at a drawn source pose would have seen, with depth, from the points of all."""
-        smaller = render_lens(lens, self._width, self._height)
-        drawn = splat(views, world_from_source, smaller, options=self._points, device=self._options.device)
-        rgb = (drawn.colour * 255).round().byte().cpu().numpy()
-        return _view(rgb, drawn.depth.cpu().numpy(), world_from_source, smaller)
+        drawn = self._splat(views, world_from_source, lens)
+        smaller = render_lens(lens, *self._options.size)
+        return _view(drawn.picture, drawn.depth.cpu().numpy(), world_from_source, smaller)
+
+    def _splat(
+        self, views: Sequence[SceneView], at: Doubles, lens: Intrinsics, labels: Sequence[Bytes] | None = None
+    ) -> Splatted:
+        smaller, options = render_lens(lens, *self._options.size), self._options
+        return splat(views, at, smaller, labels=labels, published=options.published, device=options.device)
 
 
 class ExactPictures(Pictures):
@@ -195,7 +196,7 @@ class ExactPictures(Pictures):
 
         folder, numbers = self._dataset.folder(scene), list(draw.frame_numbers)
         lens = render_lens(self._dataset.lens(scene), self._width, self._height)
-        renderer, still = self._own_renderer(), frames_of(folder, numbers, lens)
+        still, renderer = frames_of(folder, numbers, lens), self._own_renderer()
         geometry_from_world = geometry_poses(folder, numbers)
         cameras = {
             _SOURCE: geometry_from_world @ draw.world_from_source,
@@ -211,6 +212,7 @@ class ExactPictures(Pictures):
             if self._options.modality == "classes":
                 made.target = [self._ontology.encode(ids) for ids in made.classes]
         if self._options.visible:  # where the source saw the very surface of the target
+            made.depth = [each.depth for each in drawn[_TARGET]]
             each = zip(drawn[_SOURCE], cameras[_SOURCE], drawn[_TARGET], cameras[_TARGET], strict=True)
             made.visible = [
                 depth_visibility(_view(near.rgb, near.depth, at, lens), far.depth, aimed, lens)
@@ -260,15 +262,13 @@ class ViewPairs(DrawnSamples):
 
         Raises: DataError, FileFault: it cannot be read; nothing stands in for it.
         """
-        return self.pair(scene, self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps))
-
-    def pair(self, scene: str, draw: Draw) -> Sample:
-        """A sample drawn elsewhere. Raises DataError, FileFault: it cannot be read."""
+        draw = self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps)
         return self._pictures.sample(scene, draw)
 
     def _made(self, number: int, random: np.random.Generator) -> Sample:
         scene, _ = self._place(number)
-        return self.pair(scene, self.sampling.draw(random, self.dataset.frames(scene), self.dataset.fps))
+        draw = self.sampling.draw(random, self.dataset.frames(scene), self.dataset.fps)
+        return self._pictures.sample(scene, draw)
 
     def _place(self, number: int) -> tuple[str, Path]:
         scene = self.dataset.scenes[number % len(self.dataset.scenes)]

@@ -50,7 +50,8 @@ class Sample:
     start: the source camera on the sphere, and deltas: f64 [T, 3] azimuth and elevation in degrees and radius in
     metres, target minus source; None for paths that are not on the sphere. fps: of the clip, after the stride.
     scene: its name. frame_numbers: of the scene, T. visible: bool [T, H, W], target pixels that the source camera saw,
-    None where not asked for. skipped: what was tried before and left out.
+    None where not asked for. target_depth: f32 [T, H, W] metres, with `visible` of a target that was drawn exactly.
+    skipped: what was tried before and left out.
     """
 
     source: Bytes
@@ -63,6 +64,7 @@ class Sample:
     start: Spherical | None = None
     deltas: NDArray[np.float64] | None = None
     visible: NDArray[np.bool_] | None = None
+    target_depth: NDArray[np.float32] | None = None
     skipped: tuple[Skipped, ...] = ()
 
     @property

@@ -1,20 +1,25 @@
 """Which scenes are for training, validation and test, by number, split file or list; which clips are evaluated."""
 
+import difflib
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from filecmp import cmp
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 
 from gcd_model.errors import FileError, PoseError
-from gcd_model.geometry import Spherical
+from gcd_model.geometry import Spherical, SphericalDelta
 from gcd_model.small_files import read_json, read_small
-from gcd_train.data import kubric4d, parallel_domain4d
+from gcd_train.data.dataset4d import layout_of, scene_number
 from gcd_train.data.files import Skips
-from gcd_train.data.paths import Control, Controls
-from gcd_train.errors import DataError
+from gcd_train.data.paths import Control, Controls, OrbitSampling, Sampling, generator
+from gcd_train.errors import DataError, RecipeError
 
 Part = Literal["train", "val", "test"]
 
@@ -36,7 +41,7 @@ class SplitFile(msgspec.Struct, frozen=True, kw_only=True):
 def kubric_split(scenes: Iterable[str], part: Part) -> tuple[str, ...]:
     """The scenes of one part of Kubric-4D, by number: 0-2799 train, 2800-2899 val, 2900-2999 test."""
     wanted = _KUBRIC_RANGES[part]
-    return tuple(scene for scene in scenes if kubric4d.scene_number(scene) in wanted)
+    return tuple(scene for scene in scenes if scene_number(scene) in wanted)
 
 
 def read_split(path: Path, part: Part) -> tuple[str, ...]:
@@ -119,20 +124,53 @@ def _entry(line: str) -> tuple[str, str]:
         return "", ""
     place, _, comment = line.lstrip("# \t").partition("#")
     name = Path(place.strip()).name
-    if line.startswith("#") and not _is_scene(name):
+    if line.startswith("#") and not layout_of(name):
         return "", ""  # prose that happens to say "invalid"
     if name and _LIST_MARK.search(comment):
         return name, "is marked invalid"
     if line.startswith("#"):
         return "", ""
-    if name and not _is_scene(name):
+    if name and not layout_of(name):
         return name, "is no scene name"
     return name, ""
 
 
-def _is_scene(name: str) -> bool:
-    numbers = kubric4d.scene_number(name), parallel_domain4d.scene_number(name)
-    return any(number is not None for number in numbers)
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PublicSplit:
+    """One part of a world's scenes. runs: of seeds, or of Kubric-4D's scene numbers, that follow each other."""
+
+    name: str
+    world: str
+    runs: tuple[range, ...]
+
+    def __contains__(self, seed: int) -> bool:
+        return any(seed in run for run in self.runs)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.runs))
+
+
+def public_splits() -> dict[str, PublicSplit]:
+    """All there are by name, such as `driving-test`; from `splits_public`."""
+    found: dict[str, PublicSplit] = {}
+    for file in (files("gcd_train") / "splits_public").iterdir():
+        if file.name.endswith(".json"):
+            told = json.loads(file.read_bytes())
+            for part, runs in told["parts"].items():  # each run: the first seed, and how many
+                name = f"{file.name.removesuffix('.json')}-{part}"
+                each = tuple(range(first, first + count) for first, count in runs)
+                found[name] = PublicSplit(name=name, world=told["world"], runs=each)
+    return dict(sorted(found.items()))
+
+
+def public_split(name: str) -> PublicSplit:
+    """The part of that name. Raises RecipeError for another."""
+    every = public_splits()
+    if name not in every:
+        near = difflib.get_close_matches(name, every, n=1)
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise RecipeError(f"no split is called {name!r}, and it is no file; {meant}there are {', '.join(every)}")
+    return every[name]
 
 
 class _Entry(msgspec.Struct, frozen=True):
@@ -180,3 +218,71 @@ def _camera(numbers: tuple[float, float, float] | None) -> Spherical | None:
         return None
     azimuth_deg, elevation_deg, radius_m = numbers
     return Spherical(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+PAPER_ELEVATION_DEG = 5.0
+"""How high the source camera stands in the paper's evaluation on Kubric-4D."""
+RELEASED_SOURCE = Spherical(azimuth_deg=20.0, elevation_deg=10.0, radius_m=15.0)
+"""Where the released script's source camera stands without controls."""
+_RELEASED_CHANGE = SphericalDelta(azimuth_deg=30.0, elevation_deg=15.0, radius_m=0.0)  # where it goes from there
+_RELEASED_START, _RELEASED_SKIP = 0, 2  # its first frame and stride
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneControls:
+    """Which clips are cut from each scene; the same for a scene whatever others there are.
+
+    clips: of each scene, at most. sampling: how they are drawn, from the seed and the scene's number; those of an orbit
+    have one source and the same frames, and differ in the goal. listed: clips by scene, instead of drawn ones. start,
+    skip: first frame and stride of every clip, whatever is listed or drawn; None for those.
+    """
+
+    clips: int
+    sampling: Sampling
+    seed: int = 0
+    listed: Controls | None = None
+    start: int | None = None
+    skip: int | None = None
+
+    def names(self, scene: str) -> Sequence[str]:
+        """Of the clips of a scene, in order: `sample_00`; none for a scene that is not listed."""
+        if self.listed is not None:
+            return tuple(control.name for control in self.listed.get(scene, ())[: self.clips])
+        return tuple(f"sample_{number:02d}" for number in range(self.clips))
+
+    def control(self, scene: str, name: str, frames: int) -> Control:
+        """One of them, for a scene of so many time steps. Raises DataError if the scene is too short."""
+        if self.listed is not None:
+            found = next(each for each in self.listed[scene] if each.name == name)
+            start = found.frame_start if self.start is None else self.start
+            return replace(found, frame_start=start, frame_skip=found.frame_skip if self.skip is None else self.skip)
+        seeds, clip = (self.seed, scene_number(scene)), self.names(scene).index(name)
+        if not isinstance(self.sampling, OrbitSampling):
+            start, skip = self._frames(generator(*seeds, clip), frames)
+            return Control(name=name, frame_start=start, frame_skip=skip)
+        rng = generator(*seeds)
+        start, skip = self._frames(rng, frames)
+        source = replace(self.sampling.source(rng), elevation_deg=PAPER_ELEVATION_DEG)
+        goal = source + self.sampling.change(generator(*seeds, 1 + clip), source)
+        return Control(name=name, frame_start=start, frame_skip=skip, start=source, goal=goal)
+
+    def _frames(self, rng: np.random.Generator, frames: int) -> tuple[int, int]:
+        """First frame and stride."""
+        if self.start is not None and self.skip is not None:
+            return self.start, self.skip
+        usual = self.sampling.frames
+        strides = usual.strides if self.skip is None else (self.skip,)
+        numbers, stride = replace(usual, strides=strides, reverse=0.0).draw(rng, frames)
+        return numbers[0] if self.start is None else self.start, stride
+
+
+def released_controls(scenes: Sequence[str], *, orbit: bool) -> Controls:
+    """The one clip of each scene that the released script makes without a control list. orbit: False in driving."""
+    control = Control(
+        name="sample_00",
+        frame_start=_RELEASED_START,
+        frame_skip=_RELEASED_SKIP,
+        start=RELEASED_SOURCE if orbit else None,
+        goal=RELEASED_SOURCE + _RELEASED_CHANGE if orbit else None,
+    )
+    return dict.fromkeys(scenes, (control,))

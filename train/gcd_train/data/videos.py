@@ -48,7 +48,7 @@ class FileLens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     @property
     def lens(self) -> Intrinsics:
         """Raises OptionError or ShapeError if it is none."""
-        return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, width=self.width, height=self.height)
+        return Intrinsics(**{field: getattr(self, field) for field in FileLens.__struct_fields__})
 
 
 class _Camera(FileLens, frozen=True, kw_only=True):

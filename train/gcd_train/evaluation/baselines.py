@@ -15,6 +15,7 @@ from gcd_model.config import SemanticClass
 from gcd_model.diffusion import unit_noise
 from gcd_model.geometry.trajectory import pose_trajectory
 from gcd_train.data.sample import Bytes, SceneView, to_network
+from gcd_train.data.visibility import NARROW, published_tensor
 from gcd_train.errors import DataError
 from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
 from gcd_train.evaluation.metrics import NO_CLASS
@@ -29,7 +30,6 @@ from gcd_train.evaluation.predictors import (
     to_pictures,
     to_pixels,
 )
-from gcd_train.pointcloud import SplatOptions, published_tensor
 
 VANILLA_SVD, REPROJECT_RGBD, REPROJECT_SEMD = "vanilla_svd", "reproject_rgbd", "reproject_semd"
 MOTION_BUCKET = 127.0
@@ -38,13 +38,12 @@ FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
 """Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
 
 _NEAREST_SOURCE_M = 0.1  # in front of the source camera
-_KERNEL, _SIGMA = 3, 0.75
 _HOLE = 0.5  # share of a pixel below which it counts as a hole
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Baseline:
-    """What all that moves the source about has; see Predictor. published: points count as released, `SplatOptions`."""
+    """What all that moves the source about has; see Predictor. published: points count as released, see `splat`."""
 
     name: str
     privileged: bool = False
@@ -169,18 +168,16 @@ def _published(clip: SourceClip, views: Sequence[SceneView], values: Sequence[By
     values: uint8 [H, W, C] for each, shown instead of the colours.
     """
     lens, poses = clip.cameras.target, clip.cameras.source_from_target.numpy()
-    options = replace(SplatOptions(), published=published)
+    size = lens.width, lens.height
     frames = [
         published_tensor(
             [view],
             view.world_from_camera @ pose,
             lens,
-            width=lens.width,
-            height=lens.height,
+            size,
             values=None if values is None else [values[t]],
-            options=options,
-            kernel=_KERNEL,
-            sigma=_SIGMA,
+            published=published,
+            filling=NARROW,
         )
         for t, (view, pose) in enumerate(zip(views, poses, strict=True))
     ]

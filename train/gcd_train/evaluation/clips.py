@@ -22,10 +22,11 @@ from gcd_train.data.files import ZIP_FAULTS
 from gcd_train.data.pairs import PairedClip, PairedClips
 from gcd_train.data.pictures import SAME_POSE, ViewPairs, trained_lens, trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
+from gcd_train.data.splat import splat
+from gcd_train.data.splits import SceneControls
+from gcd_train.data.visibility import depth_visibility, render_lens
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_views
-from gcd_train.evaluation.protocol import SceneControls
-from gcd_train.pointcloud import depth_visibility, render_lens, splat
 
 Number = TypeVar("Number", bound=np.generic)
 

@@ -9,10 +9,11 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Self
 
 import torch
 from torch import Tensor
+from typer import Option
 
 from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, weights_path
 from gcd_model.clip import nearest_classes
@@ -35,7 +36,7 @@ from gcd_train.evaluation.baselines import (
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, names_of
 from gcd_train.evaluation.hexplane import HexPlaneSettings
 from gcd_train.evaluation.metrics import NO_CLASS, Lpips
-from gcd_train.evaluation.opening import ClipOptions, data_kind, open_clips
+from gcd_train.evaluation.opening import SAMPLES, ClipOptions, open_clips, scene_layout
 from gcd_train.evaluation.predictors import (
     CameraPair,
     OpenedWeights,
@@ -45,7 +46,6 @@ from gcd_train.evaluation.predictors import (
     SourceClip,
     open_weights,
 )
-from gcd_train.evaluation.protocol import SAMPLES
 from gcd_train.evaluation.store import LPIPS, RunNote
 
 _SAME_PATH_M = 1e-3
@@ -184,24 +184,39 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class EvaluateOptions(ClipOptions):
-    """What is asked of `gcd-train evaluate`: one field for each of its options, see there. None: left out."""
+    """What is asked of `gcd-train evaluate`: one field for each of its options. None: left out."""
 
-    weights: str | None = None
-    steps: Sequence[int] | None = None
-    samples: int | None = None
-    guidance: tuple[float, float] | None = None
-    quality: Quality = "exact"
-    solver: SolverName | None = None
-    guidance_interval: tuple[float, float] | None = None
-    baselines: bool = True
-    methods: Sequence[str] | None = None
-    svd: str | None = None
-    predictions: Sequence[str] | None = None
-    privileged: Sequence[str] | None = None
-    hexplane: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
-    lpips: Path | None = None
-    device: str = "auto"
-    dtype: str | None = None
+    weights: Annotated[list[str] | None, Option(help="package:NAME or a path; without, baselines alone.")] = None
+    steps: Annotated[
+        list[int] | None, Option(min=1, help="Also with so many steps of the sampler; may be repeated.")
+    ] = None
+    samples: Annotated[
+        int | None, Option(min=1, help="Draws of each view; by default 1 of pairs, else by the protocol.")
+    ] = None
+    guidance: Annotated[
+        tuple[float, float] | None, Option(help="Of the first and the last frame; by default as shipped.")
+    ] = None
+    quality: Annotated[Quality, Option(help="As the weights ship, or in fewer steps where they take many.")] = "exact"
+    solver: Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")] = None
+    guidance_interval: Annotated[
+        tuple[float, float] | None, Option(help="Noise levels guidance applies at; by default all.")
+    ] = None
+    baselines: Annotated[bool, Option(help="Also measure what has to be beaten.")] = True
+    methods: Annotated[
+        list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")
+    ] = None
+    svd: Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")] = None
+    predictions: Annotated[
+        list[str] | None, Option(help="NAME=FOLDER with frames of another method; may be repeated.")
+    ] = None
+    privileged: Annotated[
+        list[str] | None, Option(help="NAME of --predictions that was given depth or other views: *.")
+    ] = None
+    hexplane_updates: Annotated[int, Option(min=1, help="hexplane_K: steps of learning a clip.")] = 1000
+    hexplane_rays: Annotated[int, Option(min=1, help="hexplane_K: rays in each of these steps.")] = 1024
+    lpips: Annotated[Path | None, Option(help="Folder with LPIPS weights; without, no such figure.")] = None
+    device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
+    dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; by default as stored.")] = None
 
 
 def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, ...], tuple[str, ...]]:
@@ -217,11 +232,15 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
         raise RecipeError("--methods names baselines and --no-baselines wants none; leave one of the two out")
     if options.svd is not None and VANILLA_SVD not in (named or ()):
         raise RecipeError(f"--svd is for {VANILLA_SVD}, which --methods does not name; name it, or leave out --svd")
-    weights = None
-    if options.weights is not None:
-        weights = partial(open_weights, _resolved(options.weights), options.device, options.dtype)
+    weights, given = None, options.weights or []
+    if len(given) > 1:
+        raise RecipeError(
+            f"one --weights is measured at a time, got {' and '.join(given)}; give each its own line, to one --out"
+        )
+    if given:
+        weights = partial(open_weights, _resolved(given[0]), options.device, options.dtype)
     clips, notes = open_clips(options, None if weights is None else weights().traits)
-    samples = options.samples or (1 if data_kind(options.data) == "pairs" else SAMPLES[options.protocol])
+    samples = options.samples or (1 if scene_layout(options.data) is None else SAMPLES[options.protocol])
     options, methods = replace(options, samples=samples), list[Predictor]()
     if weights is not None:
         sampling = RenderOptions(
@@ -330,18 +349,15 @@ def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: Evalua
         if name == REPROJECT_SEMD and not clips.classes:
             raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
         if views:
-            settings = options.hexplane
+            settings = HexPlaneSettings(updates=options.hexplane_updates, rays=options.hexplane_rays)
             found.append(HexPlane(views=views, settings=settings, seed=options.seed, device=options.device))
         elif name == VANILLA_SVD:
             found.append(_vanilla_svd(options))
         elif name in makers:
             found.append(makers[name]())
         else:
-            every = (
-                *makers,
-                VANILLA_SVD,
-                *(f"hexplane_{views}" for views in (1, 2, 4, 8)),
-            )  # any other number goes too
+            some = (f"hexplane_{number}" for number in (1, 2, 4, 8))  # any other number goes too
+            every = (*makers, VANILLA_SVD, *some)
             near = difflib.get_close_matches(name, every, n=1)
             meant = f"did you mean {near[0]}? " if near else ""
             raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")

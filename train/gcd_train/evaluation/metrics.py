@@ -272,7 +272,7 @@ class Lpips:
     identity: str
 
     @classmethod
-    def open(cls, folder: Path | str, *, device: str = "cpu") -> Self:
+    def open(cls, folder: Path | str) -> Self:
         """Read the weights that lie in a folder.
 
         The folder holds torchvision's `vgg16-*.pth` and the published linear weights `vgg.pth`, or `alexnet-*.pth` and
@@ -291,8 +291,8 @@ class Lpips:
         features.load_state_dict(dict(zip(features.state_dict(), state, strict=True)))
         return cls(
             network=name,
-            features=features.to(device).eval().requires_grad_(False),
-            heads=tuple(each.to(device) for each in heads),
+            features=features.eval().requires_grad_(False),
+            heads=tuple(heads),
             identity=f"{name}-{digest.hexdigest()[:12]}",
         )
 
@@ -303,7 +303,7 @@ class Lpips:
         Args:
             draws: [S, T, 3, H, W]. targets: [T, 3, H, W].
         Returns:
-            float32 [S, T] on the CPU.
+            float32 [S, T].
         Raises:
             ShapeError: shapes differ, or pictures are too small for the network.
         """
@@ -312,13 +312,12 @@ class Lpips:
         if min(targets.shape[-2:]) < least:
             raise ShapeError(f"LPIPS wants pictures of at least {least} pixels a side, got {list(targets.shape[-2:])}")
         both = (torch.cat([draws[:, t], targets[t : t + 1]]) for t in range(len(targets)))
-        return torch.stack([self._of_frame(pictures.float()).cpu() for pictures in both], dim=1)
+        return torch.stack([self._of_frame(pictures.float()) for pictures in both], dim=1)
 
     def _of_frame(self, pictures: Tensor) -> Tensor:
         """Distances of all pictures but the last to the last: [S+1, 3, H, W] -> [S]."""
-        device = self.heads[0].device
-        mean, deviation = (torch.tensor(values, device=device).view(1, 3, 1, 1) for values in (_MEAN, _DEVIATION))
-        x, apart = (pictures.to(device) - mean) / deviation, list[Tensor]()
+        mean, deviation = (torch.tensor(values).view(1, 3, 1, 1) for values in (_MEAN, _DEVIATION))
+        x, apart = (pictures - mean) / deviation, list[Tensor]()
         for place, layer in enumerate(self.features):
             x = layer(x)
             if place in _KINDS[self.network].compared:

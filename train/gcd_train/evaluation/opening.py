@@ -1,38 +1,59 @@
-"""From the folders and options of a user to the clips that are measured."""
+"""From the folders and options of a user to the clips that are measured.
 
-import difflib
+Of whole scenes as in the paper, or as its released test script does:
+Paper: one part of each scene's video, in Kubric-4D seen on the way to four goals. The source stands at an elevation of
+5 degrees, all else is drawn, goals up to 90 degrees away whatever the model; a control list fixes all of it. Source:
+Van Hoorick et al. 2024 (GCD), appendix.
+Release: the first clip of each scene's controls, or the script's own angles; frames of the command line win.
+"""
+
 import hashlib
-import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
-from importlib.resources import files
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Annotated, Literal, TypeAlias, get_args
+
+from typer import Option
 
 from gcd_model import Traits
 from gcd_model.small_files import read_small
 from gcd_train.data import kubric4d, parallel_domain4d
+from gcd_train.data.dataset4d import Dataset4D, LayoutName, layout_in, layout_of, scene_number
 from gcd_train.data.files import MANIFEST, Skips, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
-from gcd_train.data.paths import CLIP, DRIVING_FRAMES, KUBRIC_FRAMES, DrivingSampling, FrameSampling, OrbitSampling
+from gcd_train.data.paths import (
+    CLIP,
+    DRIVING_FRAMES,
+    KUBRIC_FRAMES,
+    MAX90,
+    MAX180,
+    DrivingSampling,
+    FrameSampling,
+    OrbitSampling,
+    Sampling,
+)
 from gcd_train.data.pictures import PictureOptions, ViewPairs
-from gcd_train.data.splits import MOST_BYTES, Part, present, read_controls, read_scene_list, read_split
+from gcd_train.data.splits import (
+    MOST_BYTES,
+    Part,
+    PublicSplit,
+    SceneControls,
+    present,
+    public_split,
+    read_controls,
+    read_scene_list,
+    read_split,
+    released_controls,
+)
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
-from gcd_train.evaluation.protocol import (
-    ProtocolName,
-    SceneControls,
-    controlled,
-    released_controls,
-    require_cameras,
-    scene_number,
-)
 
-DataKind: TypeAlias = Literal["pairs", "kubric4d", "parallel_domain4d"]
-"""What a folder holds."""
+ProtocolName: TypeAlias = Literal["paper", "release"]
+SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2}
+"""Draws of each clip of a scene; of pairs, which no protocol cuts, there is one."""
 Size: TypeAlias = tuple[int, int, int]
 """T, H and W of clips."""
 
@@ -43,61 +64,33 @@ _SMALL_BYTES = 4 << 20
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipOptions:
-    """Which clips are measured: one field for each of these options of `gcd-train evaluate`. None: left out."""
+    """Which clips are measured: options of `gcd-train evaluate`. None: left out."""
 
-    data: Sequence[Path]
-    split: str | None = None
-    listed: Path | None = None
-    limit: int | None = None
-    protocol: ProtocolName = "paper"
-    controls: Path | None = None
-    trajectories: int | None = None
-    frame_start: int | None = None
-    frame_skip: int | None = None
-    angles: Literal["max90", "max180"] | None = None
-    path: Literal["gradual", "direct"] | None = None
-    modality: Literal["rgb", "semantic"] | None = None
-    exact: bool = False
-    camera: Sequence[str] | None = None
-    seed: int = 0
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PublicSplit:
-    """One part of a world's scenes. runs: of seeds, or of Kubric-4D's scene numbers, that follow each other."""
-
-    name: str
-    world: str
-    runs: tuple[range, ...]
-
-    def __contains__(self, seed: int) -> bool:
-        return any(seed in run for run in self.runs)
-
-    def __len__(self) -> int:
-        return sum(map(len, self.runs))
-
-
-def public_splits() -> dict[str, PublicSplit]:
-    """All there are by name, such as `driving-test`; from `splits_public`."""
-    found: dict[str, PublicSplit] = {}
-    for file in (files("gcd_train") / "splits_public").iterdir():
-        if file.name.endswith(".json"):
-            told = json.loads(file.read_bytes())
-            for part, runs in told["parts"].items():  # each run: the first seed, and how many
-                name = f"{file.name.removesuffix('.json')}-{part}"
-                each = tuple(range(first, first + count) for first, count in runs)
-                found[name] = PublicSplit(name=name, world=told["world"], runs=each)
-    return dict(sorted(found.items()))
-
-
-def public_split(name: str) -> PublicSplit:
-    """The part of that name. Raises RecipeError for another."""
-    every = public_splits()
-    if name not in every:
-        near = difflib.get_close_matches(name, every, n=1)
-        meant = f"did you mean {near[0]}? " if near else ""
-        raise RecipeError(f"no split is called {name!r}, and it is no file; {meant}there are {', '.join(every)}")
-    return every[name]
+    data: Annotated[list[Path], Option(help="Folder of pairs (several may be given), or one of whole scenes.")]
+    protocol: Annotated[ProtocolName, Option(help="How clips are cut from whole scenes.")] = "paper"
+    controls: Annotated[Path | None, Option(help="Scenes: control list, JSON.")] = None
+    split: Annotated[str | None, Option(help="Only scenes of a split: a name as driving-test, or FILE:test.")] = None
+    listed: Annotated[Path | None, Option("--list", help="Scenes: only those of a list, one a line.")] = None
+    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes.")] = None
+    trajectories: Annotated[
+        int | None, Option(min=1, help="Scenes: clips of each; by default 4 (paper, Kubric-4D) or 1.")
+    ] = None
+    frame_start: Annotated[int | None, Option(min=0, help="Scenes: first frame of every clip.")] = None
+    frame_skip: Annotated[int | None, Option(min=1, help="Scenes: frames from one of the clip to the next.")] = None
+    angles: Annotated[
+        Literal["max90", "max180"] | None, Option(help="Scenes: how far goals are drawn; by default max90.")
+    ] = None
+    path: Annotated[Literal["gradual", "direct"] | None, Option(help="Scenes: as the weights by default.")] = None
+    modality: Annotated[
+        Literal["rgb", "semantic"] | None, Option(help="Scenes: targets; as the weights by default.")
+    ] = None
+    exact: Annotated[
+        bool, Option("--exact", help="Our scenes: targets from their geometry instead of from points.")
+    ] = False
+    camera: Annotated[list[str] | None, Option(help="Scenes: a camera to read; may be repeated. By default all.")] = (
+        None
+    )
+    seed: Annotated[int, Option(min=0, help="Of drawn clips and of all noise.")] = 0
 
 
 def wanted_scenes(folder: Path, there: Sequence[str], options: ClipOptions, notes: Skips) -> tuple[str, ...]:
@@ -122,10 +115,8 @@ def wanted_scenes(folder: Path, there: Sequence[str], options: ClipOptions, note
     split = public_split(options.split)
     scenes = tuple(scene for scene in there if scene_number(scene) in split)
     for scene in scenes or there[:1]:
-        if (folder / scene / MANIFEST).is_file():
-            world = read_manifest(folder / scene).world
-        else:  # it was published, and counts as its layout
-            world = "kubric4d" if kubric4d.scene_number(scene) is not None else "parallel_domain4d"
+        made_here = (folder / scene / MANIFEST).is_file()  # else it was published, and counts as its layout
+        world = read_manifest(folder / scene).world if made_here else layout_of(scene)
         if world != split.world:
             raise _of_another_world(split, f"{folder / scene} is of {world}")
     _note_missing(split, {scene_number(scene) for scene in scenes}, notes)
@@ -142,21 +133,12 @@ def _note_missing(split: PublicSplit, there: set[int], notes: Skips) -> None:
         notes.add(split.name, "--data", f"has {len(there)} of its {len(split)} scenes")
 
 
-def data_kind(folders: Sequence[Path]) -> DataKind:
-    """What the folders hold. Raises DataError for nothing that is known, or several folders of scenes."""
-    try:
-        names = [path.name for path in folders[0].iterdir()]
-    except OSError as error:
-        raise DataError(f"{folders[0]} cannot be read ({error}); give a folder with pairs or with scenes") from error
-    if any(kubric4d.scene_number(name) is not None for name in names):
-        found: DataKind = "kubric4d"
-    elif any(parallel_domain4d.scene_number(name) is not None for name in names):
-        found = "parallel_domain4d"
-    else:
-        return "pairs"
-    if len(folders) > 1:
+def scene_layout(folders: Sequence[Path]) -> LayoutName | None:
+    """The layout of the scenes in a folder; None for pairs. Raises DataError for several folders of scenes."""
+    layout = layout_in(folders[0])
+    if layout is not None and len(folders) > 1:
         raise DataError(f"scenes are taken from one folder, got {len(folders)}; give one --data, or pairs")
-    return found
+    return layout
 
 
 def open_clips(
@@ -171,9 +153,8 @@ def open_clips(
         DataError: data cannot be read, are of another world than the split, or no clip is left; or a list or a control
             list cannot be read. RecipeError: options that contradict each other or the data, or no such split.
     """
-    if data_kind(options.data) == "pairs":
-        return _open_pairs(options)
-    return _open_scenes(options, model, size)
+    layout = scene_layout(options.data)
+    return _open_pairs(options) if layout is None else _open_scenes(options, layout, model, size)
 
 
 def _open_pairs(options: ClipOptions) -> tuple[EvaluationSet, tuple[str, ...]]:
@@ -196,10 +177,12 @@ def _open_pairs(options: ClipOptions) -> tuple[EvaluationSet, tuple[str, ...]]:
     return PairedSet.of(chosen(clips, scenes=wanted, limit=options.limit)), tuple(notes.lines())
 
 
-def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tuple[EvaluationSet, tuple[str, ...]]:
+def _open_scenes(
+    options: ClipOptions, layout: LayoutName, model: Traits | None, size: Size
+) -> tuple[EvaluationSet, tuple[str, ...]]:
     """Whole scenes, in either layout."""
     folder = options.data[0].resolve()  # processes may stand elsewhere
-    orbits, notes = data_kind([folder]) == "kubric4d", Skips(logged=False)
+    orbits, notes = layout == "kubric4d", Skips(logged=False)
     painted, gradual, released = options.modality == "semantic", options.path != "direct", options.protocol == "release"
     if model is not None:
         size = (model.config.frames, model.config.height, model.config.width)
@@ -246,7 +229,7 @@ def _open_scenes(options: ClipOptions, model: Traits | None, size: Size) -> tupl
     return clips, tuple(notes.lines())
 
 
-def _controls(options: ClipOptions, scenes: Sequence[str], sampling: OrbitSampling | DrivingSampling) -> SceneControls:
+def _controls(options: ClipOptions, scenes: Sequence[str], sampling: Sampling) -> SceneControls:
     orbits, bound, listed = isinstance(sampling, OrbitSampling), (options.frame_start, options.frame_skip), None
     if options.controls is not None:
         if options.protocol == "paper" and bound != (None, None):
@@ -267,17 +250,14 @@ def _controls(options: ClipOptions, scenes: Sequence[str], sampling: OrbitSampli
     )
 
 
-def _sampling(options: ClipOptions, clip: int, *, orbits: bool, gradual: bool) -> OrbitSampling | DrivingSampling:
+def _sampling(options: ClipOptions, clip: int, *, orbits: bool, gradual: bool) -> Sampling:
     """How goals, first frames and strides are drawn. clip: T."""
     usual = KUBRIC_FRAMES if orbits else DRIVING_FRAMES
     frames = FrameSampling(clip=clip, strides=usual.strides, latest_start=usual.latest_start)
     move_time = None if gradual else 0
     if not orbits:
         return DrivingSampling(move_time=move_time, frames=frames)
-    azimuth_deg, elevation_deg = (180.0, 60.0) if options.angles == "max180" else (90.0, 30.0)
-    return OrbitSampling(
-        max_azimuth_deg=azimuth_deg, max_elevation_deg=elevation_deg, move_time=move_time, frames=frames
-    )
+    return replace(MAX180 if options.angles == "max180" else MAX90, move_time=move_time, frames=frames)
 
 
 def _identity(folder: Path, scenes: Sequence[str], cuts: Sequence[object], controls: Path | None) -> str:
@@ -313,3 +293,52 @@ def _identity(folder: Path, scenes: Sequence[str], cuts: Sequence[object], contr
             ) from error
         digest.update(scene.encode() + of_scene.digest())
     return digest.hexdigest()[:12]
+
+
+_NAMED = 4  # cameras in a message
+
+
+def controlled(
+    scenes: Sequence[str], controls: SceneControls, listed: Path | None, folder: Path, notes: Skips
+) -> tuple[str, ...]:
+    """Scenes that have clips; the others are noted.
+
+    Args:
+        listed: the control list, None without. folder: where the scenes lie.
+    Raises:
+        DataError: there are scenes, and the list has none of them, or is for driving and they are seen along orbits.
+    """
+    there = tuple(scene for scene in scenes if controls.names(scene))
+    if scenes and not there:
+        raise DataError(
+            f"the control list {listed} has none of the {len(scenes)} scenes in {folder}, first {scenes[0]}; "
+            "give the list of these scenes"
+        )
+    for scene in scenes:
+        if scene not in there:
+            notes.add(scene, str(listed), "has no control for it")
+    if controls.listed is not None and isinstance(controls.sampling, OrbitSampling):
+        for scene, control in ((name, control) for name in there for control in controls.listed[name]):
+            if control.start is None or control.goal is None:
+                raise DataError(
+                    f"{listed}: {scene}, {control.name} has no spherical_start: it is a driving control, and these "
+                    "scenes are seen along orbits; give Kubric-4D's controls"
+                )
+    return there
+
+
+def require_cameras(data: Dataset4D) -> None:
+    """Raises DataError, with the first fault, where no scene can be opened with all of its cameras."""
+    faults: list[DataError] = []
+    for scene in data.scenes:
+        try:
+            data.frames(scene)
+            return
+        except DataError as error:
+            faults.append(error)
+    names, count = ", ".join(data.cameras), len(data.cameras)
+    cameras = f"the cameras {names}" if count <= _NAMED else f"its {count} cameras"
+    raise DataError(
+        f"none of {len(data.scenes)} scenes can be opened with {cameras}: {faults[0]}; name those there are with "
+        "--camera"
+    ) from faults[0]

@@ -21,9 +21,9 @@ from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_traj
 from gcd_train.data.encodings import read_colour
 from gcd_train.data.files import FileFault
 from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.splat import tangents
 from gcd_train.errors import DataError
 from gcd_train.evaluation.store import FRAMES_IN
-from gcd_train.pointcloud.project import tangents
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,12 +60,8 @@ class CameraPair:
 
     @classmethod
     def orbit(cls, trajectory: Trajectory, *, hfov_deg: float, height: int, width: int) -> Self:
-        """A path over the sphere, both cameras with the same lens.
-
-        Raises: DataError if nobody says where the source camera stands.
-        """
-        if trajectory.source is None:
-            raise DataError("a path over the sphere begins at a camera: its trajectory must say where the source is")
+        """A path over the sphere, both cameras with the same lens."""
+        assert trajectory.source is not None, "a path over the sphere begins at a camera"
         lens = Intrinsics.from_hfov(hfov_deg, width, height)
         start = to_pose(trajectory.source)
         return cls(ground_from_source=start, source=lens, target=lens, trajectory=trajectory)
@@ -78,7 +74,7 @@ class CameraPair:
 
 def pixel_rays(camera: Intrinsics) -> Tensor:
     """Rays through the pixel centres in the camera's axes, 1 along the optical axis: float64 [H, W, 3]."""
-    right, down = torch.meshgrid(*map(torch.from_numpy, tangents(camera, 0.5)), indexing="xy")
+    right, down = torch.meshgrid(*map(torch.from_numpy, tangents(camera)), indexing="xy")
     return torch.stack([right, down, torch.ones_like(right)], dim=-1)
 
 

@@ -18,11 +18,11 @@ from safetensors.numpy import save_file
 
 from gcd_model.geometry import CameraMount, Intrinsics, path_progress, sphere_poses
 from gcd_model.live.config import LIVE_CLASSES, SKY_M
+from gcd_train.data.splat import tangents
 from gcd_train.errors import RecipeError, RenderError
 from gcd_train.files import whole
 from gcd_train.live.clips import CAMERAS, Array, Poses, encode_depth
 from gcd_train.parallel import map_items, one_thread_each
-from gcd_train.pointcloud.project import tangents
 from gcd_train.scenes.description import Scene, moved, rotations
 from gcd_train.scenes.driving.world import HFOV_DEG as _DRIVING_HFOV_DEG
 from gcd_train.scenes.driving.world import driving_scene, looking

@@ -9,19 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.dataset4d import OntologyItem
 from gcd_train.data.pictures import trained_picture
 from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.splat import splat
 from gcd_train.evaluation.clips import nearest_resized
 from gcd_train.evaluation.galleries import HOLD_S, Strip, beside, write_mp4
 from gcd_train.evaluation.galleries import write_sheet as write_rows
 from gcd_train.evaluation.predictors import pixel_rays
 from gcd_train.pictures import new_figure, save
-from gcd_train.pointcloud import splat
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
@@ -91,8 +90,7 @@ class Footage:
     @cached_property
     def splat(self) -> Bytes:
         """The source's points alone as the target camera sees them, black where there are none: u8 [T, H, W, 3]."""
-        drawn = [splat([view], at, self.lens).colour for view, at in zip(self.views, self.poses, strict=True)]
-        return (torch.stack(drawn) * 255).round().byte().numpy()
+        return np.stack([splat([v], at, self.lens).picture for v, at in zip(self.views, self.poses, strict=True)])
 
     @cached_property
     def labels(self) -> NDArray[np.int32] | None:

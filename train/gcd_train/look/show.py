@@ -2,30 +2,32 @@
 
 import os
 import zipfile
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typer import Option
 
 from gcd_model.errors import FileError
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics, from_pose, spherical_trajectory
 from gcd_model.small_files import decode_json, read_json
 from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.data.dataset4d import Dataset4D, OntologyItem, read_ontology
+from gcd_train.data.dataset4d import Dataset4D, OntologyItem, layout_of, read_ontology
 from gcd_train.data.files import GEOMETRY, MOST_TEXT, ZIP_FAULTS, read_manifest, read_member
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
-from gcd_train.data.paths import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, FrameSampling, generator
-from gcd_train.data.pictures import frames_of, geometry_poses, renderer_kind
-from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.paths import DRIVING, DRIVING_FRAMES, KUBRIC_FRAMES, MAX90, Draw, FrameSampling, generator
+from gcd_train.data.pictures import PictureOptions, pictures_of
+from gcd_train.data.sample import Sample, SceneView
+from gcd_train.data.visibility import depth_visibility, render_lens
 from gcd_train.errors import DataError, RecipeError, RenderError
 from gcd_train.look.sheet import Footage, Poses
-from gcd_train.pointcloud import depth_visibility, published_picture, render_lens, visibility
 
 _WIDTH = 384
 _SHAPE = 1.5  # of the trained pictures
@@ -34,17 +36,17 @@ _STAGE, _VEHICLE = "world: z up, ground at z = 0", "vehicle: x ahead, y left, z 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ShowOptions:
-    """Which clip. start, stride: frames of the scene, drawn with the seed where None. seed: of clip and camera path.
+    """Which clip is shown: options of `gcd-train show`."""
 
-    exact: draw the target from a scene's kept geometry where there is one, else always from points. clip: seed of the
-    clip, in pair shards only.
-    """
-
-    start: int | None = None
-    stride: int | None = None
-    seed: int = 0
-    exact: bool = True
-    clip: int | None = None
+    start: Annotated[int | None, Option(min=0, help="First frame of the clip; drawn by --seed if left out.")] = None
+    stride: Annotated[int | None, Option(min=1, help="Every how many frames; drawn by --seed if left out.")] = None
+    seed: Annotated[int, Option(min=0, help="Draws the clip and the camera path.")] = 0
+    clip: Annotated[
+        int | None, Option(min=0, help="In pair shards: seed of the clip to show; the first if left out.")
+    ] = None
+    points: Annotated[
+        bool, Option("--points", help="Draw the target from the cameras' points, not from geometry.npz.")
+    ] = False
 
 
 def open_scene(path: Path, options: ShowOptions) -> Footage:
@@ -69,10 +71,11 @@ def open_scene(path: Path, options: ShowOptions) -> Footage:
 
 def _data_set(path: Path) -> Dataset4D:
     """Of one scene, with the cameras that are there: to look at it not all are needed. Raises DataError, FileFault."""
-    if kubric4d.scene_number(path.name) is not None:
+    layout = layout_of(path.name)
+    if layout == "kubric4d":
         views = [camera for camera in kubric4d.CAMERAS if os.path.lexists(kubric4d.metadata_path(path, camera))]
         return Kubric4D(path.parent, [path.name], cameras=views or kubric4d.CAMERAS, instances=True)
-    if parallel_domain4d.scene_number(path.name) is not None:
+    if layout == "parallel_domain4d":
         cameras = [camera for camera in parallel_domain4d.CAMERAS if (path / "rgb" / camera).is_dir()]
         classes = (path / "semantic_segmentation_2d").is_dir()
         return ParallelDomain4D(
@@ -82,9 +85,7 @@ def _data_set(path: Path) -> Dataset4D:
             classes=classes,
             ontology=read_ontology(parallel_domain4d.ontology_folder(path)) if classes else None,
         )
-    layouts = (kubric4d, parallel_domain4d)
-    inside = sorted(child.name for child in path.iterdir() if child.is_dir())
-    scenes = [name for name in inside if any(layout.scene_number(name) is not None for layout in layouts)]
+    scenes = sorted(child.name for child in path.iterdir() if child.is_dir() and layout_of(child.name))
     if scenes:
         raise DataError(f"{path} is a set of {len(scenes)} scenes; show one, such as {path / scenes[0]}")
     raise DataError(
@@ -101,7 +102,8 @@ def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     width = min(_WIDTH, views[0].lens.width)
     lens, pose = render_lens(views[0].lens, width, round(width / _SHAPE)), views[0].world_from_camera
     still, poses, path = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
-    target, target_depth, target_is = _target(data, scene, numbers, poses, lens, exact=options.exact)
+    draw = Draw(frame_numbers=numbers, fps=data.fps / stride, world_from_source=still, world_from_target=poses)
+    sample, target_is = _sample(data, scene, draw, (lens.width, lens.height), exact=not options.points)
     classed = data.ontology is not None and all(view.classes is not None for view in views)
     return Footage(
         title=_title(folder, "Kubric-4D" if on_sphere else "ParallelDomain-4D"),
@@ -109,15 +111,15 @@ def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
         path=path,
         scene=f"{every} frames at {data.fps:g} fps, {len(data.cameras)} cameras",
         frame_numbers=numbers,
-        fps=data.fps / stride,
+        fps=sample.fps,
         source_camera=data.source_camera,
         lens=lens,
         views=views,
         poses=poses,
-        target=target,
+        target=sample.target,
         target_is=target_is,
-        target_depth=target_depth,
-        visible=_visible(views, target_depth, poses, lens),
+        target_depth=sample.target_depth,
+        visible=np.ones(sample.target.shape[:3], np.bool_) if sample.visible is None else sample.visible,
         classes=data.ontology.items if classed and data.ontology is not None else (),
         instances={} if classed else _asset_names(data, folder),
         world_from_source=np.repeat(still[None], len(numbers), axis=0),
@@ -168,40 +170,14 @@ def _drive(frames: int) -> tuple[Poses, Poses, str]:
     return draw.world_from_source, draw.world_from_target, words
 
 
-def _target(
-    data: Dataset4D, scene: str, numbers: tuple[int, ...], poses: Poses, lens: Intrinsics, *, exact: bool
-) -> tuple[Bytes, NDArray[np.float32] | None, str]:
-    """Colour [T, H, W, 3], depth [T, H, W] where it is known, and how they were made. Raises DataError, FileFault."""
-    folder = data.folder(scene)
-    if exact and (folder / GEOMETRY).exists():
-        try:
-            still = frames_of(folder, list(numbers), lens)
-            cameras = {"target": geometry_poses(folder, numbers) @ poses}
-            with renderer_kind()(lens.width, lens.height, oversample=1) as renderer:
-                views = [view for _, _, view in renderer.views(still, cameras)]
-            colour, depth = np.stack([view.rgb for view in views]), np.stack([view.depth for view in views])
-            return colour, depth, "rendered from the scene's geometry"
-        except RenderError:
-            pass  # no renderer on this machine; points need none
-    every = [
-        published_picture(data.views(scene, number), at, lens, width=lens.width, height=lens.height)
-        for number, at in zip(numbers, poses, strict=True)
-    ]
-    return np.stack(every), None, f"points of all {len(data.cameras)} cameras"
-
-
-def _visible(
-    views: list[SceneView], target_depth: NDArray[np.float32] | None, poses: Poses, lens: Intrinsics
-) -> NDArray[np.bool_]:
-    """What the source camera saw: the very surface where the target's depth is known, else by the published rule."""
-    if target_depth is None:
-        seen = [
-            visibility(view, at, lens, width=lens.width, height=lens.height)
-            for view, at in zip(views, poses, strict=True)
-        ]
-        return np.stack(seen)
-    each = zip(views, target_depth, poses, strict=True)
-    return np.stack([depth_visibility(view, depth, at, lens) for view, depth, at in each])
+def _sample(data: Dataset4D, scene: str, draw: Draw, size: tuple[int, int], *, exact: bool) -> tuple[Sample, str]:
+    """The target and what of it the source camera saw, and how they were made. Raises DataError, FileFault."""
+    options = PictureOptions(size=size, visible=True)
+    if exact and (data.folder(scene) / GEOMETRY).exists():
+        with suppress(RenderError):  # no renderer on this machine; points need none
+            exactly = pictures_of(data, replace(options, exact=True)).sample(scene, draw)
+            return exactly, "rendered from the scene's geometry"
+    return pictures_of(data, options).sample(scene, draw), f"points of all {len(data.cameras)} cameras"
 
 
 def _title(folder: Path, layout: str) -> str:
@@ -282,7 +258,9 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
         target=clip.target,
         target_is="rendered exactly",
         target_depth=clip.target_depth,
-        visible=_visible(views, clip.target_depth, targets, lens),
+        visible=np.stack(
+            [depth_visibility(view, clip.target_depth[t], targets[t], lens) for t, view in enumerate(views)]
+        ),
         classes=tuple(OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes)),
         instances={},
         world_from_source=world_from_source,

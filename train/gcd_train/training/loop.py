@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from datetime import timedelta
 from pathlib import Path
 from threading import Event
 from typing import Protocol
@@ -255,7 +256,7 @@ class Loop:
             values["frames_per_s"],
             values["frames_per_s"] / self._options.frames_per_clip,
             values["peak_memory_gb"],
-            _duration(left_s),
+            timedelta(seconds=round(left_s)),
         )
         self._folder.record(self._options.stage, "loss", {**self._when(), **values})
 
@@ -282,12 +283,6 @@ class Loop:
     def _save(self) -> None:
         self._speak()  # a loss that is no number must not be saved
         self._states.save(self._updates, self._seconds)
-
-
-def _duration(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}"
 
 
 _KIB = 1 if sys.platform == "darwin" else 1024  # what getrusage counts in

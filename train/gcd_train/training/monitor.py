@@ -171,14 +171,6 @@ def write_sheet(path: Path, rows: Sequence[Sequence[Tensor]]) -> None:
     write_whole(path, png(sheet))
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    update: int
-    what: str
-    value: Tensor
-    ids: tuple[str, ...]
-
-
 class FiniteGuard:
     """Remembers losses and gradient norms without looking at them, so that a GPU need not wait; `check` looks.
 
@@ -188,29 +180,30 @@ class FiniteGuard:
 
     def __init__(self, stage: str, note: Path, *, at_once: bool = True) -> None:
         self._stage, self._note, self._at_once = stage, note, at_once
-        self._seen: list[_Seen] = []
+        self._seen: list[tuple[int, str, Tensor, tuple[str, ...]]] = []
 
     def saw(self, update: int, what: str, value: Tensor, ids: tuple[str, ...] = ()) -> None:
         """A value that must be finite. Raises TrainError as `check`."""
-        self._seen.append(_Seen(update, what, value.detach(), ids))
+        self._seen.append((update, what, value.detach(), ids))
         if self._at_once and value.device.type == "cpu":
             self.check()
 
     def check(self) -> None:
         """Raises TrainError for the first value since the last check that is no number, or infinite."""
         seen, self._seen = self._seen, []
-        for each in seen:
-            value = float(each.value)
-            if not math.isfinite(value):
-                self._stop(each, value, [name for other in seen if other.update == each.update for name in other.ids])
+        for update, what, given, _ in seen:
+            if not math.isfinite(value := float(given)):
+                self._stop(
+                    update, what, value, [name for number, _, _, ids in seen if number == update for name in ids]
+                )
 
-    def _stop(self, wrong: _Seen, value: float, ids: list[str]) -> None:
-        told = {"stage": self._stage, "update": wrong.update, "what": wrong.what, "value": str(value), "clips": ids}
+    def _stop(self, update: int, what: str, value: float, ids: list[str]) -> None:
+        told = {"stage": self._stage, "update": update, "what": what, "value": str(value), "clips": ids}
         with suppress(RunError):  # a full disk must not hide what is wrong
             write_whole(self._note, json.dumps(told, indent=1).encode())
         named = ", ".join(ids[:_NAMED]) + (f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "")
         raise TrainError(
-            f"the {wrong.what} of {self._stage} is {value} at update {wrong.update}"
+            f"the {what} of {self._stage} is {value} at update {update}"
             f"{f', on clips {named}' if ids else ''} (see {self._note}); the state saved before is untouched: look at "
             "these clips, or lower the learning rate in the recipe, and run again"
         )

@@ -4,6 +4,7 @@ Source: Van Hoorick et al. 2024 (GCD), section 3: noise level per clip, v-predic
 conditioning augmentation in pixel space; x0-prediction, fixed noise levels, shared noise and the class map are ours.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -17,11 +18,10 @@ from gcd_model.diffusion import RenderOptions, Schedule, preconditioning, sample
 from gcd_model.networks import Networks
 from gcd_model.unet import VideoUNet
 from gcd_train.recipe import FocalBlendName, LossRecipe, NoiseRecipe, StudentRecipe, UNetRecipe
-from gcd_train.training.draws import Draws
 from gcd_train.training.export import Validation
 from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.losses import PLAIN_BLEND, RELEASED_BLEND, FocalBlend, edm_weight, focal_fraction, frame_losses
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 from gcd_train.training.trainable import keep_trained_alone, plain_weights
 
 _BLENDS: dict[FocalBlendName, FocalBlend] = {"released": RELEASED_BLEND, "plain": PLAIN_BLEND}
@@ -84,20 +84,16 @@ class Batch:
 class BatchSource(Protocol):
     """Where batches come from."""
 
-    def single_frames(self, draws: Draws, count: int) -> Batch:
-        """`count` frames of random clips."""
-        ...
-
-    def whole_clips(self, draws: Draws, count: int) -> Batch:
-        """`count` random clips."""
+    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
+        """`count` random clips; or single frames of as many, which encoded clips alone offer."""
         ...
 
 
 class BatchMaker(Protocol):
     """Makes batches once the networks are there that encode them."""
 
-    def __call__(self, networks: Networks, precision: Precision, /) -> BatchSource:
-        """Raises RecipeError if model and data do not go together."""
+    def __call__(self, networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
+        """turns: see `SampleLoader`. Raises RecipeError if model and data do not go together."""
         ...
 
 
@@ -210,10 +206,8 @@ class UNetTask(Task):
         """The diffusion loss on single frames or on whole clips; of a student, see `_student_loss`."""
         recipe, stage = self._recipe, "unet" if self._student is None else "student"
         draws = Draws(self._seed, stage, progress.updates * recipe.parts + progress.part, self._precision.device)
-        if progress.share < recipe.image_share:
-            batch = self._batches.single_frames(draws, recipe.image_batch)
-        else:
-            batch = self._batches.whole_clips(draws, recipe.clip_batch)
+        single = progress.share < recipe.image_share
+        batch = self._batches.batch(draws, recipe.image_batch if single else recipe.clip_batch, single=single)
         if self._student is not None:
             return self._student_loss(self._student, batch, draws)
         return diffusion_loss(

@@ -194,10 +194,11 @@ class Trainer:
         recipe, data = self._recipe.unet, self._data
         if clips is not None:
             return EncodedBatches(clips, self._config, recipe, self._precision)
+        turns = [part for part, _ in self._engine.processes.batches(recipe.parts)]
         if data.batches is not None:
-            return data.batches(networks, self._precision)
+            return data.batches(networks, self._precision, turns)
         loader, seed = self._recipe.data.loader, self._recipe.seed
-        return SampleBatches(data.clips, networks, recipe, self._family, self._precision, loader, seed)
+        return SampleBatches(data.clips, networks, recipe, self._family, self._precision, loader, seed, turns)
 
     def _export(self) -> None:
         recipe, networks, config = self._recipe, self._start(), self._config

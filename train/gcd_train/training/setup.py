@@ -1,4 +1,4 @@
-"""From a recipe to networks on a device: their config, their arithmetic, the weights they start from."""
+"""From a recipe to networks on a device: config, arithmetic, first weights, draws, and what they are told of a clip."""
 
 import hashlib
 from contextlib import AbstractContextManager, nullcontext
@@ -11,14 +11,17 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import weights_path
+from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.geometry import Trajectory, motion_bucket
+from gcd_model.layers import sinusoid
 from gcd_model.networks import LoadedWeights, Networks, empty_networks
 from gcd_model.weights.adapter import DIFFUSION, carried_over
 from gcd_model.weights.families import FAMILIES, Family
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state
-from gcd_train.errors import RecipeError, RunError
+from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.recipe import ModelRecipe, Recipe, StudentRecipe, UNetChanges, UNetRecipe, VAEChanges
 from gcd_train.recipe_data import AnyStageName, ComputeRecipe
 from gcd_train.training.checkpoint import newest_weights, require_identity
@@ -188,6 +191,39 @@ def copy_of(networks: Networks) -> Networks:
     return copy
 
 
+class Draws:
+    """The randomness of one update, which follows from seed, stage and update alone: a resumed run draws what it would
+    have drawn.
+
+    Whole numbers are drawn on the CPU, noise on the device that uses it; on the CPU both come from one generator.
+    number: of the update, or of the batch where an update takes several; what comes in a fixed order goes by it.
+    """
+
+    def __init__(self, seed: int, stage: str, update: int, device: torch.device) -> None:
+        digest = hashlib.sha256(f"{seed}/{stage}/{update}".encode()).digest()
+        mixed = int.from_bytes(digest[:8], "little") >> 1
+        self.number, self._device = update, device
+        self._host = torch.Generator().manual_seed(mixed)
+        on_host = device.type == "cpu"
+        self._there = self._host if on_host else torch.Generator(device).manual_seed(mixed)
+
+    def below(self, limit: int, count: int) -> Tensor:
+        """`count` whole numbers 0 <= n < limit, int64 on the CPU."""
+        return torch.randint(limit, (count,), generator=self._host)
+
+    def order(self, count: int) -> list[int]:
+        """The numbers 0 <= n < count in random order."""
+        return torch.randperm(count, generator=self._host).tolist()
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal float32 on the device."""
+        return torch.randn(shape, generator=self._there, device=self._device)
+
+    def chance(self, probability: float, count: int) -> Tensor:
+        """`count` flags on the device, each true with the given probability."""
+        return torch.rand(count, generator=self._there, device=self._device) < probability
+
+
 Module = TypeVar("Module", bound=nn.Module)
 
 
@@ -263,3 +299,67 @@ def loaded_base(path: str, config: ModelConfig | None = None) -> LoadedWeights:
     tower, width = (None, None) if config is None else (config.image_encoder, config.unet.head_width)
     heads = None if tower is None else tower.heads
     return load_weights(weights_path(path), ask_family=False, head_width=width, image_heads=heads)
+
+
+class Conditioner:
+    """Condition channels, vectors and camera features of frames.
+
+    family: says what motion number belongs to a camera path; None where nobody asks for one.
+    """
+
+    def __init__(
+        self, config: ModelConfig, recipe: UNetRecipe, precision: Precision, family: Family | None = None
+    ) -> None:
+        self._config, self._recipe, self._precision, self._family = config, recipe, precision, family
+        width = config.unet.vector_width
+        told = micro_conditioning(recipe.fps, recipe.motion_bucket, recipe.augmentation, width)
+        self._vector = told.to(precision.device)
+
+    def vector(self, motion: Tensor) -> Tensor:
+        """Micro-conditioning, [N, V]. motion: motion number of each row, [N]."""
+        vector = self._vector.expand(len(motion), -1)
+        third = vector.shape[1] // 3  # fps, motion, augmentation
+        told = sinusoid(motion.to(self._precision.device).float(), third)
+        return torch.cat([vector[:, :third], told, vector[:, 2 * third :]], dim=1)
+
+    def motion(self, path: Trajectory) -> float:
+        """The number that tells the network how far the camera goes: the family's for the path, else the recipe's.
+
+        Raises DataError for a path without angles where the family works it out of those.
+        """
+        family = self._family
+        if family is None or family.motion_bucket is not None or family.limits is None:
+            return self._recipe.motion_bucket
+        if path.goal_delta is None:
+            raise DataError(f"family {family.name} works with angles about a centre, and these cameras have none")
+        limits = family.limits
+        return motion_bucket(
+            path.goal_delta, max_azimuth_deg=limits.azimuth_deg, max_elevation_deg=limits.elevation_deg
+        )
+
+    def camera(self, path: Trajectory) -> Tensor | None:
+        """What the network is steered by, [T, F]; None for a model with one fixed view.
+
+        Raises DataError for a path without angles where the model is steered by those.
+        """
+        match self._config.camera:
+            case "none":
+                return None
+            case "relative_pose":
+                return relative_pose_features(path.source_from_target)
+            case "spherical":
+                if path.delta is None:
+                    raise DataError("the model is steered by angles and radius, and these cameras are not on a sphere")
+                return spherical_features(path.delta)
+
+
+def mirrored_path(path: Trajectory) -> Trajectory:
+    """The same path in the world seen in a mirror: left is right, the azimuth turns the other way."""
+    sideways = torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.float64)
+    delta = path.delta
+    return Trajectory(
+        source_from_target=path.source_from_target * sideways[:, None] * sideways,
+        delta=None if delta is None else delta * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64),
+        at_goal=path.at_goal,
+        source=path.source,
+    )

@@ -16,11 +16,10 @@ from gcd_train.data.sample import Bytes, Clips, to_network
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.metrics import mean_iou, named_confusion, psnr
 from gcd_train.recipe import VAERecipe
-from gcd_train.training.draws import Draws
 from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.losses import gradient_l1, kl_to_normal, ssim
 from gcd_train.training.monitor import write_sheet
-from gcd_train.training.setup import Precision
+from gcd_train.training.setup import Draws, Precision
 
 _STATISTICS_CLIPS, _MEASURED_CLIPS = 16, 4
 _START_LOG_VARIANCE = -5.0

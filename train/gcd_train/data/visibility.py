@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.data.sample import SceneView
-from gcd_train.errors import DataError
-from gcd_train.pointcloud.project import Doubles, Floats, PixelMap, SplatOptions
-from gcd_train.pointcloud.splat import Bytes, splat
+from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.splat import Doubles, Floats, PixelMap, splat
 
 OVERSIZE = 1.09375
 """Drawn at 420 x 280 for 384 x 256."""
 _LEAST = 1e-7
 _BLACK = 1e-7
-_KERNEL, _SIGMA = 3, 0.75  # of visibility
+WIDE, NARROW = (21, 5.25), (3, 0.75)
+"""How holes are filled in pictures to train on, and in those that tell what is visible: pixels, odd, and sigma."""
+_BLUR_SIGMA = 0.6
 _NEAREST_M = 0.1  # in front of the source camera
+_TOLERANCE = 0.02  # share of the depth by which two surfaces that are the same may differ
 
 
 def render_lens(lens: Intrinsics, width: int, height: int) -> Intrinsics:
@@ -44,39 +45,30 @@ def published_tensor(
     views: Sequence[SceneView],
     world_from_camera: Doubles,
     lens: Intrinsics,
+    size: tuple[int, int],
     *,
-    width: int = 384,
-    height: int = 256,
     values: Sequence[Bytes] | None = None,
-    options: SplatOptions | None = None,
-    device: str | torch.device | None = None,
-    kernel: int = 21,
-    sigma: float = 5.25,
+    published: bool = False,
+    device: str | None = None,
+    filling: tuple[int, float] = WIDE,
 ) -> Tensor:
     """A target picture the published way, on the device.
 
     Args:
-        views, world_from_camera, values, options, device: see splat().
-        lens: of the data set's pictures, of any size; see render_lens(). width, height: of the result, pixels.
-        kernel, sigma: see fill_holes().
+        views, world_from_camera, values, published, device: see splat().
+        lens: of the data set's pictures, of any size; see render_lens(). size: width and height of the result, pixels.
     Returns:
-        float32 [height, width, C] in 0..1. With `options.published` a hole is what is black, in each three channels;
-        a black surface with colour behind it is none, as the released float64 keeps a trace of that colour.
-    Raises:
-        DataError: see splat().
+        float32 [height, width, C] in 0..1. With `published` a hole is what is black, in each three channels; a black
+        surface with colour behind it is none, as the released float64 keeps a trace of that colour.
     Source: Generative Camera Dolly, as released.
     """
-    options = options or SplatOptions()
+    width, height = size
     larger = render_lens(lens, round(width * OVERSIZE), round(height * OVERSIZE))
-    drawn = splat(views, world_from_camera, larger, values=values, options=options, device=device)
-    if options.published:
-        parts = [
-            fill_holes(part, lit, kernel=kernel, sigma=sigma)
-            for part, lit in zip(drawn.colour.split(3, -1), drawn.lit.unbind(-1), strict=True)
-        ]
-        filled = torch.cat(parts, dim=-1)
-    else:
-        filled = fill_holes(drawn.colour, drawn.covered, kernel=kernel, sigma=sigma)
+    drawn = splat(views, world_from_camera, larger, values=values, published=published, device=device)
+    parts, seen = [drawn.colour], [drawn.covered]
+    if published:
+        parts, seen = list(drawn.colour.split(3, -1)), list(drawn.lit.unbind(-1))
+    filled = torch.cat([fill_holes(part, there, filling) for part, there in zip(parts, seen, strict=True)], dim=-1)
     planes = filled.permute(2, 0, 1)[None]  # [1, C, H, W]
     smaller = F.interpolate(planes, size=(height, width), mode="bilinear", align_corners=False, antialias=False)
     return smaller[0].permute(1, 2, 0)
@@ -86,42 +78,34 @@ def published_picture(
     views: Sequence[SceneView],
     world_from_camera: Doubles,
     lens: Intrinsics,
+    size: tuple[int, int],
     *,
-    width: int = 384,
-    height: int = 256,
     values: Sequence[Bytes] | None = None,
-    options: SplatOptions | None = None,
-    device: str | torch.device | None = None,
-) -> NDArray[np.uint8]:
-    """published_tensor() as u8 [height, width, C] in memory: digits are cut off as published, or rounded without
-    `options.published`."""
-    picture = published_tensor(
-        views, world_from_camera, lens, width=width, height=height, values=values, options=options, device=device
-    )
-    half = 0.0 if options is not None and options.published else 0.5
-    return (picture * 255 + half).clamp(0, 255).to(torch.uint8).cpu().numpy()
+    published: bool = False,
+    device: str | None = None,
+) -> Bytes:
+    """published_tensor() as u8 [height, width, C] in memory: digits are cut off with `published`, else rounded."""
+    picture = published_tensor(views, world_from_camera, lens, size, values=values, published=published, device=device)
+    return (picture * 255 + (0.0 if published else 0.5)).clamp(0, 255).to(torch.uint8).cpu().numpy()
 
 
-def fill_holes(
-    colour: Tensor, covered: Tensor, *, kernel: int = 21, sigma: float = 5.25, blur_sigma: float = 0.6
-) -> Tensor:
-    """Holes take the weighted mean of what is around them; then the whole picture is blurred a little.
+def fill_holes(colour: Tensor, covered: Tensor, filling: tuple[int, float] = WIDE) -> Tensor:
+    """Holes take the weighted mean of what is around them; then the whole picture is blurred a little, over 3 x 3.
 
-        filled = G(colour * covered) / max(G(covered), 1e-7)        where not covered, G a Gaussian of `kernel` pixels
+        filled = G(colour * covered) / max(G(covered), 1e-7)        where not covered, G a Gaussian of so many pixels
 
     Holes with nothing covered within the kernel stay black. Pictures go on beyond their edges mirrored.
 
     Args:
         colour: float32 [H, W, C]. covered: bool [H, W].
-        kernel, sigma: of the filling, pixels; kernel is odd. blur_sigma: of the 3 x 3 blur over everything.
     Returns:
         [H, W, C].
     Source: Generative Camera Dolly, point renderer as released; the mirrored edges are our reading.
     """
     held = covered[..., None].to(colour.dtype)
-    blurred = _blur(torch.cat([colour * held, held], dim=-1), kernel, sigma)
+    blurred = _blur(torch.cat([colour * held, held], dim=-1), *filling)
     filled = torch.where(covered[..., None], colour, blurred[..., :-1] / blurred[..., -1:].clamp(min=_LEAST))
-    return _blur(filled, 3, blur_sigma)
+    return _blur(filled, 3, _BLUR_SIGMA)
 
 
 def _blur(picture: Tensor, kernel: int, sigma: float) -> Tensor:
@@ -138,54 +122,38 @@ def visibility(
     source: SceneView,
     world_from_camera: Doubles,
     lens: Intrinsics,
+    size: tuple[int, int],
     *,
-    width: int = 384,
-    height: int = 256,
-    options: SplatOptions | None = None,
+    published: bool = False,
 ) -> NDArray[np.bool_]:
     """Where the source view alone, drawn as another camera sees it, shows anything: the published rule.
 
     Whether the target shows the same thing there is not asked, and what is black counts as hidden.
 
     Args:
-        source: with depth. world_from_camera, lens, width, height, options: see published_tensor().
+        source: with depth. world_from_camera, lens, size, published: see published_tensor().
     Returns:
         bool [height, width]; the complement counts as occluded.
     Source: Generative Camera Dolly, evaluation as released: holes are filled over 3 pixels, not 21.
     """
-    shown = published_tensor(
-        [source],
-        world_from_camera,
-        lens,
-        width=width,
-        height=height,
-        options=options,
-        kernel=_KERNEL,
-        sigma=_SIGMA,
-    )
+    shown = published_tensor([source], world_from_camera, lens, size, published=published, filling=NARROW)
     return (shown.sum(-1) > _BLACK).numpy()
 
 
 def depth_visibility(
-    source: SceneView, target_depth: Floats, world_from_camera: Doubles, lens: Intrinsics, *, tolerance: float = 0.02
+    source: SceneView, target_depth: Floats, world_from_camera: Doubles, lens: Intrinsics
 ) -> NDArray[np.bool_]:
-    """Where the source camera saw the very surface that the target shows.
+    """Where the source camera saw the very surface that the target shows, to 2 % of its depth.
 
     Each target pixel is looked up in the source's depth: at one of the four pixels around, or between them, where
     inverse depth is interpolated, as planes have it.
 
     Args:
         source: with depth. target_depth: f32 [H, W], planar, metres, 0 where nothing is known.
-        world_from_camera, lens: of the target. tolerance: share of the depth by which the two may differ.
+        world_from_camera, lens: of the target.
     Returns:
         bool [H, W]; False where either depth is not known.
-    Raises:
-        DataError: the target's depth and lens are of different sizes.
     """
-    if target_depth.shape != (lens.height, lens.width):
-        raise DataError(
-            f"the target's depth must be {lens.width} x {lens.height} as its lens says, got {target_depth.shape[::-1]}"
-        )
     pixels = PixelMap.between(world_from_camera, lens, source.world_from_camera, source.lens, 0.5)
     rays = pixels.across[None] + pixels.along[:, None]  # [H, W, 3]
     x, y, ahead = np.moveaxis(target_depth[..., None] * rays + pixels.offset, -1, 0)
@@ -194,11 +162,11 @@ def depth_visibility(
     row = y / np.where(met, ahead, 1.0) + source.lens.cy
     met &= (column >= 0) & (column < source.lens.width) & (row >= 0) & (row < source.lens.height)
     agrees = np.zeros(met.shape, np.bool_)
-    agrees[met] = _agrees(source.depth, column[met], row[met], ahead[met], tolerance)
+    agrees[met] = _agrees(source.depth, column[met], row[met], ahead[met])
     return agrees
 
 
-def _agrees(depth: Floats, column: Doubles, row: Doubles, wanted: Doubles, tolerance: float) -> NDArray[np.bool_]:
+def _agrees(depth: Floats, column: Doubles, row: Doubles, wanted: Doubles) -> NDArray[np.bool_]:
     """[M]: whether a depth picture has the wanted depths at these places, counted from its corner."""
     left, top = np.floor(column - 0.5).astype(np.intp), np.floor(row - 0.5).astype(np.intp)
     right_share, lower_share = column - 0.5 - left, row - 0.5 - top
@@ -211,6 +179,6 @@ def _agrees(depth: Floats, column: Doubles, row: Doubles, wanted: Doubles, toler
             share = np.abs(1 - right - right_share) * np.abs(1 - lower - lower_share) * (near > 0)
             inverse += share / np.where(near > 0, near, 1.0)
             weight += share
-            found |= np.abs(near - wanted) <= tolerance * wanted
+            found |= np.abs(near - wanted) <= _TOLERANCE * wanted
     between = weight / np.where(inverse > 0, inverse, 1.0)
-    return found | ((inverse > 0) & (np.abs(between - wanted) <= tolerance * wanted))
+    return found | ((inverse > 0) & (np.abs(between - wanted) <= _TOLERANCE * wanted))
