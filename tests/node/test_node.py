@@ -185,10 +185,8 @@ class Encoder(FakeSynthesizer):
         self.encoded: list[int] = []
         self._before = before
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
-    ) -> SourceFeatures:
-        features = super().encode(clip, augmentation, extra)
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
+        features = super().encode(clip, augmentation)
         if augmentation is None:  # the warm-up
             return features
         assert clip.frames == 1

@@ -222,12 +222,10 @@ class SlowSynthesizer(FakeSynthesizer):
         self.begun.set()
         self._layers(x)
 
-    def encode(
-        self, clip: Clip, augmentation: Augmentation | None = None, extra: torch.Tensor | None = None
-    ) -> SourceFeatures:
+    def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> SourceFeatures:
         if self._part == "encoder":
             self._work(clip.video)
-        return super().encode(clip, augmentation, extra)
+        return super().encode(clip, augmentation)
 
     def render(
         self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None

@@ -174,7 +174,7 @@ def _require_plausible(step: Array, what: str) -> None:
     if not (metres <= _LONGEST_STEP_M and degrees <= _LARGEST_TURN_DEG):
         raise _LostError(
             f"{what} jumps by {metres:.2f} m and {degrees:.0f} degrees between two frames; "
-            f"at most {_LONGEST_STEP_M:g} m and {_LARGEST_TURN_DEG:g} degrees are a motion"
+            f"at most {_LONGEST_STEP_M:g} m and {_LARGEST_TURN_DEG:g} degrees are a motion (were some left out?)"
         )
 
 

@@ -161,12 +161,13 @@ def recipes(
 
 def _row(recipe: Recipe | LiveRecipe) -> tuple[str, ...]:
     if isinstance(recipe, LiveRecipe):
-        return "live", "live", _length(recipe.paint.budget), f"{recipe.paint.batch} views", "nothing"
+        length = " + ".join(_length(each.budget) for each in (recipe.depth, recipe.paint, recipe.detail))
+        return "live", "live", length, f"{recipe.paint.batch} views", recipe.weights or "nothing"
     data, unet, model = recipe.data, recipe.unet, recipe.model
     kind = data.kind if data.modality == "rgb" else f"{data.kind}, classes"
-    clips = f"{unet.clip_batch * unet.parts}"
     base = model.base if recipe.student is None else f"student, {recipe.student.steps} steps"
-    return kind, f"{base} ({model.family})", _length(unet.budget), clips, model.weights or "nothing"
+    start = f"{model.weights or 'nothing'}{', its U-Net not' if model.weights and model.scratch else ''}"
+    return kind, f"{base} ({model.family})", _length(unet.budget), f"{unet.clip_batch * unet.parts}", start
 
 
 def _length(budget: Budget) -> str:

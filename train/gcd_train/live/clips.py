@@ -109,7 +109,9 @@ def clip_paths(folder: Path) -> list[Path]:
     """All clips of a data folder, in order. Raises DataError if there are none."""
     paths = sorted(folder.glob("*/*.safetensors"))
     if not paths:
-        raise DataError(f"{folder} holds no live clips; make some with `gcd-train generate live {folder}`")
+        raise DataError(
+            f"{folder} holds no live clips, or is not there; make some with `gcd-train generate live {folder}`"
+        )
     return paths
 
 
