@@ -1,7 +1,7 @@
 # Everything from nothing but python3 (>= 3.11) and make:
 #   make demo    replay the packaged drive through the model and over ZeroMQ into a second process
 #   make test    the default tests            make check   format, lint, types
-#   make slow    full-size tests, processes, the browser, C++ (minutes, about 10 GB of memory)
+#   make slow    full-size tests, processes, the browser, C++ (half an hour, about 10 GB of memory); TESTS: some folders
 # WORKERS test processes run beside each other, on a thread each; many of the tests wait rather than compute.
 # TORCH_INDEX names another package index for torch, for example a CPU-only or CUDA one.
 
@@ -9,6 +9,7 @@ PYTHON ?= python3
 VENV ?= .venv
 TORCH_INDEX ?=
 WORKERS ?= 3
+TESTS ?=
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -q -c constraints.txt
@@ -23,7 +24,7 @@ test: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 slow: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 2 --dist loadfile $(TESTS)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .
