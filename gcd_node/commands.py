@@ -1,7 +1,7 @@
 """What the node answers to each verb of the control socket (wire protocol, section 5). Never waits for the model."""
 
 from collections.abc import Callable
-from importlib.metadata import version
+from importlib.metadata import distributions
 
 import msgspec
 import torch
@@ -71,7 +71,8 @@ class NodeCommands:
     # Queries.
 
     def _hello(self, role: Role) -> dict[str, object]:
-        release, node_id, boot_id = version("gcd-node"), self._announcer.node_id, self._announcer.boot_id
+        release = next((each.version for each in distributions(name="gcd-node")), "unknown")  # of a checkout alone
+        node_id, boot_id = self._announcer.node_id, self._announcer.boot_id
         return {"node_id": node_id, "boot_id": boot_id, "proto": PROTO, "version": release, "role": role}
 
     def _describe(self) -> dict[str, object]:

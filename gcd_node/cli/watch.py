@@ -84,7 +84,7 @@ def view(
             live.refresh()
     if timeout is not None and views.received == 0 and not views.ended:
         raise StaleError(f"no view from {where} within {timeout:g} s: is the node running, and has it such a view?")
-    ending = "the stream ended" if views.ended else "--limit" if views.received == limit else "nothing more came"
+    ending = "the stream ended" if views.ended else "at --limit" if views.received == limit else "nothing more came"
     files = 0 if saver is None else saver.files
     console.print(f"{views.received} messages, {files} files, {damaged + views.damaged} damaged; {ending}")
 
