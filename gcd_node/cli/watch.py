@@ -186,7 +186,7 @@ class ViewTable:
     def render(self, where: str, *, ended: bool) -> Table | Text:
         """For rich. where: the endpoint, named while nothing has come."""
         if not self._newest and not ended:
-            return Text(f"no view yet from {_shown(where)}: is the node running?")
+            return Text(f"no view yet from {_shown(where)}: is the node running, and has it such a view?")
         columns = ("topic", ">window", ">shape", ">age ms", ">rate Hz", ">missed", "state")
         return table(self.rows(time.monotonic(), ended=ended), columns, _TITLE)
 

@@ -14,7 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from gcd_train.cli.common import errors_shown
-from gcd_train.cli.main import COMMANDS, app
+from gcd_train.cli.main import COMMANDS, app, main
 from gcd_train.errors import RunError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_files import packaged_recipes
@@ -69,6 +69,14 @@ def test_what_is_wrong_is_one_line_and_an_exit_code(tmp_path: Path, words: list[
     found, output = ran(*words, f"--data={data}", f"--out={tmp_path / 'out'}")
     assert (found, said in output) == (code, True), output
     assert code != 78 or not (tmp_path / "out").exists()
+
+
+def test_a_wrong_command_line_ends_with_64_as_that_of_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    for words in (["nonsense"], ["train"], []):
+        monkeypatch.setattr(sys, "argv", ["gcd-train", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code == 64
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("of the device"), RuntimeError("can't allocate memory")])

@@ -85,4 +85,7 @@ def _several() -> None:
 
 def main() -> None:
     """Entry point."""
-    new_app([next((word for word in sys.argv[1:] if not word.startswith("-")), "")])()
+    try:
+        new_app([next((word for word in sys.argv[1:] if not word.startswith("-")), "")])()
+    except SystemExit as end:
+        sys.exit(64 if end.code == 2 else end.code)  # a wrong command line, as sysexits and gcd-node say it
