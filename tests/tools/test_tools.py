@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 TOOLS = Path(__file__).parents[2] / "tools"
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def ran(script: str, *words: str) -> str:
@@ -17,7 +18,6 @@ def ran(script: str, *words: str) -> str:
     return done.stdout
 
 
-@pytest.mark.timeout(600)
 def test_a_model_is_measured_with_its_memory_and_shown_again(tmp_path: Path) -> None:
     out = str(tmp_path / "a.json")
     size = ["--height", "64", "--width", "64", "--steps", "1", "--repeats", "1", "--warm", "0", "--threads", "1"]
@@ -30,7 +30,6 @@ def test_a_model_is_measured_with_its_memory_and_shown_again(tmp_path: Path) -> 
     assert 0 <= ours["memory"]["private_gb"] < ours["memory"]["resident_gb"]
 
 
-@pytest.mark.timeout(600)
 def test_diffusers_computes_the_same_window_on_the_same_weights(tmp_path: Path) -> None:
     out = tmp_path / "b.json"
     size = ["--height", "64", "--width", "64", "--steps", "2", "--repeats", "1", "--warm", "0", "--threads", "1"]
@@ -40,7 +39,6 @@ def test_diffusers_computes_the_same_window_on_the_same_weights(tmp_path: Path) 
     assert difference["pictures"] < 1e-4
 
 
-@pytest.mark.timeout(600)
 def test_a_short_soak_ends_with_nothing_left_behind(tmp_path: Path) -> None:
     command = [sys.executable, str(TOOLS / "soak.py"), "--hours", "0.004", "--json", str(tmp_path / "soak.json")]
     subprocess.run(command, capture_output=True, text=True, check=False)  # 1 if it is too short to settle
