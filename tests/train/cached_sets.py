@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gcd_train.data.cache import CacheIdentity, ClipPlan, FrozenEncoders, SceneShard, only_writer
+from gcd_train.data.cache import CacheIdentity, ClipPlan, FrozenEncoders, SceneShard
 from gcd_train.data.cache_writer import CacheJob, EncoderChoice, cache_scenes, load_encoders, missing_scenes
 from gcd_train.errors import DataError
+from gcd_train.files import only_writer
 from gcd_train.parallel import Outcome
 
 HEIGHT, WIDTH, FRAMES, CLIP = 32, 48, 7, 3

@@ -15,7 +15,8 @@ from gcd_model.config import ModelConfig
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
+from gcd_train.data.batches import CachedBatches
+from gcd_train.data.open import RunData, open_data, sampling_of
 from gcd_train.data.paths import DrivingSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import LossRecipe, Recipe
@@ -55,7 +56,7 @@ def recipe(data: DataRecipe, **unet: object) -> Recipe:
 
 
 def opened(told: Recipe, data: Path, valid: Path | None = None, family: str = "kubric90") -> RunData:
-    return open_data(told, CONFIG, FAMILIES[family], DataPlaces(data=data, valid=valid))
+    return open_data(told, CONFIG, FAMILIES[family], data, valid)
 
 
 def lengths(run: RunData) -> tuple[int, int]:
@@ -66,7 +67,7 @@ def lengths(run: RunData) -> tuple[int, int]:
 def test_kubric_is_split_by_number(kubric: Path) -> None:
     run = opened(recipe(KUBRIC), kubric)
     assert lengths(run) == (2, 1)
-    assert run.batches is not None
+    assert run.drawn is not None
     assert (run.clips.fps, run.valid.fps, run.valid.camera) == (12.0, 12.0, "spherical")
     source, target = run.valid.sample(0).source, run.valid.sample(0).target
     assert source.shape == target.shape == (3, 32, 48, 3)
@@ -127,18 +128,19 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     told = msgspec.structs.replace(own, model=model, vae=None, latents=None)
     networks = random_weights("driving", frames=CLIP).networks
     config = msgspec.structs.replace(networks.config, height=HEIGHT, width=WIDTH)
-    run = open_data(told, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
-    assert run.batches is not None
+    run = open_data(told, config, FAMILIES["driving"], tmp_path, driving)
     precision = Precision(torch.device("cpu"), half=False, channels_last=False)
-    batch = run.batches(networks, precision).batch(Draws(1, "unet", 0, torch.device("cpu")), 2)
+    batch = CachedBatches(run.drawn, networks, told.unet, precision, "gradual").batch(
+        Draws(1, "unet", 0, torch.device("cpu")), 2
+    )
     assert batch.target.shape[0] == 2 * CLIP
     assert len(batch.ids) == 2
     assert batch.wait_s is not None
     both = msgspec.structs.replace(told, data=msgspec.structs.replace(data, held_out=2))
     with pytest.raises(DataError, match="scene_000002"):
-        open_data(both, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+        open_data(both, config, FAMILIES["driving"], tmp_path, driving)
     with pytest.raises(RecipeError, match="made with other encoders"):
-        run.batches(random_networks(networks.config, seed=9), precision)
+        CachedBatches(run.drawn, random_networks(networks.config, seed=9), told.unet, precision, "gradual")
     for change, name in (
         ({"modality": "semantic"}, "data.modality"),
         ({"move_time": 0}, "data.move_time"),
@@ -147,9 +149,9 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     ):
         other = msgspec.structs.replace(told, data=msgspec.structs.replace(data, **change))
         with pytest.raises(RecipeError, match=f"the recipe's {name} wants another thing"):
-            open_data(other, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+            open_data(other, config, FAMILIES["driving"], tmp_path, driving)
     with pytest.raises(RecipeError, match="frozen autoencoder"):
-        open_data(own, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+        open_data(own, config, FAMILIES["driving"], tmp_path, driving)
 
 
 def test_rates_and_orbits_that_do_not_fit_are_refused(kubric: Path) -> None:
@@ -158,7 +160,7 @@ def test_rates_and_orbits_that_do_not_fit_are_refused(kubric: Path) -> None:
     wide = msgspec.structs.replace(KUBRIC, orbit=OrbitRecipe(max_azimuth_deg=120.0))
     with pytest.raises(RecipeError, match="nobody could ask for the views beyond"):
         opened(recipe(wide), kubric)
-    assert opened(recipe(wide), kubric, family="kubric180").batches is not None
+    assert opened(recipe(wide), kubric, family="kubric180").drawn is not None
 
 
 def test_what_is_left_out_of_the_sampling_is_as_released() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gcd_model.geometry import CameraMount, driving_trajectory
-from gcd_train.data.open import DataPlaces, RunData, open_data
+from gcd_train.data.open import RunData, open_data
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import cameras_of
@@ -37,7 +37,7 @@ def folder(place: Path, path: CameraWay, first_seed: int = 0) -> Path:
 
 def opened(recipe: Recipe, data: Path, valid: Path) -> RunData:
     model = recipe.model
-    return open_data(recipe, model_config(model), family_of(model), DataPlaces(data=data, valid=valid))
+    return open_data(recipe, model_config(model), family_of(model), data, valid)
 
 
 def test_a_direct_target_stands_where_a_gradual_one_arrives_and_the_source_is_the_same() -> None:

@@ -9,7 +9,7 @@ from tiny_world import FRAMES, TinyClips, TinyOrbits, trainer
 
 from gcd_model import load_synthesizer
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.open import DataPlaces, open_data
+from gcd_train.data.open import open_data
 from gcd_train.data.sample import video_clips
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import Recipe
@@ -72,4 +72,4 @@ def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
 def test_a_model_for_something_else_is_refused(tmp_path: Path) -> None:
     told = recipe("study-pretrain", "model.family=driving")
     with pytest.raises(RecipeError, match=r'give model\.family "svd"'):
-        open_data(told, model_config(told.model), family_of(told.model), DataPlaces(data=tmp_path, valid=tmp_path))
+        open_data(told, model_config(told.model), family_of(told.model), tmp_path, tmp_path)

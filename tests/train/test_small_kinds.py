@@ -18,8 +18,9 @@ from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.latents import Encodings, LatentClips, LatentRows
-from gcd_train.data.open import DataPlaces, open_data
+from gcd_train.data.cache import EncodedRows
+from gcd_train.data.latents import Encodings, LatentClips
+from gcd_train.data.open import open_data
 from gcd_train.data.sample import Clips, MadeClips, Sample, to_network
 from gcd_train.data.sample import painted as painted_clips
 from gcd_train.errors import DataError
@@ -110,7 +111,7 @@ def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tm
         repeats=2,
     )
     recipe = msgspec.structs.replace(painted_recipe(), data=data)
-    places = DataPlaces(data=tmp_path / "set")
+    places = tmp_path / "set"
     opened = open_data(recipe, model_config(recipe.model), FAMILIES["driving-semantic"], places)
     truth = opened.valid.sample(0).target_classes
     assert [kind.name for kind in opened.valid.classes] == ["Car", "Road", "Sky", "Void"]
@@ -160,7 +161,7 @@ def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
     return LatentClips.open(path)
 
 
-def row(clips: LatentClips, *, mirrored: bool) -> LatentRows:
+def row(clips: LatentClips, *, mirrored: bool) -> EncodedRows:
     """Frame 2 of clip 1."""
     return clips.rows(torch.tensor([1]), torch.tensor([2]), torch.tensor([mirrored]), CPU)
 
@@ -180,7 +181,7 @@ def test_a_mirrored_row_is_the_row_of_the_mirrored_scene(
     assert torch.equal(one.source, other.source)
     assert torch.equal(one.target, other.target)
     assert torch.equal(one.motion, other.motion)
-    assert_alike(one.control, other.control)
+    assert_alike(one.camera, other.camera)
     assert_alike(one.emphasis, other.emphasis)
 
 
@@ -196,10 +197,12 @@ def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run
     config, path = model_config(recipe.model), TinyOrbits().trajectory(1)
     traits = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu").traits
     told = micro_conditioning(12.0, traits.motion_bucket(path), 0.0, config.unet.vector_width)
-    torch.testing.assert_close(Conditioner(config, recipe.unet, PRECISION).vector(rows.motion)[0], told)
+    torch.testing.assert_close(
+        Conditioner(config, recipe.unet, PRECISION).vector(torch.tensor([recipe.unet.fps]), rows.motion)[0], told
+    )
     assert path.delta is not None
-    assert rows.control is not None
-    assert torch.equal(rows.control[0], spherical_features(path.delta)[2])
+    assert rows.camera is not None
+    assert torch.equal(rows.camera[0], spherical_features(path.delta)[2])
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Samples by number, made ahead by other processes, in an order that a resumed run finds again."""
 
 import signal
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count, islice
@@ -42,15 +41,6 @@ class SampleOrder:
         return round_ * self.length + self._places[within]
 
 
-@dataclass(frozen=True, slots=True)
-class LoadedBatch:
-    """Samples, their numbers, and how long they were waited for."""
-
-    samples: SampleBatch
-    numbers: tuple[int, ...]
-    wait_s: float
-
-
 class SampleLoader:
     """Batches by number; those that follow are made ahead.
 
@@ -67,16 +57,17 @@ class SampleLoader:
         self._expected: Iterator[int] = iter(())
         self._batches: Iterator[SampleBatch | TrainError] = iter(())
 
-    def batch(self, number: int, count: int) -> LoadedBatch:
-        """Batch `number` of `count` samples. Raises: as `Samples.sample`; RunError if a process was killed."""
-        started = time.perf_counter()
+    def batch(self, number: int, count: int) -> tuple[SampleBatch, list[int]]:
+        """Batch `number` of `count` samples, and their numbers.
+
+        Raises: as `Samples.sample`; RunError if a process was killed.
+        """
         if count != self._count or number != next(self._expected):
             self._start(number, count)
-        samples = self._following()
-        if self._recipe.workers:
-            self._samples.skips.extend(samples.skipped)  # each worker has its own account
-        numbers = tuple(self._order.batch(number, count))
-        return LoadedBatch(samples, numbers, time.perf_counter() - started)
+        batch = self._following()
+        if self._recipe.workers:  # each worker has its own account
+            self._samples.skips.extend(skipped for sample in batch.samples for skipped in sample.skipped)
+        return batch, self._order.batch(number, count)
 
     def _following(self) -> SampleBatch:
         try:
