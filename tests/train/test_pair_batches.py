@@ -14,9 +14,8 @@ from gcd_model.conditioning import micro_conditioning, relative_pose_features, s
 from gcd_model.config import SMALL, ModelConfig
 from gcd_model.networks import Networks, random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.batches import SampleBatches
+from gcd_train.data.batches import SampleBatches, SampleLoader, SampleOrder
 from gcd_train.data.files import Skips
-from gcd_train.data.loader import SampleLoader, SampleOrder
 from gcd_train.data.sample import Sample
 from gcd_train.errors import DataError, RunError
 from gcd_train.recipe import OptimiserRecipe, UNetRecipe

@@ -1,6 +1,7 @@
 """Clips, networks and recipes small enough to train in a second."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -8,6 +9,7 @@ import msgspec
 import numpy as np
 import torch
 from safetensors.torch import load_file
+from torch import nn
 
 from gcd_model import Clip, Traits, View, load_synthesizer
 from gcd_model.config import DRIVING_CLASSES, CameraControl
@@ -21,8 +23,10 @@ from gcd_model.geometry import (
 )
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips, Sample, to_network
-from gcd_train.recipe import Recipe
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, UNetRecipe
+from gcd_train.recipe_data import Budget, LogRecipe
 from gcd_train.training.checkpoint import SavedWeights, newest_weights
+from gcd_train.training.loop import LoopOptions, Progress, StepLoss, Task
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.run import Trainer
 
@@ -111,6 +115,43 @@ class TinyOrbits(TinyClips):
         source = Spherical(azimuth_deg=0.0, elevation_deg=5.0 + number, radius_m=14.0)
         change = SphericalDelta(azimuth_deg=40.0 - 70.0 * number, elevation_deg=10.0, radius_m=-1.0)
         return spherical_trajectory(source, change, frames=FRAMES, move_time=FRAMES - 1)
+
+
+class Slope(Task):
+    """Four numbers to learn, from inputs that follow from the update; keeps every update's loss, which can go wrong."""
+
+    module: nn.Linear
+
+    def __init__(self, fails_at: int | None = None) -> None:
+        super().__init__(nn.Linear(4, 1))
+        nn.init.constant_(self.module.weight, 0.5)
+        nn.init.zeros_(self.module.bias)
+        self.losses: dict[int, float] = {}
+        self._fails_at = fails_at
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        inputs = torch.randn(8, 4, generator=torch.Generator().manual_seed(progress.updates))
+        loss = (self.module(inputs) - inputs.sum(1, keepdim=True)).square().mean()
+        self.losses[progress.updates] = loss.item()
+        if progress.updates == self._fails_at:
+            loss = loss * torch.inf
+        return StepLoss(loss, {"square": loss}, 8)
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        return {"bias": self.module.bias.item()}
+
+
+def loop_options(budget: Budget, ema: EmaRecipe | None = None, **changes: object) -> LoopOptions:
+    """A stage of so long, which speaks, saves and measures at its end alone."""
+    options = LoopOptions(
+        stage="unet",
+        identity="slope",
+        table=UNetRecipe(budget=budget, optimiser=OptimiserRecipe(rate=0.1), ema=ema),
+        log=LogRecipe(log_s=1e6, save_s=1e6, measure_s=1e6),
+        stop=Event(),
+        frames_per_clip=1,
+    )
+    return replace(options, **changes)
 
 
 class After(Event):

@@ -19,13 +19,12 @@ from gcd_train.cli.common import (
     stop_as_by_ctrl_c,
     with_fields_of,
 )
-from gcd_train.data.cache import CacheIndex, SceneShard, read_index
-from gcd_train.data.cache_writer import CacheJob, CacheOptions, cache_job, cache_scenes, missing_scenes
+from gcd_train.data.cache_writer import CacheOptions, cache_job, cache_scenes
 from gcd_train.data.compact import Compaction
 from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
 from gcd_train.errors import DataError
-from gcd_train.files import only_writer, remove_leftovers
+from gcd_train.files import remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
 
 Done = TypeVar("Done")
@@ -80,16 +79,15 @@ def compact(
 
 
 def _worked_through(
-    outcomes: Iterable[Outcome[str, Done]], count: int, remark: Callable[[Done], str], there: int = 0
+    outcomes: Iterable[Outcome[str, Done]], count: int, remark: Callable[[Done], str]
 ) -> tuple[list[Done], int]:
     """What became of scenes, each shown as it is done, and how many cannot be read; any other error ends the run.
 
-    count: of all scenes. there: those that were done before. remark: what there is to say of a scene, if anything.
+    count: of scenes. remark: what there is to say of one, if anything.
     """
     made, damaged = list[Done](), 0
     with progress_bar("scenes", count, keep=True) as show:
-        show(there)
-        for number, outcome in enumerate(outcomes, start=there + 1):
+        for number, outcome in enumerate(outcomes, start=1):
             try:
                 made.append(outcome.unwrap())
             except DataError as fault:
@@ -153,28 +151,18 @@ def cache(
 ) -> None:
     """Encode a driving set once, so that training never runs the frozen encoders again."""
     with errors_shown():
-        _cache(cache_job(data, out, CacheOptions(**options)), workers, ray)
-
-
-def _cache(job: CacheJob, workers: int, ray: str | None) -> None:
-    folder, scenes = job.folder, job.pictures.scenes
-    with only_writer(folder):
-        missing = missing_scenes(job)
-        outcomes, there = cache_scenes(job, missing, workers=workers, ray_address=ray), len(scenes) - len(missing)
-
-        def remark(shard: SceneShard) -> str:
-            return f"{len(shard.missing)} frames missing" if shard.missing else ""
-
-        _, failed = _worked_through(outcomes, len(scenes), remark, there)
-    index = read_index(folder, CacheIndex)
-    kept = [] if index is None else [index.scenes[name] for name in scenes if name in index.scenes]
-    if kept:
-        count, size = len(kept), sum(entry.bytes for entry in kept) / 1e6
-        seconds, lacking = sum(entry.seconds for entry in kept), sum(len(entry.missing) for entry in kept)
-        say(
-            f"{folder}: {count} scenes, {size:.2f} MB, {size / count:.2f} MB and {seconds / count:.1f} s a scene, "
-            f"{lacking} frames missing (named in index.json)",
-            stderr=False,
+        job = cache_job(data, out, CacheOptions(**options))
+        outcomes = cache_scenes(job, workers=workers, ray_address=ray)
+        count = len(job.pictures.scenes)
+        kept, failed = _worked_through(
+            outcomes, count, lambda shard: f"{len(shard.missing)} frames missing" if shard.missing else ""
         )
-    if failed:
-        raise DataError(f"{failed} of {len(scenes)} scenes could not be cached, see above; the others are whole")
+        if kept:
+            size, seconds = sum(shard.bytes for shard in kept) / 1e6, sum(shard.seconds for shard in kept)
+            say(
+                f"{out}: {len(kept)} scenes, {size:.2f} MB, {size / len(kept):.2f} MB and {seconds / len(kept):.1f} s "
+                f"a scene, {sum(len(shard.missing) for shard in kept)} frames missing (named in index.json)",
+                stderr=False,
+            )
+        if failed:
+            raise DataError(f"{failed} of {count} scenes could not be cached, see above; the others are whole")
