@@ -7,8 +7,7 @@ import msgspec
 import pytest
 import torch
 from fake_model import traits_of
-from tiny_driving import smaller
-from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, measured, saved, trainer
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, measured, saved, smaller, trainer
 
 from gcd_model import Clip, RenderOptions, load_synthesizer
 from gcd_model.config import SVD_14

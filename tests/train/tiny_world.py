@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from gcd_model import Clip, Traits, View, load_synthesizer
-from gcd_model.config import DRIVING_CLASSES, CameraControl
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, CameraControl, ModelConfig
 from gcd_model.geometry import (
     CameraMount,
     Spherical,
@@ -21,6 +21,10 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
+from gcd_model.networks import random_networks
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.load import save_weights
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips, Sample, to_network
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, UNetRecipe
@@ -217,3 +221,41 @@ def assert_same_states(first: Path, second: Path, stage: str) -> None:
     one, other = ({n: v for f in each.path.glob("*.safetensors") for n, v in load_file(f).items()} for each in (a, b))
     assert one.keys() == other.keys()
     assert [name for name, value in one.items() if not torch.equal(value, other[name])] == []
+
+
+def write_untrained(folder: Path) -> Path:
+    """`untrained.safetensors`: four frames of 64 x 32."""
+    config = msgspec.structs.replace(
+        PLAIN_SMALL,
+        frames=FRAMES,
+        height=HEIGHT,
+        width=WIDTH,
+        unet=msgspec.structs.replace(PLAIN_SMALL.unet, width=16, embedding_width=32, head_width=16),
+        vae=msgspec.structs.replace(PLAIN_SMALL.vae, width=16),
+        sampling=msgspec.structs.replace(PLAIN_SMALL.sampling, steps=1),
+    )
+    path = folder / "untrained.safetensors"
+    card = Card(name="untrained", config=config, family=FAMILIES["driving"], move_time=FRAMES - 1, trained=False)
+    save_weights(random_networks(config, seed=0), path, card)
+    return path
+
+
+def smaller(frames: int, height: int, width: int) -> ModelConfig:
+    """A still smaller one."""
+    change = msgspec.structs.replace
+    unet = change(
+        PLAIN_SMALL.unet,
+        width=8,
+        multipliers=(1, 2),
+        attention=(False, True),
+        embedding_width=16,
+        head_width=8,
+    )
+    return change(
+        PLAIN_SMALL,
+        frames=frames,
+        height=height,
+        width=width,
+        unet=unet,
+        vae=change(PLAIN_SMALL.vae, width=8, multipliers=(1, 1, 2)),
+    )

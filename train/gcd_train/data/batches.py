@@ -297,7 +297,8 @@ class CachedBatches(Batches):
                 f"{cache.folder} was made with other encoders ({kept}) than the run's ({given}); give the same "
                 "model.weights, or make the cache anew"
             )
-        self._cache, self._path = cache, path
+        self._cache = cache
+        self._path: PathKind = path
 
     def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """See Batches."""

@@ -122,11 +122,7 @@ class _Opening:
         learned = self._episodes(self.folder, (0, -held_out or None))
         held = self._episodes(self.valid or self.folder, (-held_out, None))
         require_apart(*({episode.name: episode.data for episode in part.episodes} for part in (learned, held)))
-        return RunData(
-            clips=self._clips(learned, len(learned), learned.fps),
-            valid=self._clips(held, len(held.episodes), held.fps),
-            drawn=self._sides(learned),
-        )
+        return self._run(learned, held, len(held.episodes), held.fps)
 
     def videos(self) -> RunData:
         scenes, held_out = filmed_scenes(self.folder), self._data.held_out
@@ -144,11 +140,12 @@ class _Opening:
         size, frames = (self.config.width, self.config.height), self.config.frames
         pairs = FilmedPairs(learned, size=size, frames=frames, fps=fps, seed=seed, repeats=repeats)
         valid = FilmedPairs(held, size=size, frames=frames, fps=fps, seed=_FIXED_SEED)
-        return RunData(
-            clips=self._clips(pairs, len(pairs), fps),
-            valid=self._clips(valid, len(valid), fps),
-            drawn=self._sides(pairs),
-        )
+        return self._run(pairs, valid, len(valid), fps)
+
+    def _run(self, learned: Samples, held: Samples, count: int, fps: float) -> RunData:
+        """count: of the clips that are measured on."""
+        clips, valid = self._clips(learned, len(learned), fps), self._clips(held, count, fps)
+        return RunData(clips=clips, valid=valid, drawn=self._sides(learned))
 
     def cache(self) -> RunData:
         if self.recipe.vae is not None or self.recipe.latents is not None:
