@@ -160,6 +160,7 @@ def test_the_detail_stage_leaves_all_other_weights_as_they_are(trained: Path) ->
     assert all(name.startswith("paint.detail.") for name in changes)
 
 
+@pytest.mark.slow
 def test_a_training_begins_from_a_weight_file_and_leaves_what_it_is_told_to_keep(trained: Path) -> None:
     begun = trained / "out" / "tiny-live.safetensors"
     more = changed(RECIPE, weights=str(begun), keep=frozenset({"depth"}))
@@ -283,6 +284,7 @@ def test_where_the_gate_is_open_depth_is_that_of_the_declared_ground() -> None:
     assert ((metres / ground - 1).abs()[near] < 0.05).float().mean() > 0.98
 
 
+@pytest.mark.slow
 def test_depth_learns_one_picture_by_heart(data: Path) -> None:
     torch.manual_seed(0)
     net, clips = DepthNet(TINY.depth, len(TINY.classes)), TrainingClips(data / "data", CPU)

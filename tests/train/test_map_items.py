@@ -28,6 +28,7 @@ def test_each_item_has_one_outcome_and_errors_end_nothing(workers: int) -> None:
             outcomes[number].unwrap()
 
 
+@pytest.mark.slow
 def test_what_a_killed_worker_had_is_done_again(tmp_path: Path) -> None:
     items = [(str(tmp_path), number) for number in range(6)]
     outcomes = list(map_items(killed_once, items, workers=2))

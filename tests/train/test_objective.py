@@ -5,7 +5,7 @@ from dataclasses import replace
 import msgspec
 import pytest
 import torch
-from tiny_world import FRAMES, TinyClips, tiny_recipe
+from tiny_world import FRAMES, TinyClips, noise_batch, tiny_recipe
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -32,16 +32,7 @@ def tiny_networks(prediction: str) -> Networks:
 
 
 def batch_of(networks: Networks, clips: int) -> Batch:
-    made, unet = draws(99), networks.config.unet
-    rows = clips * FRAMES
-    return Batch(
-        target=made.normal(rows, unet.latent_channels, 4, 8),
-        condition=made.normal(rows, unet.condition_channels, 4, 8),
-        vector=made.normal(rows, unet.vector_width),
-        tokens=None,
-        emphasis=None,
-        frames=FRAMES,
-    )
+    return noise_batch(networks.config, draws(99), clips * FRAMES, FRAMES)
 
 
 def network_output(networks: Networks, noisy: Tensor, sigma: Tensor, batch: Batch) -> Tensor:

@@ -91,6 +91,7 @@ def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None
     assert set(measured(orbit_run)) == {"vae", "unet", "export"}
 
 
+@pytest.mark.slow
 def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run: Path) -> None:
     view, traits = rendered(painted_run / "tiny-painted.safetensors")
     assert view.classes is not None
@@ -99,6 +100,7 @@ def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run
     assert all(0 <= measured(painted_run)[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
 
 
+@pytest.mark.slow
 def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tmp_path: Path) -> None:
     for number in (1, 2):
         write_driving(tmp_path / "set", number, frames=FRAMES + 1)
@@ -265,6 +267,7 @@ def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> No
     assert len(set(videos.seeds)) == 6
 
 
+@pytest.mark.slow
 def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     latents, other = tmp_path / "latents", TinyClips(2, seed=4)
     other.origin = "tiny direct"

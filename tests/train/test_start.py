@@ -8,7 +8,7 @@ import msgspec
 import pytest
 import torch
 from safetensors.torch import save_file
-from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, saved, trainer
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, noise_batch, saved, trainer
 from torch import Tensor
 from torch.testing import assert_close
 from typer.testing import CliRunner
@@ -111,17 +111,7 @@ def test_a_file_of_another_model_is_refused_by_its_first_weight(tmp_path: Path) 
 
 
 def random_batch(config: ModelConfig) -> Batch:
-    draws, rows = Draws(1, "batch", 0, CPU), config.frames
-    assert config.image_encoder is not None
-    return Batch(
-        target=draws.normal(rows, 4, 4, 4),
-        condition=draws.normal(rows, 4, 4, 4),
-        vector=draws.normal(rows, config.unet.vector_width),
-        tokens=draws.normal(rows, config.image_encoder.output_width),
-        emphasis=None,
-        frames=rows,
-        camera=draws.normal(rows, 13),
-    )
+    return noise_batch(config, Draws(1, "batch", 0, CPU), config.frames, config.frames, (4, 4))
 
 
 def updated(networks: Networks, *, half: bool = False) -> set[str]:
@@ -220,6 +210,7 @@ def test_a_missing_weight_file_is_told_with_its_key_before_networks_are_made() -
         start_networks(recipe, model_config(recipe), seed=0)
 
 
+@pytest.mark.slow
 def test_the_temporal_part_trains_on_a_cpu_with_channels_last() -> None:
     """In a process of its own, which torch's group norm would crash."""
     program = (

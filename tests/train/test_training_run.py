@@ -64,6 +64,7 @@ def test_every_stage_writes_metrics_and_samples(run: Path) -> None:
     assert found["export"]["bytes"] == (run / "tiny.safetensors").stat().st_size
 
 
+@pytest.mark.slow
 def test_a_finished_run_does_nothing_but_export_again(run: Path) -> None:
     before = {
         path: path.stat().st_mtime_ns
@@ -91,8 +92,7 @@ def folder_with(run: Path, path: Path, *parts: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("at", [2, 5])
-@pytest.mark.parametrize("stage", ["vae", "unet"])
+@pytest.mark.parametrize(("stage", "at"), [("vae", 2), ("unet", 5)])
 def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
     run: Path, tmp_path: Path, stage: StageName, at: int
 ) -> None:

@@ -32,7 +32,9 @@ from gcd_train.recipe_data import Budget, LogRecipe
 from gcd_train.training.checkpoint import SavedWeights, newest_weights
 from gcd_train.training.loop import LoopOptions, Progress, StepLoss, Task
 from gcd_train.training.monitor import RunFolder
+from gcd_train.training.objective import Batch
 from gcd_train.training.run import Trainer
+from gcd_train.training.setup import Draws
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
 
@@ -156,6 +158,20 @@ def loop_options(budget: Budget, ema: EmaRecipe | None = None, **changes: object
         frames_per_clip=1,
     )
     return replace(options, **changes)
+
+
+def noise_batch(config: ModelConfig, draws: Draws, rows: int, frames: int, size: tuple[int, int] = (4, 8)) -> Batch:
+    """Rows of nothing but noise, with all that a network of this config is given. size: of the latents."""
+    tower, unet = config.image_encoder, config.unet
+    return Batch(
+        target=draws.normal(rows, unet.latent_channels, *size),
+        condition=draws.normal(rows, unet.condition_channels, *size),
+        vector=draws.normal(rows, unet.vector_width),
+        tokens=None if tower is None else draws.normal(rows, tower.output_width),
+        emphasis=None,
+        frames=frames,
+        camera=draws.normal(rows, 13) if config.camera == "spherical" else None,
+    )
 
 
 class After(Event):
