@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Generator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast, get_args
@@ -67,12 +68,13 @@ def train(
         loaded = load_recipe(recipe, small=small, changes=changes or ())
         if stage is not None and stage not in get_args(StageName):
             raise BadParameter(f"no stage is called {stage!r}; there are {', '.join(get_args(StageName))}")
-        live = isinstance(loaded, LiveRecipe)
-        with _in_processes(ComputeRecipe(device=loaded.device) if live else loaded.compute) as processes:
-            if live:
-                _train_live(loaded, data, valid, out, processes)
-            else:
-                _train(loaded, data, valid, out, latents, cast("StageName | None", stage), processes)
+        if isinstance(loaded, LiveRecipe) and valid is None:
+            raise RecipeError(
+                "a live model is measured on clips of their own: give --valid (`gcd-train generate live`)"
+            )
+        compute = ComputeRecipe(device=loaded.device) if isinstance(loaded, LiveRecipe) else loaded.compute
+        with _in_processes(compute) as processes:
+            _train(loaded, data, valid, out, latents, cast("StageName | None", stage), processes)
 
 
 @contextmanager
@@ -94,19 +96,8 @@ def _stop_when_asked() -> Event:
     return stop
 
 
-def _train_live(recipe: LiveRecipe, data: Path, valid: Path | None, out: Path, processes: "Processes") -> None:
-    from gcd_train.live.training import train_live
-    from gcd_train.training.monitor import RunFolder
-
-    if valid is None:
-        raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
-    folder = RunFolder(out)
-    with folder.begun(recipe, command_line()) if processes.first else nullcontext():
-        train_live(recipe, data, valid, folder, _stop_when_asked(), processes)
-
-
 def _train(
-    recipe: Recipe,
+    recipe: Recipe | LiveRecipe,
     data: Path,
     valid: Path | None,
     out: Path,
@@ -115,6 +106,7 @@ def _train(
     processes: "Processes",
 ) -> None:
     from gcd_train.data.open import open_data
+    from gcd_train.live.training import train_live
     from gcd_train.training.monitor import RunFolder, TensorBoard
     from gcd_train.training.run import Trainer
     from gcd_train.training.setup import family_of, run_config
@@ -122,10 +114,15 @@ def _train(
     stop = _stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
     folder = RunFolder(out, board)
-    opened = open_data(recipe, run_config(recipe), family_of(recipe.model), data, valid)
-    trainer = Trainer(recipe=recipe, data=opened, folder=folder, stop=stop, latents=latents, processes=processes)
+    if isinstance(recipe, LiveRecipe):
+        assert valid is not None, "refused before"
+        run = partial(train_live, recipe, data, valid, folder, stop, processes)
+    else:
+        opened = open_data(recipe, run_config(recipe), family_of(recipe.model), data, valid)
+        trainer = Trainer(recipe=recipe, data=opened, folder=folder, stop=stop, latents=latents, processes=processes)
+        run = partial(trainer.run, stage)
     with folder.begun(recipe, command_line()) if processes.first else nullcontext():
-        trainer.run(stage)
+        run()
 
 
 def recipes(
