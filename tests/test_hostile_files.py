@@ -234,7 +234,7 @@ TEXT_DOORS = {
         lambda here: (here / "recipe.toml").write_text('base = "base.toml"\n'),
     ),
     "pair_world": Door("json", "pairs/world.json", ON_PAIRS, folders("pairs")),
-    "scene_manifest": Door("json", "scn00000/gcd-manifest.json", "gcd-train verify scn00000", KUBRIC),
+    "scene_manifest": Door("json", "scn00000/gcd-manifest.json", "gcd-train generate drop --out . --scenes 1", KUBRIC),
     "kubric_metadata": Door("json", "scn00000/scn00000_p0_v4.json", "gcd-train show scn00000", KUBRIC),
     "driving_ontology": Door("json", "scene_000000/ontology/ontology.json", PARALLEL, labelled_scene),
     "driving_calibration": Door("json", "scene_000000/calibration/calibration.json", PARALLEL, pictured_scene),
@@ -572,6 +572,6 @@ def require_one_line(commands: WarmCommands, argv: list[str], here: Path, name: 
     assert ended.cpu_s < LIMIT_S, shown
     assert ended.peak_mb < LIMIT_MB, shown
     last = ended.output.strip().splitlines()[-1]
-    assert last.startswith(("error: ", "gcd-train: ")) or argv[1] == "verify", shown
+    assert last.startswith(("error: ", "gcd-train: ")) or argv[1] == "generate", shown
     assert name in ended.output, shown
     assert "\x1b" not in ended.output.replace("\x1b[", ""), shown

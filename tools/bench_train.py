@@ -338,14 +338,14 @@ class Updates:
         source, target = (
             self.precision.frames(draws.normal(rows, 3, config.height, config.width).clamp(-1, 1)) for _ in range(2)
         )
-        latents, encoded, images, emphasis = encode_frames(self.networks, self.recipe, source, target, draws)
-        condition, tokens = drop_streams(encoded, images, config.frames, draws, self.recipe)
+        encoded = encode_frames(self.networks, self.recipe, source, target, draws)
+        condition, tokens = drop_streams(encoded.source, encoded.tokens, config.frames, draws, self.recipe)
         return Batch(
-            target=latents,
+            target=encoded.target,
             condition=condition,
-            vector=self.conditioner.vector(torch.full((rows,), 100.0)),
+            vector=self.conditioner.vector(torch.full((rows,), self.recipe.fps), torch.full((rows,), 100.0)),
             tokens=tokens,
-            emphasis=emphasis,
+            emphasis=encoded.emphasis,
             frames=config.frames,
             camera=draws.normal(rows, 13),
         )

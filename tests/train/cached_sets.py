@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gcd_train.data.cache import CacheIdentity, ClipPlan, FrozenEncoders, SceneShard, only_writer
-from gcd_train.data.cache_writer import CacheJob, EncoderChoice, cache_scenes, load_encoders, missing_scenes
+from gcd_train.data.cache import CacheIdentity, ClipPlan, FrozenEncoders, SceneShard
+from gcd_train.data.cache_writer import CacheJob, CacheOptions, cache_scenes, load_encoders
 from gcd_train.errors import DataError
 from gcd_train.parallel import Outcome
 
 HEIGHT, WIDTH, FRAMES, CLIP = 32, 48, 7, 3
 PLAN = ClipPlan(clip_frames=CLIP)
-CHOICE = EncoderChoice(weights="random:driving", device="cpu", batch=8)
+CHOICE = CacheOptions(weights="random:driving", device="cpu", batch=8)
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,7 @@ def cached(folder: Path, pictures: FakePictures | None = None, **identity: objec
     """Make the cache of a set; what became of each scene."""
     pictures = pictures or FakePictures()
     job = CacheJob(folder=folder, pictures=pictures, choice=CHOICE, identity=tiny_identity(**identity))  # pyright: ignore[reportArgumentType]
-    with only_writer(folder):
-        return list(cache_scenes(job, missing_scenes(job)))
+    return list(cache_scenes(job))
 
 
 # a child that kills itself at the n-th time something settles on the disk

@@ -113,16 +113,3 @@ def test_what_comes_out_otherwise_is_not_there(source: Path, tmp_path: Path, mon
     with pytest.raises(DataError, match="view0 at frame 0: its depth came out"):
         Compaction.of(source / "kubric", tmp_path, cameras=VIEWS)("scn00003")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_a_killed_run_left_is_removed(source: Path, tmp_path: Path) -> None:
-    (tmp_path / ".scn00003.0123456789ab.partial" / "scn00003").mkdir(parents=True)
-    (tmp_path / ".scn00003.0123456789ab.partial" / "lock").touch()
-    assert packed(source / "kubric", tmp_path, "--limit", "1")[0] == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["scn00003"]
-
-
-@pytest.mark.parametrize(("folder", "words"), [("nowhere", "cannot be read"), ("kubric/scn00003", "holds no scene")])
-def test_folders_without_scenes_are_refused(source: Path, tmp_path: Path, folder: str, words: str) -> None:
-    result = CliRunner().invoke(app, ["data", "compact", str(source / folder), str(tmp_path)])
-    assert (result.exit_code, words in " ".join(result.output.split())) == (66, True), result.output

@@ -1,6 +1,7 @@
 """What a recipe's [data] makes of folders: parts, samplings, and what is refused."""
 
 import shutil
+import zipfile
 from pathlib import Path
 
 import msgspec
@@ -12,15 +13,28 @@ from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
 from tiny_world import tiny_recipe
 
 from gcd_model.config import ModelConfig
+from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
+from gcd_train.data.batches import CachedBatches
+from gcd_train.data.open import RunData, open_data, sampling_of
+from gcd_train.data.pairs import PairedClips
 from gcd_train.data.paths import DrivingSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.clips import cameras_of
 from gcd_train.recipe import LossRecipe, Recipe
 from gcd_train.recipe_data import DataRecipe, FramesRecipe, OrbitRecipe
-from gcd_train.training.setup import Draws, Precision
+from gcd_train.recipe_files import load_recipe
+from gcd_train.scenes.driving.world import driving_scene
+from gcd_train.scenes.worlds import (
+    SCENE_WORLDS,
+    CameraWay,
+    SceneFormat,
+    agree,
+    pair_world,
+)
+from gcd_train.training.setup import Draws, Precision, family_of, model_config
 
 VIEWS = tuple(f"view{number}" for number in range(4))
 CONFIG = ModelConfig(frames=3, height=32, width=48)
@@ -55,7 +69,7 @@ def recipe(data: DataRecipe, **unet: object) -> Recipe:
 
 
 def opened(told: Recipe, data: Path, valid: Path | None = None, family: str = "kubric90") -> RunData:
-    return open_data(told, CONFIG, FAMILIES[family], DataPlaces(data=data, valid=valid))
+    return open_data(told, CONFIG, FAMILIES[family], data, valid)
 
 
 def lengths(run: RunData) -> tuple[int, int]:
@@ -66,7 +80,7 @@ def lengths(run: RunData) -> tuple[int, int]:
 def test_kubric_is_split_by_number(kubric: Path) -> None:
     run = opened(recipe(KUBRIC), kubric)
     assert lengths(run) == (2, 1)
-    assert run.batches is not None
+    assert run.drawn is not None
     assert (run.clips.fps, run.valid.fps, run.valid.camera) == (12.0, 12.0, "spherical")
     source, target = run.valid.sample(0).source, run.valid.sample(0).target
     assert source.shape == target.shape == (3, 32, 48, 3)
@@ -127,18 +141,19 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     told = msgspec.structs.replace(own, model=model, vae=None, latents=None)
     networks = random_weights("driving", frames=CLIP).networks
     config = msgspec.structs.replace(networks.config, height=HEIGHT, width=WIDTH)
-    run = open_data(told, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
-    assert run.batches is not None
+    run = open_data(told, config, FAMILIES["driving"], tmp_path, driving)
     precision = Precision(torch.device("cpu"), half=False, channels_last=False)
-    batch = run.batches(networks, precision).batch(Draws(1, "unet", 0, torch.device("cpu")), 2)
+    batch = CachedBatches(run.drawn, networks, told.unet, precision, "gradual").batch(
+        Draws(1, "unet", 0, torch.device("cpu")), 2
+    )
     assert batch.target.shape[0] == 2 * CLIP
     assert len(batch.ids) == 2
     assert batch.wait_s is not None
     both = msgspec.structs.replace(told, data=msgspec.structs.replace(data, held_out=2))
     with pytest.raises(DataError, match="scene_000002"):
-        open_data(both, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+        open_data(both, config, FAMILIES["driving"], tmp_path, driving)
     with pytest.raises(RecipeError, match="made with other encoders"):
-        run.batches(random_networks(networks.config, seed=9), precision)
+        CachedBatches(run.drawn, random_networks(networks.config, seed=9), told.unet, precision, "gradual")
     for change, name in (
         ({"modality": "semantic"}, "data.modality"),
         ({"move_time": 0}, "data.move_time"),
@@ -147,9 +162,9 @@ def test_a_cache_is_read_with_the_encoders_that_made_it(driving: Path, tmp_path:
     ):
         other = msgspec.structs.replace(told, data=msgspec.structs.replace(data, **change))
         with pytest.raises(RecipeError, match=f"the recipe's {name} wants another thing"):
-            open_data(other, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+            open_data(other, config, FAMILIES["driving"], tmp_path, driving)
     with pytest.raises(RecipeError, match="frozen autoencoder"):
-        open_data(own, config, FAMILIES["driving"], DataPlaces(data=tmp_path, valid=driving))
+        open_data(own, config, FAMILIES["driving"], tmp_path, driving)
 
 
 def test_rates_and_orbits_that_do_not_fit_are_refused(kubric: Path) -> None:
@@ -158,7 +173,7 @@ def test_rates_and_orbits_that_do_not_fit_are_refused(kubric: Path) -> None:
     wide = msgspec.structs.replace(KUBRIC, orbit=OrbitRecipe(max_azimuth_deg=120.0))
     with pytest.raises(RecipeError, match="nobody could ask for the views beyond"):
         opened(recipe(wide), kubric)
-    assert opened(recipe(wide), kubric, family="kubric180").batches is not None
+    assert opened(recipe(wide), kubric, family="kubric180").drawn is not None
 
 
 def test_what_is_left_out_of_the_sampling_is_as_released() -> None:
@@ -186,3 +201,70 @@ def test_every_difference_of_the_release_can_be_chosen() -> None:
     slip = sampling_of(recipe(msgspec.structs.replace(other, move_time=13)), 14)
     assert isinstance(slip, OrbitSampling)
     assert slip.move_time == 13  # as the released file of the direct 180-degree model has it
+
+
+# --- driving pairs, whose target camera moves to its goal or stands there from the first frame on --------------------
+
+FORM = SceneFormat(width=48, height=32, frames=3, oversample=1)
+
+
+def pair_folder(place: Path, path: CameraWay, first_seed: int = 0) -> Path:
+    """A data folder that says what it is; its one clip is a name without pictures."""
+    place.mkdir(parents=True)
+    agree(place, pair_world(SCENE_WORLDS["driving"], FORM, path=path))
+    with zipfile.ZipFile(place / f"shard-{first_seed:08d}-0001.zip", "w") as archive:
+        archive.writestr(f"{first_seed:08d}/scene.json", "{}")
+    return place
+
+
+def opened_pairs(recipe: Recipe, data: Path, valid: Path) -> RunData:
+    model = recipe.model
+    return open_data(recipe, model_config(model), family_of(model), data, valid)
+
+
+def test_a_direct_target_stands_where_a_gradual_one_arrives_and_the_source_is_the_same() -> None:
+    gradual, direct = driving_scene(3, frames=3), driving_scene(3, frames=3, move_time=0)
+    np.testing.assert_array_equal(direct.cameras["source"], gradual.cameras["source"])
+    np.testing.assert_allclose(direct.cameras["target"][-1], gradual.cameras["target"][-1], atol=1e-9)
+    between = np.linalg.inv(direct.cameras["source"]) @ direct.cameras["target"]
+    np.testing.assert_allclose(between, np.repeat(between[-1:], 3, 0), atol=1e-6)
+    assert not np.allclose(gradual.cameras["target"][0], direct.cameras["target"][0])
+
+
+@pytest.mark.parametrize(("path", "goal"), [("gradual", 2), ("direct", 0)])
+def test_clips_and_methods_follow_the_path_that_the_world_tells(path: CameraWay, goal: int, tmp_path: Path) -> None:
+    clips = PairedClips.open(pair_folder(tmp_path / "data", path))
+    wanted = driving_trajectory(frames=3, move_time=goal, mount=CameraMount()).source_from_target
+    for trajectory in (clips.trajectory(0), cameras_of(clips, 0).trajectory):
+        np.testing.assert_allclose(trajectory.source_from_target.numpy(), wanted.numpy(), atol=1e-9)
+        assert trajectory.at_goal.index(True) == goal
+    lower = CameraMount(height_m=1.2)
+    declared = cameras_of(clips, 0, lower).trajectory.source_from_target
+    np.testing.assert_allclose(declared, driving_trajectory(frames=3, move_time=goal, mount=lower).source_from_target)
+
+
+def test_clips_of_both_paths_do_not_go_together(tmp_path: Path) -> None:
+    pair_folder(tmp_path / "gradual", "gradual")
+    pair_folder(tmp_path / "direct", "direct")
+    with pytest.raises(DataError, match="camera and path"):
+        PairedClips.open(tmp_path)
+
+
+def test_a_recipe_for_the_other_path_is_refused(tmp_path: Path) -> None:
+    recipe = load_recipe("package:study-gradual-scratch")
+    data, valid = pair_folder(tmp_path / "train", "direct"), pair_folder(tmp_path / "valid", "direct", 1_000_000)
+    with pytest.raises(DataError, match=r"goal in frame 0, the recipe's data\.path says frame 2"):
+        opened_pairs(recipe, data, valid)
+    direct = load_recipe("package:study-direct-scratch")
+    assert len(opened_pairs(direct, data, valid).clips) == 1
+
+
+def test_image_to_video_takes_both_paths_and_no_scene_that_is_held_out(tmp_path: Path) -> None:
+    for path in ("gradual", "direct"):
+        pair_folder(tmp_path / "train" / path, path)
+        pair_folder(tmp_path / "valid" / path, path, 1_000_000)
+    recipe = load_recipe("package:study-pretrain")
+    run = opened_pairs(recipe, tmp_path / "train", tmp_path / "valid")
+    assert (len(run.clips), len(run.valid)) == (4, 4)
+    with pytest.raises(DataError, match="share 1 scenes"):
+        opened_pairs(recipe, tmp_path / "train", tmp_path / "train" / "direct")

@@ -7,8 +7,7 @@ import msgspec
 import pytest
 import torch
 from fake_model import traits_of
-from tiny_driving import smaller
-from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, measured, saved, trainer
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, measured, saved, smaller, trainer
 
 from gcd_model import Clip, RenderOptions, load_synthesizer
 from gcd_model.config import SVD_14
@@ -119,6 +118,7 @@ def test_a_student_has_its_own_steps_and_no_guidance() -> None:
         student_config(config, StudentRecipe(steps=2, sigma_min=900.0))
 
 
+@pytest.mark.slow
 def test_a_distillation_ends_in_a_weight_file_that_takes_the_students_steps(run: Path) -> None:
     synthesizer = load_synthesizer(run / "tiny-student.safetensors", device="cpu")
     sampling = synthesizer.traits.config.sampling
@@ -131,6 +131,7 @@ def test_a_distillation_ends_in_a_weight_file_that_takes_the_students_steps(run:
     assert synthesizer.traits.trained
 
 
+@pytest.mark.slow
 def test_a_distillation_says_what_it_measures(run: Path) -> None:
     found = measured(run)
     assert set(found) == {"unet", "export"}
@@ -138,6 +139,7 @@ def test_a_distillation_says_what_it_measures(run: Path) -> None:
     assert '"latent": ' in (run / "metrics.jsonl").read_text()
 
 
+@pytest.mark.slow
 def test_the_student_is_exported_as_weights_and_as_an_adapter(run: Path, teacher: Path) -> None:
     paired = saved(run / "unet", "unet").best
     adapter = read_adapter(run / "tiny-student-adapter.safetensors")

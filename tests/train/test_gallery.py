@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from fake_model import FakeModel, traits_of
-from tiny_driving import write_untrained
+from tiny_world import write_untrained
 from typer import Typer
 from typer.testing import CliRunner
 

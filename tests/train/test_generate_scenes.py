@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
 from gcd_train.data import kubric4d
-from gcd_train.data.files import GEOMETRY, MANIFEST, SceneFiles, faults, read_manifest
+from gcd_train.data.files import GEOMETRY, MANIFEST, SceneFiles, read_manifest
 from gcd_train.errors import DataError, RecipeError, RenderError, RunError
 from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.scenes import scene_writer
@@ -157,19 +157,6 @@ class TestWriteScene:
         with pytest.raises(DataError, match="has no gcd-manifest"):
             write_scene(tmp_path, box_world(), FORM, 0)
         assert (tmp_path / "scn00000" / "mine").read_text() == "precious"
-
-    def test_a_changed_file_is_named(self, tmp_path: Path) -> None:
-        folder = write_scene(tmp_path, box_world(), FORM, 0).folder
-        depth = kubric4d.frame_path(folder, "view1", "depth", 0)
-        depth.write_bytes(depth.read_bytes()[:-1] + b"x")
-        (fault,) = faults(folder)
-        assert "depth_00000.tiff is not as it was written" in fault
-        depth.unlink()
-        (fault,) = faults(folder)
-        assert "depth_00000.tiff cannot be read" in fault
-        (folder / MANIFEST).write_text("{")
-        with pytest.raises(DataError):
-            list(faults(folder))
 
     def test_a_file_size_limit_leaves_what_was_finished_and_nothing_half_done(self, tmp_path: Path) -> None:
         """The kernel refuses the sixth kibibyte of any file: what a quota or a full disk does, for real."""

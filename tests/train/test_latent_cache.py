@@ -38,7 +38,6 @@ from gcd_train.data.cache import (
     ClipPlan,
     log_variance_codes,
     log_variance_of,
-    only_writer,
     read_index,
 )
 from gcd_train.data.cache_writer import CacheJob, DrivingPictures
@@ -46,6 +45,7 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.pictures import PictureOptions
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.files import only_writer
 from gcd_train.recipe import LossRecipe
 from gcd_train.training.setup import Draws, Precision
 

@@ -24,7 +24,7 @@ from gcd_train.data.lerobot_export import (
     TabletopExport,
     export_tabletop,
 )
-from gcd_train.data.open import DataPlaces, RunData, open_data
+from gcd_train.data.open import RunData, open_data
 from gcd_train.data.sample import Sample
 from gcd_train.errors import DataError, RunError
 from gcd_train.recipe_data import DataRecipe
@@ -130,7 +130,7 @@ def test_an_episode_that_is_learned_from_is_never_measured_on(made: Path, copied
     config = ModelConfig(frames=6, height=HEIGHT, width=WIDTH)
 
     def opened(valid: Path | None) -> RunData:
-        return open_data(recipe, config, FAMILIES["driving"], DataPlaces(data=made, valid=valid))
+        return open_data(recipe, config, FAMILIES["driving"], made, valid)
 
     assert len(opened(None).valid) == 1
     for same in (made, copied):

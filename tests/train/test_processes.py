@@ -39,6 +39,7 @@ def more(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return two_processes(tmp_path_factory.mktemp("more"), "more")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_two_processes_end_with_the_weights_of_one_with_twice_the_batch(found: dict[str, Any]) -> None:
     assert found["ddp moved"] > 1e-5  # there was something to learn
@@ -47,21 +48,25 @@ def test_two_processes_end_with_the_weights_of_one_with_twice_the_batch(found: d
     assert found["ddp against two batches"] < 1e-7
 
 
+@pytest.mark.slow
 def test_two_processes_share_three_batches(found: dict[str, Any]) -> None:
     assert found["uneven"] < 1e-6
     shared, alone = found["uneven speeds"]  # a batch that counts nothing is not counted
     assert shared == alone > 0
 
 
+@pytest.mark.slow
 def test_the_first_of_two_processes_measures_alone(found: dict[str, Any]) -> None:
     assert found["ddp measured"] == 0.5  # once in one, never in the other
 
 
+@pytest.mark.slow
 def test_means_over_processes_keep_what_one_of_them_alone_gives(found: dict[str, Any]) -> None:
     assert found["ddp rank 0"] == found["ddp rank 1"] == 1.0
     assert found["ddp weighed"] == 0.75  # three values of 1 beside one of 0
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_process_that_ends_ends_the_others_with_an_error(found: dict[str, Any]) -> None:
     assert "lost another process of this run" in found["lost"]

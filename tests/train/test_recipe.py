@@ -11,8 +11,7 @@ from tiny_world import RECIPE, tiny_recipe
 from gcd_train.data.open import sampling_of
 from gcd_train.data.paths import DRIVING, MAX90, MAX180
 from gcd_train.errors import RecipeError, RunError
-from gcd_train.live.recipe import LiveRecipe, live_recipe, live_recipes
-from gcd_train.recipe import Recipe
+from gcd_train.recipe import LiveRecipe, Recipe
 from gcd_train.recipe_files import load_recipe, merged, on_top, packaged_recipes, to_toml
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.setup import family_of, model_config, require_exportable
@@ -28,7 +27,7 @@ def write(folder: Path, **files: str) -> Path:
     return folder / f"{next(iter(files))}.toml"
 
 
-@pytest.mark.parametrize("name", packaged_recipes())
+@pytest.mark.parametrize("name", [name for name in packaged_recipes() if not name.startswith("live-")])
 def test_every_packaged_recipe_describes_a_model_that_can_be_built_and_is_the_same_when_written_out(name: str) -> None:
     recipe = load_recipe(f"package:{name}")
     assert msgspec.toml.decode(to_toml(recipe), type=Recipe) == recipe
@@ -182,9 +181,9 @@ def test_a_run_folder_whose_files_lead_elsewhere_is_refused(tmp_path: Path, name
     assert mine.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", live_recipes())
+@pytest.mark.parametrize("name", ["live-small", "live-small-gpu"])
 def test_a_live_recipe_is_kept_too(tmp_path: Path, name: str) -> None:
-    recipe = live_recipe(f"package:{name}")
+    recipe = load_recipe(f"package:{name}")
     with RunFolder(tmp_path).begun(recipe, "gcd-train train"):
         pass
     assert msgspec.convert(tomllib.loads((tmp_path / "recipe.toml").read_text()), LiveRecipe) == recipe
@@ -206,10 +205,9 @@ def test_tables_merge_key_by_key_and_lists_are_replaced() -> None:
 def test_what_a_recipe_does_without_is_gone_before_its_own_words_count() -> None:
     table = on_top({"a": {"b": 1, "c": 2}, "d": 3}, {"without": ["a.b", "d"], "a": {"e": 4}}, "x")
     assert table == {"a": {"c": 2, "e": 4}}
-    with pytest.raises(RecipeError, match=r"x is to do without `a\.z`"):
-        on_top({"a": {"b": 1}}, {"without": ["a.z"]}, "x")
-    with pytest.raises(RecipeError, match="list of keys"):
-        on_top({"a": {"b": 1}}, {"without": "a.b"}, "x")
+    for without in (["a.z"], ["z.a"], "a.z", [3], ["a.b.c"]):
+        with pytest.raises(RecipeError, match="`without` lists keys"):
+            on_top({"a": {"b": 1}}, {"without": without}, "x")
 
 
 def test_a_recipe_states_only_what_differs_from_its_base(tmp_path: Path) -> None:
@@ -245,7 +243,6 @@ def test_a_base_is_looked_for_beside_the_file_that_names_it(tmp_path: Path) -> N
         ({"a": 'base = "b.toml"', "b": "= 3"}, r"b\.toml \(the base of .*a\.toml\) is not valid TOML"),
         ({"a": "base = 3"}, "`base` is a path"),
         ({"a": 'base = "b.toml"\n[unet]\nclip_bath = 2', "b": TINY}, r"a\.toml \(based on .*b\.toml\): .*`clip_batch`"),
-        ({"a": 'bse = "b.toml"\n'}, "did you mean `base`"),
     ],
 )
 def test_what_is_wrong_in_a_chain_names_its_files(tmp_path: Path, files: dict[str, str], wanted: str) -> None:

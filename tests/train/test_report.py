@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from driving_plane import PlaneClips
 from made_records import FRAMES, note, record, region
-from tiny_driving import write_untrained
+from tiny_world import write_untrained
 from typer.testing import CliRunner
 
 from gcd_model.geometry import SphericalDelta

@@ -25,7 +25,7 @@ TINY = World(name="driving", width=48, height=32, frames=2, fps=10.0, hfov_deg=8
 
 @needs_egl
 def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
-    list(generate(tmp_path, TINY, range(3), workers=2))
+    list(generate(tmp_path, TINY, range(3), workers=1))
     clips = PairedClips.open(tmp_path)
     assert (len(clips), clips.frames, clips.height, clips.width, clips.fps) == (3, 2, 32, 48, 10.0)
     clip = clips[2]
@@ -108,6 +108,7 @@ def test_a_scene_in_two_shards_counts_once(tmp_path: Path) -> None:
 
 
 @needs_egl
+@pytest.mark.slow
 def test_sigterm_stops_the_workers_and_keeps_whole_shards(tmp_path: Path) -> None:
     size = "--width 48 --height 32 --frames 2 --oversample 1 --clips-per-shard 1"
     line = f"generate driving --out {tmp_path} --clips 5000 --workers 2 {size}".split()

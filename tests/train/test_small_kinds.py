@@ -18,15 +18,17 @@ from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
 from gcd_model.weights.families import FAMILIES
-from gcd_train.data.latents import Encodings, LatentClips, LatentRows
-from gcd_train.data.open import DataPlaces, open_data
-from gcd_train.data.sample import Clips, MadeClips, Sample, to_network
+from gcd_train.data.cache import EncodedRows
+from gcd_train.data.latents import Encodings, LatentClips
+from gcd_train.data.open import open_data
+from gcd_train.data.sample import Clips, MadeClips, Sample, to_network, video_clips
 from gcd_train.data.sample import painted as painted_clips
-from gcd_train.errors import DataError
+from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import Budget, DataRecipe, FramesRecipe
+from gcd_train.recipe_files import load_recipe
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.training.setup import Conditioner, Precision, mirrored_path, model_config
+from gcd_train.training.setup import Conditioner, Precision, family_of, mirrored_path, model_config, start_networks
 
 CPU = torch.device("cpu")
 PRECISION = Precision(CPU, half=False, channels_last=False)
@@ -89,6 +91,7 @@ def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None
     assert set(measured(orbit_run)) == {"vae", "unet", "export"}
 
 
+@pytest.mark.slow
 def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run: Path) -> None:
     view, traits = rendered(painted_run / "tiny-painted.safetensors")
     assert view.classes is not None
@@ -97,6 +100,7 @@ def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run
     assert all(0 <= measured(painted_run)[stage]["miou_full"] <= 1 for stage in ("vae", "unet", "export"))
 
 
+@pytest.mark.slow
 def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tmp_path: Path) -> None:
     for number in (1, 2):
         write_driving(tmp_path / "set", number, frames=FRAMES + 1)
@@ -110,7 +114,7 @@ def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tm
         repeats=2,
     )
     recipe = msgspec.structs.replace(painted_recipe(), data=data)
-    places = DataPlaces(data=tmp_path / "set")
+    places = tmp_path / "set"
     opened = open_data(recipe, model_config(recipe.model), FAMILIES["driving-semantic"], places)
     truth = opened.valid.sample(0).target_classes
     assert [kind.name for kind in opened.valid.classes] == ["Car", "Road", "Sky", "Void"]
@@ -160,7 +164,7 @@ def encoded(path: Path, recipe: Recipe, clips: Clips) -> LatentClips:
     return LatentClips.open(path)
 
 
-def row(clips: LatentClips, *, mirrored: bool) -> LatentRows:
+def row(clips: LatentClips, *, mirrored: bool) -> EncodedRows:
     """Frame 2 of clip 1."""
     return clips.rows(torch.tensor([1]), torch.tensor([2]), torch.tensor([mirrored]), CPU)
 
@@ -180,7 +184,7 @@ def test_a_mirrored_row_is_the_row_of_the_mirrored_scene(
     assert torch.equal(one.source, other.source)
     assert torch.equal(one.target, other.target)
     assert torch.equal(one.motion, other.motion)
-    assert_alike(one.control, other.control)
+    assert_alike(one.camera, other.camera)
     assert_alike(one.emphasis, other.emphasis)
 
 
@@ -196,10 +200,12 @@ def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run
     config, path = model_config(recipe.model), TinyOrbits().trajectory(1)
     traits = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu").traits
     told = micro_conditioning(12.0, traits.motion_bucket(path), 0.0, config.unet.vector_width)
-    torch.testing.assert_close(Conditioner(config, recipe.unet, PRECISION).vector(rows.motion)[0], told)
+    torch.testing.assert_close(
+        Conditioner(config, recipe.unet, PRECISION).vector(torch.tensor([recipe.unet.fps]), rows.motion)[0], told
+    )
     assert path.delta is not None
-    assert rows.control is not None
-    assert torch.equal(rows.control[0], spherical_features(path.delta)[2])
+    assert rows.camera is not None
+    assert torch.equal(rows.camera[0], spherical_features(path.delta)[2])
 
 
 @pytest.mark.parametrize(
@@ -234,3 +240,61 @@ def test_a_mirrored_path_turns_the_other_way() -> None:
     assert torch.equal(other.delta[:, 1:], path.delta[:, 1:])
     torch.testing.assert_close(other.source_from_target[:, 0, 3], -path.source_from_target[:, 0, 3])
     torch.testing.assert_close(mirrored_path(other).source_from_target, path.source_from_target)
+
+
+# --- videos out of pairs: what is learned before views ----------------------------------------------------------------
+
+SMALLER = ("model.unet.multipliers=[1,2,2]", "model.vae.width=16", "model.vae.multipliers=[1,1,2]", "log.valid_clips=1")
+
+
+def study(name: str, *changes: str) -> Recipe:
+    return load_recipe(f"package:{name}", small=True, changes=[*SMALLER, *changes])
+
+
+def test_both_sides_of_a_pair_are_videos_that_begin_with_their_condition() -> None:
+    pairs, orbits = TinyClips(2), TinyOrbits(1)
+    videos = video_clips([pairs, orbits])
+    assert len(videos) == 6
+    for number in range(6):
+        video = videos.sample(number)
+        assert (video.source == video.target[0]).all()
+        assert not (video.target == video.target[0]).all()
+        assert (video.start, video.deltas, video.target_classes, video.visible) == (None, None, None, None)
+        assert np.array_equal(video.source_from_target, np.tile(np.eye(4), (FRAMES, 1, 1)))
+    shown = [videos.sample(number).target for number in (0, 1, 2, 5)]
+    wanted = [pairs.sample(0).source, pairs.sample(0).target, orbits.sample(0).source, pairs.sample(1).target]
+    assert all(np.array_equal(one, other) for one, other in zip(shown, wanted, strict=True))
+    assert len(set(videos.seeds)) == 6
+
+
+@pytest.mark.slow
+def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
+    latents, other = tmp_path / "latents", TinyClips(2, seed=4)
+    other.origin = "tiny direct"
+    first = study("study-pretrain")
+    videos = video_clips((TinyClips(2), other))
+    trainer(tmp_path / "first", first, videos, videos, latents=latents).run()
+    weights = tmp_path / "first" / "study-pretrain-small.safetensors"
+    made = load_synthesizer(weights, device="cpu")
+    assert made.traits.family is FAMILIES["svd"]
+    before = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
+    assert len({path.parent for path in before}) == 1
+    assert not (tmp_path / "first" / "latents").exists()
+    then = study("study-gradual-pretrained", f"model.weights={weights}")
+    for folder in ("second", "third"):  # which share their latents
+        trainer(tmp_path / folder, then, latents=latents).run("latents")
+    after = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
+    assert before.items() < after.items()
+    assert len({path.parent for path in after}) == 2
+    start = start_networks(then.model, model_config(then.model), then.seed)
+    assert torch.equal(start.unet.conv_out.weight, made.networks.unet.conv_out.weight.float())
+    scratch = study("study-gradual-scratch", f"model.weights={weights}")
+    anew = start_networks(scratch.model, model_config(scratch.model), scratch.seed)
+    assert not torch.equal(anew.unet.stem.weight, start.unet.stem.weight)
+    assert torch.equal(anew.decoder.stem.weight, start.decoder.stem.weight)
+
+
+def test_a_model_for_something_else_is_refused(tmp_path: Path) -> None:
+    told = study("study-pretrain", "model.family=driving")
+    with pytest.raises(RecipeError, match=r'give model\.family "svd"'):
+        open_data(told, model_config(told.model), family_of(told.model), tmp_path, tmp_path)

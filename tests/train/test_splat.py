@@ -268,12 +268,6 @@ def test_a_gpu_draws_the_same(room: list[SceneView]) -> None:
     assert (made.covered.cpu() == wanted.covered).float().mean() > 0.999
 
 
-def test_sizes_may_differ_from_view_to_view(room: list[SceneView]) -> None:
-    other = photograph(room[0].world_from_camera, Intrinsics.from_hfov(60.0, 45, 33))
-    made = splat([room[0], other], room[0].world_from_camera, TARGET)
-    assert bool(made.covered.any())
-
-
 def test_distance_becomes_depth_exactly(room: list[SceneView]) -> None:
     points = plain_points(room[0], 0.5).reshape(*room[0].depth.shape, 3) - room[0].world_from_camera[:3, 3]
     planar = np.linalg.norm(points, axis=-1).astype(np.float32) / ray_lengths(SOURCE)

@@ -7,21 +7,19 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import msgspec
 import pytest
 import torch
-from tiny_world import saved
-from torch import nn
+from tiny_world import Slope, loop_options, saved
 from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
 
 from gcd_train.errors import RunError
-from gcd_train.recipe import EmaRecipe, OptimiserRecipe, UNetRecipe
+from gcd_train.recipe import EmaRecipe
 from gcd_train.recipe_data import Budget, LogRecipe
 from gcd_train.training.checkpoint import DamagedStateError, StateNote, close_folder, newest_weights, read_weights
-from gcd_train.training.loop import Loop, LoopOptions, Progress, StepLoss, Task
+from gcd_train.training.loop import Loop
 from gcd_train.training.monitor import RunFolder
 
 LOG = LogRecipe(log_s=1e6, save_s=1e6, measure_s=1e6, keep=3, keep_every=1)
@@ -29,44 +27,9 @@ LOG = LogRecipe(log_s=1e6, save_s=1e6, measure_s=1e6, keep=3, keep_every=1)
 EMA = EmaRecipe(limit=0.9)
 
 
-class Slope(Task):
-    """Four numbers to learn, from inputs that follow from the update; keeps the loss of every update."""
-
-    module: nn.Linear
-
-    def __init__(self) -> None:
-        super().__init__(nn.Linear(4, 1))
-        nn.init.constant_(self.module.weight, 0.5)
-        nn.init.zeros_(self.module.bias)
-        self.losses: dict[int, float] = {}
-
-    def step_loss(self, progress: Progress) -> StepLoss:
-        inputs = torch.randn(8, 4, generator=torch.Generator().manual_seed(progress.updates))
-        loss = (self.module(inputs) - inputs.sum(1, keepdim=True)).square().mean()
-        self.losses[progress.updates] = loss.item()
-        return StepLoss(loss, {"square": loss}, 8)
-
-    def measure(self, picture: Path) -> dict[str, float]:
-        return {"bias": self.module.bias.item()}
-
-
-def run(
-    path: Path,
-    updates: int,
-    log: LogRecipe = LOG,
-    identity: str = "slope",
-    ema: EmaRecipe | None = EMA,
-) -> Slope:
+def run(path: Path, updates: int, log: LogRecipe = LOG, identity: str = "slope", ema: EmaRecipe | None = EMA) -> Slope:
     task = Slope()
-    options = LoopOptions(
-        stage="unet",
-        identity=identity,
-        table=UNetRecipe(budget=Budget(updates=updates), optimiser=OptimiserRecipe(rate=0.1), ema=ema),
-        log=log,
-        stop=Event(),
-        frames_per_clip=1,
-    )
-    Loop(task, RunFolder(path), options).run()
+    Loop(task, RunFolder(path), loop_options(Budget(updates=updates), ema, log=log, identity=identity)).run()
     return task
 
 

@@ -26,17 +26,6 @@ def ran(*words: object, columns: int = 200) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def test_families_are_listed_with_their_limits_all_or_one() -> None:
-    code, said = ran("families")
-    assert code == 0
-    for text in ("kubric90", "kubric180", "driving-semantic", "svd", "±180°", "53.13°"):
-        assert text in said
-    _, one = ran("families", "driving")
-    assert ("85°" in one, "kubric" in one) == (True, False)
-    code, refused = ran("families", "cubric")
-    assert (code != 0, "kubric90" in refused) == (True, True)
-
-
 def test_recipes_are_listed_whole_and_one_is_shown_with_all_it_says() -> None:
     for columns in (60, 160):  # a name that is cut off cannot be given to `train`
         code, listed = ran("recipes", columns=columns)

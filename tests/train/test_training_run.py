@@ -64,6 +64,7 @@ def test_every_stage_writes_metrics_and_samples(run: Path) -> None:
     assert found["export"]["bytes"] == (run / "tiny.safetensors").stat().st_size
 
 
+@pytest.mark.slow
 def test_a_finished_run_does_nothing_but_export_again(run: Path) -> None:
     before = {
         path: path.stat().st_mtime_ns
@@ -91,8 +92,7 @@ def folder_with(run: Path, path: Path, *parts: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("at", [2, 5])
-@pytest.mark.parametrize("stage", ["vae", "unet"])
+@pytest.mark.parametrize(("stage", "at"), [("vae", 2), ("unet", 5)])
 def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
     run: Path, tmp_path: Path, stage: StageName, at: int
 ) -> None:
@@ -205,3 +205,29 @@ def test_clips_the_model_or_the_latents_do_not_fit_are_refused_before_training(
     monkeypatch.setattr(TinyClips, "fps", 5.0)
     with pytest.raises(DataError, match="the clips have 5"):
         trainer(tmp_path)
+
+
+def unet_of(path: Path, *, compiled: bool, recompute: bool = False) -> dict[str, torch.Tensor]:
+    """The U-Net's state after all updates of the tiny recipe; the stages before it are taken as they lie there."""
+    recipe = tiny_recipe()
+    compute = msgspec.structs.replace(recipe.compute, compile=compiled, checkpoint_activations=recompute)
+    for stage in ("vae", "latents", "unet"):
+        trainer(path, msgspec.structs.replace(recipe, compute=compute)).run(stage)
+    return saved(path / "unet", "unet").module
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_compiled_blocks_learn_what_plain_ones_do(tmp_path: Path) -> None:
+    """Single frames, then whole clips; also where blocks forget and compute anew."""
+    torch.set_num_threads(1)
+    plain = unet_of(tmp_path / "plain", compiled=False)
+    for recompute in (False, True):
+        folder = tmp_path / f"compiled-{recompute}"
+        folder.mkdir()
+        for stage in ("vae", "latents"):
+            (folder / stage).symlink_to(tmp_path / "plain" / stage)
+        compiled = unet_of(folder, compiled=True, recompute=recompute)
+        assert compiled.keys() == plain.keys()  # a plain run can go on with it
+        for name, weight in plain.items():
+            torch.testing.assert_close(compiled[name], weight, rtol=1e-3, atol=1e-4, msg=name)

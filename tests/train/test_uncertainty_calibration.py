@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from driving_plane import PlaneClips
-from tiny_driving import write_untrained
+from tiny_world import write_untrained
 from torch import Tensor
 from typer import Typer
 from typer.testing import CliRunner

@@ -15,7 +15,7 @@ from tiny_world import tiny_recipe
 from gcd_model.config import ModelConfig
 from gcd_model.weights.families import FAMILIES
 from gcd_train.data.files import FileFault
-from gcd_train.data.open import DataPlaces, RunData, open_data
+from gcd_train.data.open import RunData, open_data
 from gcd_train.data.videos import CAMERA_FILE, FilmedPairs, filmed_scenes
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe_data import DataRecipe
@@ -108,7 +108,7 @@ def opened(data: Path, valid: Path | None = None, **changes: Any) -> RunData:
     told = {"kind": "videos", "held_out": 1, "repeats": 3, **changes}
     recipe = tiny_recipe(data=DataRecipe(**told), unet=msgspec.structs.replace(tiny_recipe().unet, fps=FPS / 2))
     config = ModelConfig(frames=CLIP, height=32, width=48)
-    return open_data(recipe, config, FAMILIES["manipulation"], DataPlaces(data=data, valid=valid))
+    return open_data(recipe, config, FAMILIES["manipulation"], data, valid)
 
 
 def test_the_last_scene_is_held_out_and_none_is_on_both_sides(folder: Path, tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_the_last_scene_is_held_out_and_none_is_on_both_sides(folder: Path, tmp_
     shutil.copytree(folder, tmp_path / "set" / "second")
     run = opened(tmp_path / "set")
     assert (len(run.clips), len(run.valid), run.valid.fps) == (3, 1, FPS / 2)
-    assert run.batches is not None
+    assert run.drawn is not None
     with pytest.raises(DataError, match="first"):
         opened(tmp_path / "set", folder)
 

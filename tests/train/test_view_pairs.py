@@ -159,11 +159,11 @@ def test_workers_of_a_loader_give_what_one_process_gives(driving_root: Path) -> 
     pairs = driving_pairs(driving_root, repeats=2)
     alone = [pairs.sample(index) for index in range(4)]
     loaded = list(DataLoader(pairs, batch_size=2, num_workers=2, collate_fn=collate))
-    assert [batch.scenes for batch in loaded] == [("scene_000004", "scene_000009")] * 2
+    assert [[sample.scene for sample in batch.samples] for batch in loaded] == [["scene_000004", "scene_000009"]] * 2
     together = torch.cat([batch.target for batch in loaded])
     np.testing.assert_array_equal(together, np.stack([sample.target for sample in alone]))
-    assert loaded[0].source_from_target.shape == (2, 4, 4, 4)
-    assert loaded[0].deltas is None
+    np.testing.assert_array_equal(loaded[0].samples[1].source_from_target, alone[1].source_from_target)
+    assert loaded[0].samples[0].deltas is None
 
 
 def cut_off(path: Path) -> None:

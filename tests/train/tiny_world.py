@@ -1,6 +1,7 @@
 """Clips, networks and recipes small enough to train in a second."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -8,9 +9,10 @@ import msgspec
 import numpy as np
 import torch
 from safetensors.torch import load_file
+from torch import nn
 
 from gcd_model import Clip, Traits, View, load_synthesizer
-from gcd_model.config import DRIVING_CLASSES, CameraControl
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, CameraControl, ModelConfig
 from gcd_model.geometry import (
     CameraMount,
     Spherical,
@@ -19,12 +21,20 @@ from gcd_model.geometry import (
     driving_trajectory,
     spherical_trajectory,
 )
+from gcd_model.networks import random_networks
+from gcd_model.weights.card import Card
+from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.load import save_weights
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips, Sample, to_network
-from gcd_train.recipe import Recipe
+from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, UNetRecipe
+from gcd_train.recipe_data import Budget, LogRecipe
 from gcd_train.training.checkpoint import SavedWeights, newest_weights
+from gcd_train.training.loop import LoopOptions, Progress, StepLoss, Task
 from gcd_train.training.monitor import RunFolder
+from gcd_train.training.objective import Batch
 from gcd_train.training.run import Trainer
+from gcd_train.training.setup import Draws
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64
 
@@ -113,6 +123,57 @@ class TinyOrbits(TinyClips):
         return spherical_trajectory(source, change, frames=FRAMES, move_time=FRAMES - 1)
 
 
+class Slope(Task):
+    """Four numbers to learn, from inputs that follow from the update; keeps every update's loss, which can go wrong."""
+
+    module: nn.Linear
+
+    def __init__(self, fails_at: int | None = None) -> None:
+        super().__init__(nn.Linear(4, 1))
+        nn.init.constant_(self.module.weight, 0.5)
+        nn.init.zeros_(self.module.bias)
+        self.losses: dict[int, float] = {}
+        self._fails_at = fails_at
+
+    def step_loss(self, progress: Progress) -> StepLoss:
+        inputs = torch.randn(8, 4, generator=torch.Generator().manual_seed(progress.updates))
+        loss = (self.module(inputs) - inputs.sum(1, keepdim=True)).square().mean()
+        self.losses[progress.updates] = loss.item()
+        if progress.updates == self._fails_at:
+            loss = loss * torch.inf
+        return StepLoss(loss, {"square": loss}, 8)
+
+    def measure(self, picture: Path) -> dict[str, float]:
+        return {"bias": self.module.bias.item()}
+
+
+def loop_options(budget: Budget, ema: EmaRecipe | None = None, **changes: object) -> LoopOptions:
+    """A stage of so long, which speaks, saves and measures at its end alone."""
+    options = LoopOptions(
+        stage="unet",
+        identity="slope",
+        table=UNetRecipe(budget=budget, optimiser=OptimiserRecipe(rate=0.1), ema=ema),
+        log=LogRecipe(log_s=1e6, save_s=1e6, measure_s=1e6),
+        stop=Event(),
+        frames_per_clip=1,
+    )
+    return replace(options, **changes)
+
+
+def noise_batch(config: ModelConfig, draws: Draws, rows: int, frames: int, size: tuple[int, int] = (4, 8)) -> Batch:
+    """Rows of nothing but noise, with all that a network of this config is given. size: of the latents."""
+    tower, unet = config.image_encoder, config.unet
+    return Batch(
+        target=draws.normal(rows, unet.latent_channels, *size),
+        condition=draws.normal(rows, unet.condition_channels, *size),
+        vector=draws.normal(rows, unet.vector_width),
+        tokens=None if tower is None else draws.normal(rows, tower.output_width),
+        emphasis=None,
+        frames=frames,
+        camera=draws.normal(rows, 13) if config.camera == "spherical" else None,
+    )
+
+
 class After(Event):
     """A stop signal that is set the n-th time it is asked."""
 
@@ -176,3 +237,41 @@ def assert_same_states(first: Path, second: Path, stage: str) -> None:
     one, other = ({n: v for f in each.path.glob("*.safetensors") for n, v in load_file(f).items()} for each in (a, b))
     assert one.keys() == other.keys()
     assert [name for name, value in one.items() if not torch.equal(value, other[name])] == []
+
+
+def write_untrained(folder: Path) -> Path:
+    """`untrained.safetensors`: four frames of 64 x 32."""
+    config = msgspec.structs.replace(
+        PLAIN_SMALL,
+        frames=FRAMES,
+        height=HEIGHT,
+        width=WIDTH,
+        unet=msgspec.structs.replace(PLAIN_SMALL.unet, width=16, embedding_width=32, head_width=16),
+        vae=msgspec.structs.replace(PLAIN_SMALL.vae, width=16),
+        sampling=msgspec.structs.replace(PLAIN_SMALL.sampling, steps=1),
+    )
+    path = folder / "untrained.safetensors"
+    card = Card(name="untrained", config=config, family=FAMILIES["driving"], move_time=FRAMES - 1, trained=False)
+    save_weights(random_networks(config, seed=0), path, card)
+    return path
+
+
+def smaller(frames: int, height: int, width: int) -> ModelConfig:
+    """A still smaller one."""
+    change = msgspec.structs.replace
+    unet = change(
+        PLAIN_SMALL.unet,
+        width=8,
+        multipliers=(1, 2),
+        attention=(False, True),
+        embedding_width=16,
+        head_width=8,
+    )
+    return change(
+        PLAIN_SMALL,
+        frames=frames,
+        height=height,
+        width=width,
+        unet=unet,
+        vae=change(PLAIN_SMALL.vae, width=8, multipliers=(1, 1, 2)),
+    )

@@ -18,7 +18,7 @@ from threading import Event
 
 import msgspec
 import torch
-from tiny_world import FRAMES, After, saved, tiny_recipe
+from tiny_world import FRAMES, After, noise_batch, saved, tiny_recipe
 from torch import Tensor
 
 from gcd_model.networks import random_networks
@@ -43,15 +43,7 @@ class Noise:
 
     def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         rows, frames = (count, 1) if single else (count * FRAMES, FRAMES)
-        unet = model_config(tiny_recipe().model).unet
-        return Batch(
-            target=draws.normal(rows, unet.latent_channels, 4, 8),
-            condition=draws.normal(rows, unet.condition_channels, 4, 8),
-            vector=draws.normal(rows, unet.vector_width),
-            tokens=None,
-            emphasis=None,
-            frames=frames,
-        )
+        return noise_batch(model_config(tiny_recipe().model), draws, rows, frames)
 
 
 class Task(UNetTask):

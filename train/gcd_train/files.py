@@ -6,6 +6,7 @@ that ends, so what a killed run left behind is told from what another process is
 
 import errno
 import fcntl
+import logging
 import os
 import shutil
 import time
@@ -16,6 +17,7 @@ from pathlib import Path
 
 from gcd_train.errors import RunError
 
+_log = logging.getLogger(__name__)
 _LOCK = "lock"
 _UNLOCKED_S = 60.0  # a partial folder is locked sooner, or was killed in between
 
@@ -77,6 +79,28 @@ def remove_leftovers(root: Path, name: str = "*") -> int:
     for partial in found:
         shutil.rmtree(partial, ignore_errors=True)
     return len(found)
+
+
+@contextmanager
+def only_writer(folder: Path) -> Generator[None]:
+    """Hold a folder for one run. Raises RunError if another run has it, or it cannot be written; a killed one lets go
+    by itself, and what it left of files is deleted."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("a")
+    except OSError as error:
+        raise RunError(f"cannot write in {folder}: {error.strerror}; choose another --out") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(f"another run is at work in {folder}; wait for it, or choose another --out") from error
+        except OSError as error:
+            _log.warning("%s is on a file system without locks; start no second run in it (%s)", folder, error)
+        for leftover in folder.glob(".*.partial"):
+            if leftover.is_file():
+                leftover.unlink(missing_ok=True)
+        yield
 
 
 def _claim(root: Path, name: str) -> tuple[Path, int]:

@@ -6,11 +6,13 @@ import msgspec
 from msgspec import Meta
 
 from gcd_model.config import CameraControl
+from gcd_model.live.config import LiveConfig
 from gcd_train.recipe_data import (
     Budget,
     ComputeRecipe,
     Count,
     DataRecipe,
+    LiveStageName,
     LogRecipe,
     NotNegative,
     Positive,
@@ -49,6 +51,14 @@ class EmaRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     limit: Share = 0.999
     horizon: Positive | None = None
+
+
+class StageRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the tables of all stages that train state."""
+
+    budget: Budget
+    optimiser: OptimiserRecipe
+    ema: EmaRecipe | None = None
 
 
 TrainedPart: TypeAlias = Literal["all", "temporal", "lora"]
@@ -100,7 +110,7 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     gcd_train.training.setup.
     train: what the U-Net stage trains: "all" of the U-Net and what steers it, as published; "temporal", of the U-Net
     only what works across frames; "lora", adapters as [model.lora] says. family: how it is used, see
-    `gcd-train families`. frames, height, width: trained length and size in pixels, left out as the base has them.
+    docs/launch-file.md. frames, height, width: trained length and size in pixels, left out as the base has them.
     """
 
     base: Literal["plain-small", "svd-14", "small"] = "plain-small"
@@ -123,7 +133,7 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ValueError('model.train "lora" adds to a trained U-Net: give model.weights, and leave scratch out')
 
 
-class VAERecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class VAERecipe(StageRecipe, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The autoencoder, on crops of source and target frames.
 
     pool: clips to learn from, drawn once and kept decoded in memory (2 MB each at 192x128).
@@ -133,9 +143,6 @@ class VAERecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     normalise_at: share of the budget after which mean and spread of the latents are folded into the weights.
     """
 
-    budget: Budget
-    optimiser: OptimiserRecipe
-    ema: EmaRecipe | None = None
     pool: Count = 800
     crop: Count = 64
     clips: Count = 8
@@ -199,7 +206,7 @@ class LossRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     sensitivity: bool = False
 
 
-class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class UNetRecipe(StageRecipe, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The U-Net.
 
     source: "latents" reads what the latents stage wrote, "pixels" encodes every batch anew with fresh noise, "cache"
@@ -214,9 +221,6 @@ class UNetRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     fps, motion_bucket: what the network is told where the clip or its camera path does not say it.
     """
 
-    budget: Budget
-    optimiser: OptimiserRecipe
-    ema: EmaRecipe | None = None
     source: Literal["latents", "pixels", "cache"] = "latents"
     image_share: Share = 0.0
     image_batch: Count = 16
@@ -318,3 +322,47 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             )
         if (self.data.kind == "cache") != (self.unet.source == "cache"):
             raise ValueError('a latent cache is read with both data.kind "cache" and unet.source "cache"')
+
+
+class LiveStage(StageRecipe, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How long a stage trains and how.
+
+    batch: frames (depth) or views (paint, detail) of a batch. parts: batches an update, which the processes that
+    `torchrun` starts share; of the detail, one. small_share: so much of its time depth and paint learn from pictures
+    of half the size, at a quarter of the cost.
+    """
+
+    batch: Count = 8
+    parts: Count = 1
+    small_share: Share = 0.6
+    ema: EmaRecipe | None = EmaRecipe(limit=0.998, horizon=0.15)
+
+
+class LiveRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A live model's training.
+
+    weights: a live weight file to begin from, at random without. keep: stages that are left as it has them.
+    exact_every, learned_every: of the clips, every so many-th has its inputs worked out by exact and by learned depth.
+    workers: processes that work out inputs; 0 for none but this one.
+    """
+
+    kind: Literal["live"]
+    name: str
+    seed: int = 1
+    model: LiveConfig = LiveConfig()
+    weights: str | None = None
+    keep: frozenset[LiveStageName] = frozenset()
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    workers: Annotated[int, Meta(ge=0)] = 0
+    depth: LiveStage
+    exact_every: Count = 4
+    learned_every: Count = 1
+    paint: LiveStage
+    detail: LiveStage
+    log: LogRecipe = LogRecipe()
+
+    def __post_init__(self) -> None:
+        if self.keep and self.weights is None:
+            raise ValueError(f"keep = {sorted(self.keep)} needs weights, a live weight file that has them")
+        if self.detail.parts != 1:
+            raise ValueError(f"the detail stage takes one batch an update, got detail.parts = {self.detail.parts}")

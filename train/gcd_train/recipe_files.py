@@ -3,8 +3,9 @@
 import difflib
 import os
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import msgspec
 import tomli_w
@@ -13,7 +14,7 @@ from gcd_model import explain_settings_error
 from gcd_model.errors import FileError
 from gcd_model.small_files import decode_toml, read_small
 from gcd_train.errors import RecipeError
-from gcd_train.recipe import Recipe
+from gcd_train.recipe import LiveRecipe, Recipe
 
 PACKAGED = Path(__file__).parent / "recipes"
 """Where the recipes that ship with the package lie; those that only serve as a base, in `bases/`."""
@@ -51,13 +52,14 @@ def on_top(base: Mapping[str, object], over: Mapping[str, object], name: str) ->
 
     Raises: RecipeError if it does without something that the base does not have.
     """
-    wanted = over.get(WITHOUT, [])
-    keys = cast(list[object], wanted) if isinstance(wanted, list) else [None]
-    if not all(isinstance(key, str) for key in keys):
-        raise RecipeError(f'{name}: `without` is a list of keys of the base, such as ["unet.ema"], got {wanted!r}')
-    table = dict(base)
-    for key in cast(Sequence[str], keys):
-        table = _removed(table, key.split("."), key, name)
+    table, unwanted = cast(dict[str, Any], deepcopy(dict(base))), cast(Any, over.get(WITHOUT, []))
+    for key in unwanted if isinstance(unwanted, list) else [unwanted]:
+        below, (*path, last) = table, str(key).split(".")
+        for part in path:
+            below = below.get(part, {})
+        if not isinstance(below, dict) or last not in below:
+            raise RecipeError(f'{name}: `without` lists keys of the base, such as "unet.ema"; it has no `{key}`')
+        del below[last]
     return merged(table, {key: value for key, value in over.items() if key != WITHOUT})
 
 
@@ -100,23 +102,8 @@ def _told(chain: Sequence[Path]) -> str:
     return last if not before else f"{last} (the base of {', the base of '.join(before)})"
 
 
-def _removed(table: Mapping[str, object], keys: Sequence[str], told: str, name: str) -> Table:
-    first, *rest = keys
-    if first not in table:
-        raise RecipeError(f"{name} is to do without `{told}`, which its base does not have; take it out of `without`")
-    if not rest:
-        return {key: value for key, value in table.items() if key != first}
-    below = table[first]
-    if not isinstance(below, dict):
-        raise RecipeError(f"{name} is to do without `{told}`, but `{first}` is no table")
-    return {**table, first: _removed(cast(Table, below), rest, told, name)}
-
-
-_KEYS = (*Recipe.__struct_fields__, BASE, WITHOUT, SMALL)
-
-
-def load_recipe(source: str | Path, *, small: bool = False, changes: Sequence[str] = ()) -> Recipe:
-    """Read a recipe: a path, or `package:NAME`, on top of the bases it names.
+def load_recipe(source: str | Path, *, small: bool = False, changes: Sequence[str] = ()) -> Recipe | LiveRecipe:
+    """Read a recipe: a path, or `package:NAME`, on top of the bases it names; a live model's has `kind = "live"`.
 
     small: with what its table [small] says: a model, size, batch and budget for a CPU. changes: `KEY=VALUE` each, on
     top of all, such as `model.weights=svd.safetensors`.
@@ -125,40 +112,32 @@ def load_recipe(source: str | Path, *, small: bool = False, changes: Sequence[st
         RecipeError: missing, not TOML, a base that is missing or goes in a circle, an unknown key (the nearest known
             one is named), a value out of range, or no table [small] where it is asked for.
     """
-    read, (first, *bases) = read_merged(place_of(source))
+    table, (first, *bases) = read_merged(place_of(source))
     place = first if not bases else f"{first} (based on {', '.join(bases)})"
-    for key in read:
-        if key not in _KEYS:
-            near = difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.5)
-            hint = f"did you mean `{near[0]}`?" if near else f"known are {', '.join(_KEYS)}"
-            raise RecipeError(f"{place}: unknown key `{key}`; {hint}")
-    own = {key: value for key, value in read.items() if key not in (SMALL, WITHOUT)}
-    if small and SMALL not in read:
+    given, _ = table.pop(SMALL, None), table.pop(WITHOUT, None)
+    if small and given is None:
         raise RecipeError(f"{place} has no table [small], which would say what a CPU can do; leave out --small")
-    table = _smaller(own, read[SMALL], place) if small else own
+    chosen, inner = table, f"[small] of {place}"
+    smaller = table
+    if given is not None:
+        if not isinstance(given, dict):
+            raise RecipeError(f"{inner} must be a table, got {given!r}")
+        smaller = on_top(table, {"name": f"{table.get('name')}-small", **cast(Table, given)}, inner)
+        chosen = smaller if small else table
     for change in changes:
-        table = merged(table, _change(change))
-    recipe = _checked(table, place)
-    if SMALL in read:
-        _smaller(own, read[SMALL], place)  # what is wrong in it is told now, not to whoever asks for it
+        chosen = merged(chosen, _change(change))
+    recipe = _checked(chosen, inner if small else place)
+    if smaller is not table and not small:
+        _checked(smaller, inner)  # what is wrong in it is told now, not to whoever asks for it
     return recipe
 
 
-def _smaller(own: Table, smaller: object, place: str) -> Table:
-    """The recipe as its table [small] wants it; named so, too, lest the one be taken for the other."""
-    place = f"[small] of {place}"
-    if not isinstance(smaller, dict):
-        raise RecipeError(f"{place} must be a table, got {smaller!r}")
-    table = on_top(own, {"name": f"{own.get('name')}-small", **cast(Table, smaller)}, place)
-    _checked(table, place)
-    return table
-
-
-def _checked(table: Table, place: str) -> Recipe:
+def _checked(table: Table, place: str) -> Recipe | LiveRecipe:
+    kind = LiveRecipe if table.get("kind") == "live" else Recipe
     try:
-        return msgspec.convert(table, Recipe)
+        return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        raise RecipeError(f"{place}: {explain_settings_error(str(error), Recipe)}") from error
+        raise RecipeError(f"{place}: {explain_settings_error(str(error), kind)}") from error
 
 
 def _change(change: str) -> Table:

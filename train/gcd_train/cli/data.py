@@ -1,8 +1,9 @@
-"""Data sets looked after: repacked, verified, encoded once; LeRobot sets written and read."""
+"""Data sets looked after: repacked, encoded once; LeRobot sets written and read."""
 
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
@@ -18,16 +19,15 @@ from gcd_train.cli.common import (
     stop_as_by_ctrl_c,
     with_fields_of,
 )
-from gcd_train.data.cache import CacheIndex, only_writer, read_index
-from gcd_train.data.cache_writer import CacheJob, CacheOptions, cache_job, cache_scenes, missing_scenes
+from gcd_train.data.cache_writer import CacheOptions, cache_job, cache_scenes
 from gcd_train.data.compact import Compaction
-from gcd_train.data.dataset4d import layout_of
-from gcd_train.data.files import MANIFEST, faults
 from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
 from gcd_train.errors import DataError
 from gcd_train.files import remove_leftovers
-from gcd_train.parallel import map_items, one_thread_each
+from gcd_train.parallel import Outcome, map_items, one_thread_each
+
+Done = TypeVar("Done")
 
 data = typer.Typer(no_args_is_help=True, help="Downloaded data sets: repacking.")
 export = typer.Typer(no_args_is_help=True, help="Write data in other programs' formats.")
@@ -65,61 +65,40 @@ def compact(
         scenes = work.scenes[:limit]
         remove_leftovers(work.out)
         one_thread_each()
-        packed, there, damaged, written = 0, 0, 0, 0
-        with progress_bar("scenes", len(scenes), keep=True) as show:
-            for number, outcome in enumerate(map_items(work, scenes, workers=workers, ray_address=ray), start=1):
-                try:
-                    done = outcome.unwrap()
-                except DataError as fault:
-                    damaged += 1
-                    say(printable(f"{outcome.item}: {fault}"))
-                else:
-                    packed, there = packed + done.made, there + (not done.made)
-                    written += done.written
-                    if done.gaps:
-                        say(f"{outcome.item}: packed without {done.gaps} views that are missing")
-                show(number)
-        sizes = f", {written / 1e6:.1f} MB" if packed else ""
-        say(f"scenes: {packed} packed{sizes}; {there} there already; {damaged} damaged")
+        outcomes = map_items(work, scenes, workers=workers, ray_address=ray)
+        made, damaged = _worked_through(
+            outcomes,
+            len(scenes),
+            lambda done: f"packed without {done.gaps} views that are missing" if done.gaps else "",
+        )
+        packed = [done for done in made if done.made]
+        sizes = f", {sum(done.written for done in packed) / 1e6:.1f} MB" if packed else ""
+        say(f"scenes: {len(packed)} packed{sizes}; {len(made) - len(packed)} there already; {damaged} damaged")
     if damaged:
         raise typer.Exit(DataError.exit_code)
 
 
-def verify_command(
-    scenes: Annotated[list[Path], typer.Argument(help="Scene folders, or folders full of them.")],
-) -> None:
-    """Compare every file of generated scenes with its SHA-256; exit code 66 and the files' names if one differs."""
-    with errors_shown():
-        found = [scene for place in scenes for scene in _scenes_of(place)]
-        damaged: dict[Path, list[str]] = {}
-        with progress_bar("scenes", len(found)) as show:
-            for number, scene in enumerate(found, start=1):
-                try:
-                    lines = list(faults(scene))
-                except DataError as error:
-                    lines = [str(error)]
-                if lines:
-                    damaged[scene] = lines
-                show(number)
-        for line in (line for lines in damaged.values() for line in lines):
-            say(printable(line), stderr=False)
-        advice = "; delete the others and run the line that made them again" if damaged else ""
-        whole = len(found) - len(damaged)
-        say(f"{whole} of {len(found)} scenes are as they were written{advice}", stderr=False)
-    if damaged:
-        raise typer.Exit(DataError.exit_code)
+def _worked_through(
+    outcomes: Iterable[Outcome[str, Done]], count: int, remark: Callable[[Done], str]
+) -> tuple[list[Done], int]:
+    """What became of scenes, each shown as it is done, and how many cannot be read; any other error ends the run.
 
-
-def _scenes_of(place: Path) -> list[Path]:
-    """The folder itself if it is a scene, else the scenes in it."""
-    if (place / MANIFEST).exists() or layout_of(place.resolve().name):
-        return [place]
-    if not place.is_dir():
-        raise DataError(f"{place} is no folder; give scene folders, or the folder that `gcd-train generate` filled")
-    inside = sorted(path for path in place.iterdir() if layout_of(path.name))
-    if not inside:
-        raise DataError(f"{place} holds no scene (scnNNNNN, scene_NNNNNN) and is none; give another folder")
-    return inside
+    count: of scenes. remark: what there is to say of one, if anything.
+    """
+    made, damaged = list[Done](), 0
+    with progress_bar("scenes", count, keep=True) as show:
+        for number, outcome in enumerate(outcomes, start=1):
+            try:
+                made.append(outcome.unwrap())
+            except DataError as fault:
+                damaged += 1
+                said = str(fault)
+            else:
+                said = remark(made[-1])
+            if said:
+                say(printable(f"{outcome.item}: {said}"))
+            show(number)
+    return made, damaged
 
 
 @export.command()
@@ -172,31 +151,18 @@ def cache(
 ) -> None:
     """Encode a driving set once, so that training never runs the frozen encoders again."""
     with errors_shown():
-        _cache(cache_job(data, out, CacheOptions(**options)), workers, ray)
-
-
-def _cache(job: CacheJob, workers: int, ray: str | None) -> None:
-    folder, scenes, failed = job.folder, job.pictures.scenes, 0
-    with only_writer(folder), progress_bar("scenes", len(scenes), keep=True) as show:
-        missing = missing_scenes(job)
-        show(there := len(scenes) - len(missing))
-        outcomes = cache_scenes(job, missing, workers=workers, ray_address=ray)
-        for number, outcome in enumerate(outcomes, start=there + 1):
-            if outcome.value is None:
-                failed += 1
-                say(f"{outcome.item}  left out: {outcome.error}")
-            elif outcome.value.missing:
-                say(f"{outcome.item}  {len(outcome.value.missing)} frames missing")
-            show(number)
-    index = read_index(folder, CacheIndex)
-    kept = [] if index is None else [index.scenes[name] for name in scenes if name in index.scenes]
-    if kept:
-        count, size = len(kept), sum(entry.bytes for entry in kept) / 1e6
-        seconds, missing = sum(entry.seconds for entry in kept), sum(len(entry.missing) for entry in kept)
-        say(
-            f"{folder}: {count} scenes, {size:.2f} MB, {size / count:.2f} MB and {seconds / count:.1f} s a scene, "
-            f"{missing} frames missing (named in index.json)",
-            stderr=False,
+        job = cache_job(data, out, CacheOptions(**options))
+        outcomes = cache_scenes(job, workers=workers, ray_address=ray)
+        count = len(job.pictures.scenes)
+        kept, failed = _worked_through(
+            outcomes, count, lambda shard: f"{len(shard.missing)} frames missing" if shard.missing else ""
         )
-    if failed:
-        raise DataError(f"{failed} of {len(scenes)} scenes could not be cached, see above; the others are whole")
+        if kept:
+            size, seconds = sum(shard.bytes for shard in kept) / 1e6, sum(shard.seconds for shard in kept)
+            say(
+                f"{out}: {len(kept)} scenes, {size:.2f} MB, {size / len(kept):.2f} MB and {seconds / len(kept):.1f} s "
+                f"a scene, {sum(len(shard.missing) for shard in kept)} frames missing (named in index.json)",
+                stderr=False,
+            )
+        if failed:
+            raise DataError(f"{failed} of {count} scenes could not be cached, see above; the others are whole")

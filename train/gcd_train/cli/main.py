@@ -18,10 +18,6 @@ COMMANDS = {
         "Measure weights, baselines and others' frames on held-out clips, and say what is reached.",
     ),
     "export": ("data:export", "Write data in other programs' formats."),
-    "families": (
-        "train:families_command",
-        "List the model families: how each was trained, and what a finetuned checkpoint will accept.",
-    ),
     "gallery": (
         "look:gallery_command",
         "View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line.",
@@ -41,10 +37,6 @@ COMMANDS = {
     "train": (
         "train:train",
         "Train a model on clips, or go on where a run stopped. Ctrl-C stops after the update and saves.",
-    ),
-    "verify": (
-        "data:verify_command",
-        "Compare every file of generated scenes with its SHA-256; exit code 66 and the files' names if one differs.",
     ),
 }
 """Where each command stands in this package, and what its help begins with: only the one that is asked for is imported,

@@ -1,4 +1,4 @@
-"""`gcd-train train`: from a recipe and data to a weight file; `recipes`, `lora`, `families`: what there is to train."""
+"""`gcd-train train`: from a recipe and data to a weight file; `recipes`, `lora`: what there is to train."""
 
 import logging
 import signal
@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Generator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast, get_args
@@ -17,17 +18,15 @@ from rich.table import Table
 from typer import Argument, BadParameter, Option, Typer
 
 from gcd_model.weights.card import precision
-from gcd_model.weights.families import FAMILIES, Family
 from gcd_model.weights.load import load_adapted, read_adapter, save_weights
 from gcd_model.weights.save import write_published
 from gcd_train.cli.common import Dtype, command_line, errors_shown, say
-from gcd_train.live.recipe import LiveRecipe, live_recipe, live_recipes
-from gcd_train.recipe import Recipe
+from gcd_train.errors import RecipeError
+from gcd_train.recipe import LiveRecipe, Recipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, StageName
 from gcd_train.recipe_files import load_recipe, packaged_recipes, to_toml
 
-if TYPE_CHECKING:  # `recipes` and `families` want none of it
-    from gcd_train.data.open import DataPlaces
+if TYPE_CHECKING:  # `recipes` wants none of it
     from gcd_train.training.distributed import Processes
 
 Small: TypeAlias = Annotated[
@@ -66,19 +65,16 @@ def train(
     if threads is not None:
         torch.set_num_threads(threads)
     with errors_shown():
-        from gcd_train.data.open import DataPlaces
-
-        places = DataPlaces(data=data, valid=valid)
-        live = live_recipe(recipe)
-        if live is not None:
-            with _in_processes(ComputeRecipe(device=live.device, parallel="ddp")) as processes:
-                _train_live(live, places, out, processes)
-            return
         loaded = load_recipe(recipe, small=small, changes=changes or ())
         if stage is not None and stage not in get_args(StageName):
             raise BadParameter(f"no stage is called {stage!r}; there are {', '.join(get_args(StageName))}")
-        with _in_processes(loaded.compute) as processes:
-            _train(loaded, places, out, latents, cast("StageName | None", stage), processes)
+        if isinstance(loaded, LiveRecipe) and valid is None:
+            raise RecipeError(
+                "a live model is measured on clips of their own: give --valid (`gcd-train generate live`)"
+            )
+        compute = ComputeRecipe(device=loaded.device) if isinstance(loaded, LiveRecipe) else loaded.compute
+        with _in_processes(compute) as processes:
+            _train(loaded, data, valid, out, latents, cast("StageName | None", stage), processes)
 
 
 @contextmanager
@@ -100,25 +96,17 @@ def _stop_when_asked() -> Event:
     return stop
 
 
-def _train_live(recipe: LiveRecipe, places: "DataPlaces", out: Path, processes: "Processes") -> None:
-    from gcd_train.live.training import train_live, valid_folder
-    from gcd_train.training.monitor import RunFolder
-
-    valid_folder(places)
-    folder = RunFolder(out)
-    with folder.begun(recipe, command_line()) if processes.first else nullcontext():
-        train_live(recipe, places, folder, _stop_when_asked(), processes)
-
-
 def _train(
-    recipe: Recipe,
-    places: "DataPlaces",
+    recipe: Recipe | LiveRecipe,
+    data: Path,
+    valid: Path | None,
     out: Path,
     latents: Path | None,
     stage: StageName | None,
     processes: "Processes",
 ) -> None:
     from gcd_train.data.open import open_data
+    from gcd_train.live.training import train_live
     from gcd_train.training.monitor import RunFolder, TensorBoard
     from gcd_train.training.run import Trainer
     from gcd_train.training.setup import family_of, run_config
@@ -126,10 +114,15 @@ def _train(
     stop = _stop_when_asked()
     board = TensorBoard(out / "tensorboard") if recipe.log.tensorboard and processes.first else None
     folder = RunFolder(out, board)
-    opened = open_data(recipe, run_config(recipe), family_of(recipe.model), places)
-    trainer = Trainer(recipe=recipe, data=opened, folder=folder, stop=stop, latents=latents, processes=processes)
+    if isinstance(recipe, LiveRecipe):
+        assert valid is not None, "refused before"
+        run = partial(train_live, recipe, data, valid, folder, stop, processes)
+    else:
+        opened = open_data(recipe, run_config(recipe), family_of(recipe.model), data, valid)
+        trainer = Trainer(recipe=recipe, data=opened, folder=folder, stop=stop, latents=latents, processes=processes)
+        run = partial(trainer.run, stage)
     with folder.begun(recipe, command_line()) if processes.first else nullcontext():
-        trainer.run(stage)
+        run()
 
 
 def recipes(
@@ -143,16 +136,13 @@ def recipes(
     console = Console(highlight=False, soft_wrap=True)
     with errors_shown():
         if recipe is not None:
-            whole = live_recipe(recipe) or load_recipe(recipe, small=small, changes=changes or ())
-            console.print(to_toml(whole), markup=False, end="")
+            console.print(to_toml(load_recipe(recipe, small=small, changes=changes or ())), markup=False, end="")
             return
         table = Table(box=SIMPLE, pad_edge=False, padding=(0, 0))
         for column in ("recipe", "data", "model", "updates", "clips an update", "starts from"):
             table.add_column(column, no_wrap=True)
         for name in packaged_recipes():
             table.add_row(f"package:{name}", *_row(load_recipe(f"package:{name}")))
-        for name, live in live_recipes().items():
-            table.add_row(f"package:{name}", *_row(live))
         # a name that is cut off cannot be given to `train`: a narrow terminal breaks lines instead
         widest = console.measure(table, options=console.options.update(max_width=1000)).maximum
         console.width = max(console.width, widest)
@@ -205,28 +195,3 @@ def merge(
         else:
             save_weights(networks, out, card, overwrite=overwrite)
     say(f"wrote {out}", stderr=False)
-
-
-def families_command(
-    name: Annotated[str | None, Argument(help="Show one family only.", metavar="FAMILY")] = None,
-) -> None:
-    """List the model families: how each was trained, and what a finetuned checkpoint will accept."""
-    if name is not None and name not in FAMILIES:
-        raise BadParameter(f"no family is called {name!r}; there are {', '.join(FAMILIES)}")
-    table = Table(title="Model families", box=SIMPLE, pad_edge=False, padding=(0, 0))
-    for column in ("family", "camera", "az / el / r", "rates", "hfov", "size"):
-        table.add_column(column, no_wrap=True)
-    for family in FAMILIES.values():
-        if name in (None, family.name):
-            table.add_row(*_family_row(family))
-    Console().print(table)
-
-
-def _family_row(family: Family) -> tuple[str, ...]:
-    limits = family.limits
-    span = "fixed"
-    if limits is not None:
-        span = f"±{limits.azimuth_deg:g}° ±{limits.elevation_deg:g}° ±{limits.radius_m:g}"
-    rates = ", ".join(f"{rate:g}" for rate in family.rates) or "any"
-    hfov = "any" if family.hfov_deg is None else f"{family.hfov_deg:g}°"
-    return family.name, family.camera, span, rates, hfov, f"{family.width}x{family.height}"

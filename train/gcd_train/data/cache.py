@@ -21,10 +21,8 @@ K copies keep the 0.02 pixel noise of the paper: every frame of every clip draws
 clip.
 """
 
-import fcntl
 import hashlib
-from collections.abc import Callable, Collection, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -120,20 +118,6 @@ def open_shard(folder: Path, shard: Shard, redo: str) -> dict[str, Tensor]:
     if wrong is not None:
         raise DataError(f"{wrong}; {redo}")
     return load_file(folder / shard.file)
-
-
-@contextmanager
-def only_writer(folder: Path) -> Generator[None]:
-    """Hold a folder for one run. Raises RunError if another run has it; a killed one lets go by itself."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RunError(f"another run is writing to {folder}; wait for it, or stop it") from error
-        for leftover in folder.glob(".*.partial"):
-            leftover.unlink(missing_ok=True)
-        yield
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -282,20 +266,19 @@ class CacheIndex(Index, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class CachedClip:
-    """One clip of T frames, float32 on the CPU.
+class EncodedRows:
+    """N frames, encoded, float32; None for what the model or the data does without.
 
-    source: [T, C, h, w], not scaled. target: [T, C, h, w], scaled. tokens: [T, D] or None. emphasis: [T, 1, h, w] or
-    None. fps: of the clip, after the stride.
+    source: [N, C, h, w], not scaled. target: [N, C, h, w], scaled. tokens: [N, D] of the image tower. emphasis:
+    [N, 1, h, w], see `class_emphasis`. motion: [N], how far the camera goes. camera: [N, K], what steers the model.
     """
 
     source: Tensor
     target: Tensor
-    tokens: Tensor | None
-    emphasis: Tensor | None
-    fps: float
-    scene: str
-    place: ClipPlace
+    tokens: Tensor | None = None
+    emphasis: Tensor | None = None
+    motion: Tensor | None = None
+    camera: Tensor | None = None
 
 
 class CachedLatents:
@@ -340,8 +323,8 @@ class CachedLatents:
                 return scene, able[int(draws.below(len(able), 1))]
         raise DataError(f"{self.folder}: 100 scenes in a row have no complete clip; see `missing` in its index.json")
 
-    def clip(self, scene: str, place: ClipPlace, path: PathKind, draws: Draws | None = None) -> CachedClip:
-        """The tensors of a clip.
+    def clip(self, scene: str, place: ClipPlace, path: PathKind, draws: Draws | None = None) -> EncodedRows:
+        """The frames of a clip, on the CPU.
 
         draws: chooses each frame's noise copy, and a sample of the target's posterior;
         None: the first copy and the mean. Raises: DataError for a clip that is not there or a damaged shard.
@@ -355,14 +338,11 @@ class CachedLatents:
         where = {(time, position): row for row, (time, position) in enumerate(tensors["pairs"].tolist())}
         r = torch.tensor([where[time, plan.position(path, i)] for i, time in enumerate(times.tolist())])
         copies = torch.zeros_like(n) if draws is None else draws.below(identity.copies, len(n))
-        return CachedClip(
+        return EncodedRows(
             source=tensors["source"][n, copies].float(),
             target=self._target(tensors, r, draws),
             tokens=tensors["tokens"][n].float() if "tokens" in tensors else None,
             emphasis=tensors["emphasis"][r].float() if "emphasis" in tensors else None,
-            fps=identity.fps / place.stride,
-            scene=scene,
-            place=place,
         )
 
     def _read(self, scene: str) -> dict[str, Tensor]:

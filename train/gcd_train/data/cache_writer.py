@@ -47,6 +47,7 @@ from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
 from gcd_train.data.sample import Bytes, to_network
 from gcd_train.data.splits import Part, present, read_split
 from gcd_train.errors import DataError, RecipeError, RunError
+from gcd_train.files import only_writer
 from gcd_train.parallel import Outcome, map_items
 from gcd_train.training.losses import PARALLEL_DOMAIN_WEIGHTS, class_emphasis
 from gcd_train.training.setup import Draws
@@ -55,8 +56,8 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class EncoderChoice:
-    """Which encoders, run where and how."""
+class CacheOptions:
+    """Which encoders, run where and how, and what is cached: options of `gcd-train cache`."""
 
     weights: Annotated[
         str,
@@ -68,11 +69,6 @@ class EncoderChoice:
     batch: Annotated[
         int, Option(min=1, help="Pictures in one call of the encoder; changes memory, not the latents.")
     ] = 2
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CacheOptions(EncoderChoice):
-    """What is cached: options of `gcd-train cache`."""
 
     split: Annotated[Part | None, Option(help="Part of the set, needs --split-file; the whole set if left out.")] = None
     split_file: Annotated[Path | None, Option(help="JSON with the scenes of train, val and test.")] = None
@@ -90,7 +86,7 @@ class CacheOptions(EncoderChoice):
 
 
 @lru_cache(maxsize=1)
-def load_encoders(choice: EncoderChoice) -> tuple[FrozenEncoders, str]:
+def load_encoders(choice: CacheOptions) -> tuple[FrozenEncoders, str]:
     """Load, freeze and place the encoders, and name their weights by a digest; a process does it once.
 
     Raises: CheckpointError, OptionError as `load_weights`; RecipeError where the device is not there.
@@ -216,7 +212,7 @@ class CacheJob:
 
     folder: Path
     pictures: DrivingPictures
-    choice: EncoderChoice
+    choice: CacheOptions
     identity: CacheIdentity
 
     def __call__(self, scene: str) -> SceneShard:
@@ -276,33 +272,30 @@ def cache_job(data: Path, out: Path, options: CacheOptions) -> CacheJob:
     return CacheJob(folder=out, pictures=pictures, choice=options, identity=identity)
 
 
-def missing_scenes(job: CacheJob) -> list[str]:
-    """Those whose shards are missing or damaged; the index is without the damaged ones from now on. The caller holds
-    `only_writer`.
-
-    Raises: RunError if the folder holds another cache, naming what differs, or cannot be written.
-    """
-    index = read_index(job.folder, CacheIndex) or CacheIndex(identity=job.identity)
-    there, wanted = (msgspec.structs.asdict(identity) for identity in (index.identity, job.identity))
-    differs = [f"{name} {there[name]!r}, now {wanted[name]!r}" for name in there if there[name] != wanted[name]]
-    if differs:
-        raise RunError(f"{job.folder} was cached with {'; '.join(differs)}: choose another --out, or delete the folder")
-    faults = {scene: fault(job.folder, entry) for scene, entry in index.scenes.items()}
-    for reason in filter(None, faults.values()):
-        _log.warning("made anew: %s", reason)
-    whole = {scene: entry for scene, entry in index.scenes.items() if faults[scene] is None}
-    write_index(job.folder, msgspec.structs.replace(index, scenes=whole))
-    return [scene for scene in job.pictures.scenes if scene not in whole]
-
-
 def cache_scenes(
-    job: CacheJob, missing: Sequence[str], *, workers: int = 1, ray_address: str | None = None
+    job: CacheJob, *, workers: int = 1, ray_address: str | None = None
 ) -> Iterator[Outcome[str, SceneShard]]:
-    """Make the shards of `missing_scenes`; each scene ends in the index or is reported with its error."""
-    index = read_index(job.folder, CacheIndex) or CacheIndex(identity=job.identity)
-    for outcome in map_items(job, missing, workers=workers, ray_address=ray_address):
-        if outcome.value is not None:
-            scenes_now = sorted({**index.scenes, outcome.item: outcome.value}.items())
-            index = msgspec.structs.replace(index, scenes=dict(scenes_now))
-            write_index(job.folder, index)
-        yield outcome
+    """What becomes of every scene: its shard, which is in the index then, or its error; those that are there first.
+
+    A damaged shard is made anew. workers, ray_address: see `map_items`.
+    Raises: RunError if another run writes there, or the folder holds another cache, naming what differs.
+    """
+    with only_writer(job.folder):
+        index = read_index(job.folder, CacheIndex) or CacheIndex(identity=job.identity)
+        there, wanted = (msgspec.structs.asdict(identity) for identity in (index.identity, job.identity))
+        differs = [f"{name} {there[name]!r}, now {wanted[name]!r}" for name in there if there[name] != wanted[name]]
+        if differs:
+            said = f"{job.folder} was cached with {'; '.join(differs)}"
+            raise RunError(f"{said}: choose another --out, or delete the folder")
+        faults = {scene: fault(job.folder, entry) for scene, entry in index.scenes.items()}
+        for reason in filter(None, faults.values()):
+            _log.warning("made anew: %s", reason)
+        scenes = {scene: entry for scene, entry in index.scenes.items() if faults[scene] is None}
+        write_index(job.folder, msgspec.structs.replace(index, scenes=scenes))
+        missing = [scene for scene in job.pictures.scenes if scene not in scenes]
+        yield from (Outcome(item=scene, value=scenes[scene]) for scene in job.pictures.scenes if scene in scenes)
+        for outcome in map_items(job, missing, workers=workers, ray_address=ray_address):
+            if outcome.value is not None:
+                scenes = dict(sorted({**scenes, outcome.item: outcome.value}.items()))
+                write_index(job.folder, msgspec.structs.replace(index, scenes=scenes))
+            yield outcome

@@ -68,12 +68,6 @@ class Compaction:
         """
         if (self.out / scene).exists():
             return Packed(made=False)
-        try:
-            return self._packed(scene)
-        except FileFault as fault:
-            raise DataError(str(fault)) from fault  # which crosses from process to process as what it is
-
-    def _packed(self, scene: str) -> Packed:
         reader = self._reader(self.source, scene)
         frames = reader.frames(scene)
         with new_folder(self.out, scene) as folder:

@@ -40,7 +40,7 @@ _DEPTH_PNG = _png_options(6, cv2.IMWRITE_PNG_FILTER_PAETH, cv2.IMWRITE_PNG_STRAT
 # only what changes from row to row, in runs: a third of the time of searching for repetitions
 _ID_PNG = _png_options(1, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_STRATEGY_RLE)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_PALETTE, _PNG_GREY = 3, 0  # kinds of a PNG
+_PNG_PALETTE = 3  # a kind of PNG
 _MOST_PIXELS = 1 << 27
 _PLAIN_TIFF = [cv2.IMWRITE_TIFF_COMPRESSION, 1]  # not compressed: every reader can
 _WEBP_EFFORT = 2  # half the time of OpenCV's effort, which is 4, for 3 % more bytes
@@ -109,14 +109,21 @@ def colour_png(rgb: Bytes, *, alpha: bool = False) -> bytes:
     return _encoded(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGRA if alpha else cv2.COLOR_RGB2BGR), _FAST_PNG)
 
 
+def pillow() -> Any:
+    """Pillow's module Image. Raises RenderError without the extra `scenes`."""
+    try:
+        from PIL import Image  # OpenCV has neither palettes nor a choice of effort
+    except ImportError as error:
+        raise RenderError(
+            "compact scenes and palettes need the extra `scenes`: pip install 'gcd-node[scenes]'"
+        ) from error
+    return Image
+
+
 def webp(rgb: Bytes, *, quality: int) -> bytes:
     """[H, W, 3] as WebP of a quality up to 100. Raises RenderError without the extra `scenes`."""
-    try:
-        from PIL import Image  # an optional dependency, as drawing is; OpenCV has no choice of effort
-    except ImportError as error:
-        raise RenderError("compact scenes need the extra `scenes`: pip install 'gcd-node[scenes]'") from error
     file = io.BytesIO()
-    Image.fromarray(rgb).save(file, "WEBP", quality=quality, method=_WEBP_EFFORT)
+    pillow().fromarray(rgb).save(file, "WEBP", quality=quality, method=_WEBP_EFFORT)
     return file.getvalue()
 
 
@@ -268,23 +275,24 @@ def read_ids(path: Path) -> NDArray[np.int32]:
 
 
 def read_palette_indices(path: Path) -> Bytes:
-    """Indices, u8 [H, W], of a palette PNG; of a grey one its values. Raises FileFault.
+    """Indices, u8 [H, W], of a palette PNG; of a grey one its values.
 
-    OpenCV would give the palette's colours. A palette picture without its palette is a grey picture, though, so the
-    header is rewritten to say that before it is decoded.
+    Raises: FileFault; RenderError without the extra `scenes`, as OpenCV would give the palette's colours.
     """
     content = read(path)
     _require_whole_png(path, content)
-    depth, kind = content[24], content[25]
-    if kind == _PNG_PALETTE:
-        content = _as_grey(content)
-    elif kind != _PNG_GREY:
+    try:
+        with pillow().open(io.BytesIO(content)) as picture:
+            if picture.width * picture.height > _MOST_PIXELS:
+                raise ValueError(f"it states {picture.width} x {picture.height} pixels")
+            mode, indices = picture.mode, np.array(picture)
+    except RenderError:
+        raise
+    except Exception as error:  # of any kind, where a file is damaged
+        raise FileFault(path, f"is damaged ({error})") from error
+    if mode not in ("P", "L"):
         raise FileFault(path, "holds colours, not a palette: instance numbers cannot be told from it")
-    picture = decoded(path, content, cv2.IMREAD_UNCHANGED)
-    if picture.dtype != np.uint8 or picture.ndim != 2:
-        raise FileFault(path, f"should hold 8-bit indices, got {picture.dtype} {list(picture.shape)}")
-    step = 255 // (2**depth - 1) if depth < 8 else 1  # fewer bits are spread over 0..255 when they are decoded
-    return np.ascontiguousarray(picture // step, dtype=np.uint8)
+    return indices.astype(np.uint8, copy=False)
 
 
 def sized(path: Path, picture: NDArray[Number], height: int, width: int, other: str) -> NDArray[Number]:
@@ -318,16 +326,3 @@ def _require_whole_png(path: Path, content: bytes) -> None:
         raise FileFault(path, "is damaged: it is no PNG")
     if content[-8:-4] != b"IEND":
         raise FileFault(path, f"is damaged: it is cut off after {len(content)} bytes")
-
-
-def _as_grey(content: bytes) -> bytes:
-    """A palette PNG as a grey PNG of its indices."""
-    header = content[12:25] + bytes([_PNG_GREY]) + content[26:29]
-    rebuilt = [content[:12], header, struct.pack(">I", zlib.crc32(header))]
-    at = 33
-    while at + 8 <= len(content):
-        length, name = struct.unpack_from(">I4s", content, at)
-        if name not in (b"PLTE", b"tRNS", b"bKGD", b"sBIT", b"hIST"):  # mean something else, or nothing, in grey
-            rebuilt.append(content[at : at + 12 + length])
-        at += 12 + length
-    return b"".join(rebuilt)

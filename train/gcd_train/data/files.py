@@ -10,7 +10,7 @@ import logging
 import zipfile
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -230,22 +230,3 @@ def read_manifest(scene: Path) -> SceneManifest:
         return read_json(path, SceneManifest, MOST_TEXT)
     except FileError as error:
         raise DataError(f"{path} {error}; delete the scene and generate it again") from error
-
-
-def faults(scene: Path) -> Iterator[str]:
-    """One line for every file of a scene folder that is missing, cannot be read, or is not as it was written.
-
-    Files that other programs added are no fault. Raises: DataError as `read_manifest`.
-    """
-    for name, wanted in read_manifest(scene).files.items():
-        try:
-            if (scene / name).exists() and not (scene / name).is_file():
-                yield f"{scene / name} is no regular file"
-                continue
-            with (scene / name).open("rb") as file:
-                came = hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            yield f"{scene / name} cannot be read ({error.strerror})"
-            continue
-        if came != wanted:
-            yield f"{scene / name} is not as it was written: SHA-256 {came[:12]}…, wanted {wanted[:12]}…"

@@ -26,6 +26,7 @@ from gcd_model.networks import Networks
 from gcd_model.vae import Posterior
 from gcd_model.weights.families import Family
 from gcd_train.data.cache import (
+    EncodedRows,
     FrozenEncoders,
     Index,
     Shard,
@@ -74,21 +75,6 @@ class LatentsMeta(Index, frozen=True, kw_only=True):
         return sum(shard.arrays["motion"][0] for shard in self.shards)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LatentRows:
-    """Some frames. Each row is one frame, mirrored or not.
-
-    source, target: float32 [N, C, h, w]. motion: float32 [N]. control: float32 [N, K], None where nothing is steered.
-    emphasis: float32 [N, 1, h, w] or None.
-    """
-
-    source: Tensor
-    target: Tensor
-    motion: Tensor
-    control: Tensor | None
-    emphasis: Tensor | None
-
-
 class LatentClips:
     """An opened folder of latents."""
 
@@ -109,7 +95,7 @@ class LatentClips:
         names = self._shards[0]
         return type(self)(self.meta, [{name: torch.cat([s[name] for s in self._shards]).to(device) for name in names}])
 
-    def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> LatentRows:
+    def rows(self, clips: Tensor, frames: Tensor, mirrored: Tensor, device: torch.device) -> EncodedRows:
         """The frames (clips[i], frames[i]), mirrored where the flag says so; all int64 or bool [N] on the CPU."""
 
         part_of = torch.bucketize(clips, self._ends, right=True)
@@ -130,25 +116,19 @@ class LatentClips:
             return rows[order.to(rows.device)].to(device)
 
         side = mirrored.long()
-        source, target, motion = at("source", side, frames), at("target", side, frames), at("motion")
-        assert source is not None
-        assert target is not None
-        assert motion is not None
+        source, target = at("source", side, frames), at("target", side, frames)
+        assert source is not None and target is not None  # noqa: PT018
         emphasis = at("emphasis", frames)
         if emphasis is not None:
             flip = mirrored.to(device).view(-1, *[1] * (emphasis.ndim - 1))
             emphasis = torch.where(flip, emphasis.flip(-1), emphasis).float()
-        return LatentRows(
+        return EncodedRows(
             source=source.float(),
             target=target.float(),
-            motion=motion,
-            control=at("control", side, frames),
+            motion=at("motion"),
+            camera=at("control", side, frames),
             emphasis=emphasis,
         )
-
-    def names(self, clips: Tensor) -> tuple[str, ...]:
-        """What the clips are called in messages: their seeds."""
-        return tuple(f"clip {self.meta.seeds[number]}" for number in clips.tolist())
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -39,31 +39,6 @@ _FILE = "chunk-000/file-000"
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
-Statistics = dict[str, NDArray[np.float64]]
-"""min, max, mean and std of each number, and the count of rows, [1]."""
-
-
-def _statistics(rows: NDArray[Any]) -> Statistics:
-    """Of rows [T, N]."""
-    values = rows.astype(np.float64)
-    spread = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
-    return {**spread, "count": np.array([len(values)])}
-
-
-def _together(parts: Sequence[Statistics]) -> Statistics:
-    """Of all rows that some statistics are of."""
-    count = np.stack([part["count"] for part in parts])
-    mean = sum(part["mean"] * part["count"] for part in parts) / count.sum()
-    square = sum((part["std"] ** 2 + part["mean"] ** 2) * part["count"] for part in parts) / count.sum()
-    return {
-        "min": np.min([part["min"] for part in parts], 0),
-        "max": np.max([part["max"] for part in parts], 0),
-        "mean": mean,
-        "std": np.sqrt(np.maximum(square - mean**2, 0.0)),
-        "count": count.sum(0),
-    }
-
-
 class LeRobotWriter:
     """Writes a data set episode by episode into an empty folder; complete when it is closed.
 
@@ -83,7 +58,8 @@ class LeRobotWriter:
     ) -> None:
         self._folder, self._cameras, self._robot, self._fps, self._names = folder, cameras, robot, fps, names
         self._arrow, self._parquet, self._av = extra("pyarrow"), extra("pyarrow.parquet"), extra("av")
-        self._frames, self._tasks, self._statistics = 0, dict[str, int](), dict[str, list[Statistics]]()
+        self._frames, self._tasks = 0, dict[str, int]()
+        self._seen = dict[str, list[Floats]]()  # rows [N, C] of every feature, and of colours [N, 3] of some pictures
         self._tables, self._episodes = list[Any](), list[dict[str, Any]]()
         self._videos: dict[str, tuple[Any, Any]] = {}
         (folder / "meta").mkdir(parents=True, exist_ok=True)
@@ -109,11 +85,12 @@ class LeRobotWriter:
         gives one [H, W, 3] of every camera for each of its rows.
         """
         lengths = {len(rows) for rows in features.values()}
-        frames, statistics = self._encode(pictures)
+        frames = self._encode(pictures)
         if lengths != {frames}:
             raise DataError(f"an episode has {frames} pictures and {sorted(lengths)} rows; give one for each")
         columns = self._columns(features, task, frames)
-        statistics |= {name: _statistics(values) for name, values in columns.items()}
+        for name, values in columns.items():
+            self._seen.setdefault(name, []).append(values.astype(np.float64))
         pa = self._arrow
         flat = {name: pa.array(values.reshape(-1)) for name, values in columns.items()}
         lists = {  # LeRobot's own are plain numbers
@@ -122,7 +99,7 @@ class LeRobotWriter:
             if name not in _OWN
         }
         self._tables.append(pa.table(flat | lists))
-        self._episodes.append(self._episode(task, frames, statistics))
+        self._episodes.append(self._episode(task, frames))
         self._frames += frames
 
     def close(self) -> None:
@@ -144,7 +121,7 @@ class LeRobotWriter:
         table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
         table = table.replace_schema_metadata({"pandas": json.dumps(index)})
         self._parquet.write_table(table, self._folder / "meta/tasks.parquet")
-        statistics = {name: self._listed(name, _together(parts)) for name, parts in self._statistics.items()}
+        statistics = {name: self._statistics(name, np.concatenate(rows)) for name, rows in self._seen.items()}
         for name, told in (("stats", statistics), ("info", self._info())):
             (self._folder / f"meta/{name}.json").write_text(json.dumps(told, indent=4) + "\n", encoding="utf-8")
         calibration = msgspec.json.format(msgspec.json.encode(CameraFile(cameras=self._cameras)), indent=1)
@@ -155,9 +132,8 @@ class LeRobotWriter:
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
-    def _encode(self, pictures: Iterator[Mapping[str, Bytes]]) -> tuple[int, dict[str, Statistics]]:
-        """Append the pictures to the videos: how many, and statistics of the colours of some."""
-        sampled: dict[str, list[NDArray[np.float64]]] = {name: [] for name in self._cameras}
+    def _encode(self, pictures: Iterator[Mapping[str, Bytes]]) -> int:
+        """Append the pictures to the videos: how many."""
         frames = 0
         for frames, seen in enumerate(pictures, start=1):
             for name, camera in self._cameras.items():
@@ -168,8 +144,8 @@ class LeRobotWriter:
                 frame.pts, frame.time_base = self._frames + frames - 1, Fraction(1, self._fps)
                 container.mux(stream.encode(frame))
                 if frames % _SAMPLED == 1:
-                    sampled[name].append(picture[::4, ::4].reshape(-1, 3) / 255)
-        return frames, {name: _statistics(np.concatenate(rows)) for name, rows in sampled.items() if rows}
+                    self._seen.setdefault(name, []).append(picture[::4, ::4].reshape(-1, 3) / 255)
+        return frames
 
     def _columns(
         self, features: Mapping[str, NDArray[np.floating[Any]]], task: str, frames: int
@@ -177,7 +153,7 @@ class LeRobotWriter:
         """Rows [T, N] of an episode by name: its features and LeRobot's own numbers."""
         columns = {name: np.ascontiguousarray(rows, np.float32) for name, rows in features.items()}
         for name, rows in columns.items():
-            width = self._statistics[name][0]["mean"].shape[0] if name in self._statistics else rows.shape[1]
+            width = self._seen[name][0].shape[1] if name in self._seen else rows.shape[1]
             if width != rows.shape[1]:
                 raise DataError(f"{name} had {width} numbers in the first episode and has {rows.shape[1]} in this one")
         number, steps = self._tasks.setdefault(task, len(self._tasks)), np.arange(frames)
@@ -185,7 +161,7 @@ class LeRobotWriter:
         own = [(steps / self._fps).astype(np.float32), *(row.astype(np.int64) for row in numbers)]
         return columns | {name: row[:, None] for name, row in zip(_OWN, own, strict=True)}
 
-    def _episode(self, task: str, frames: int, statistics: dict[str, Statistics]) -> dict[str, Any]:
+    def _episode(self, task: str, frames: int) -> dict[str, Any]:
         """The episode's row in meta/episodes."""
         row: dict[str, Any] = {
             "episode_index": len(self._episodes),
@@ -199,18 +175,13 @@ class LeRobotWriter:
         for name in self._cameras:
             row[f"videos/{name}/from_timestamp"] = self._frames / self._fps
             row[f"videos/{name}/to_timestamp"] = (self._frames + frames) / self._fps
-        for name, seen in statistics.items():
-            row.update({f"stats/{name}/{key}": value for key, value in self._listed(name, seen).items()})
-            self._statistics.setdefault(name, []).append(seen)
         return row
 
-    def _listed(self, name: str, statistics: Statistics) -> dict[str, list[Any]]:
-        """As LeRobot writes it: a number each, or [3, 1, 1] for the channels of pictures."""
-        shaped = name in self._cameras
-        return {
-            key: (row.reshape(3, 1, 1) if shaped and key != "count" else row).tolist()
-            for key, row in statistics.items()
-        }
+    def _statistics(self, name: str, rows: Floats) -> dict[str, list[Any]]:
+        """Of rows [N, C] as LeRobot writes it: C numbers each, or [3, 1, 1] for the channels of pictures."""
+        found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+        shape = (3, 1, 1) if name in self._cameras else (-1,)
+        return {key: row.reshape(shape).tolist() for key, row in found.items()} | {"count": [len(rows)]}
 
     def _info(self) -> dict[str, Any]:
         return {
@@ -237,10 +208,10 @@ class LeRobotWriter:
             info = {f"video.{key}": value for key, value in video.items()} | {"has_audio": False}
             shape, axes = [camera.height, camera.width, 3], ["height", "width", "channels"]
             told[name] = {"dtype": "video", "shape": shape, "names": axes, "info": info}
-        for name, parts in self._statistics.items():
+        for name, rows in self._seen.items():
             if name not in self._cameras and name not in _OWN:
                 names = list(self._names.get(name, [])) or None
-                told[name] = {"dtype": "float32", "shape": list(parts[0]["mean"].shape), "names": names}
+                told[name] = {"dtype": "float32", "shape": [rows[0].shape[1]], "names": names}
         for name in _OWN:
             told[name] = {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
         return told

@@ -1,6 +1,5 @@
 """From a recipe's [data] and the folders a user names to what a run learns from and is measured on."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,10 +8,8 @@ import msgspec
 import torch
 
 from gcd_model.config import ModelConfig
-from gcd_model.networks import Networks
 from gcd_model.weights.families import Family
 from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.data.batches import CachedBatches, SampleBatches
 from gcd_train.data.cache import CachedLatents
 from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.files import MANIFEST, Skips, read_manifest
@@ -28,8 +25,7 @@ from gcd_train.data.videos import FilmedPairs, filmed_scenes
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.recipe import Recipe
 from gcd_train.recipe_data import DataRecipe
-from gcd_train.training.objective import BatchMaker, BatchSource
-from gcd_train.training.setup import Precision, digest_of
+from gcd_train.training.setup import digest_of
 
 _FIXED_SEED = 0  # of the clips that are measured on: the same ones in every run
 _VIDEO_FAMILY = "svd"
@@ -39,24 +35,18 @@ _VIDEO_FAMILY = "svd"
 class RunData:
     """clips: to learn from, for stages that take them one by one, all at the recipe's fps. valid: held out.
 
-    batches: how the U-Net's batches are made where they come neither from encoded clips nor from `clips`.
+    drawn: what the U-Net's batches are made of where it is neither encoded clips nor `clips`.
     """
 
     clips: Clips
     valid: Clips
-    batches: BatchMaker | None = None
+    drawn: Samples | CachedLatents | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DataPlaces:
-    """The folders a user names. data: to learn from. valid: held out; None to hold out a part of `data`."""
-
-    data: Path
-    valid: Path | None = None
-
-
-def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataPlaces) -> RunData:
+def open_data(recipe: Recipe, config: ModelConfig, family: Family, data: Path, valid: Path | None = None) -> RunData:
     """Open what a recipe's [data] says the folders hold.
+
+    data: to learn from. valid: held out; None to hold out a part of `data`.
 
     Raises:
         DataError: no such data there, nothing is left to measure on, or both parts share scenes or episodes.
@@ -67,7 +57,7 @@ def open_data(recipe: Recipe, config: ModelConfig, family: Family, places: DataP
             f'data.task "image-to-video" makes a model without views, model.family is {recipe.model.family!r}: give '
             f'model.family "{_VIDEO_FAMILY}"'
         )
-    opening = _Opening(recipe, config, family, places)
+    opening = _Opening(recipe, config, family, data, valid)
     match recipe.data.kind:
         case "pairs":
             return opening.pairs()
@@ -86,14 +76,15 @@ class _Opening:
     recipe: Recipe
     config: ModelConfig
     family: Family
-    places: DataPlaces
+    folder: Path
+    valid: Path | None
 
     @property
     def _data(self) -> DataRecipe:
         return self.recipe.data
 
     def pairs(self) -> RunData:
-        data, valid = self.places.data, self._valid_folder("pairs have no split of their own")
+        data, valid = self.folder, self._valid_folder("pairs have no split of their own")
         if self._data.task == "image-to-video":  # both sides of all pairs: the folders need not go the same way
             learned, held = (tuple(map(PairedClips.open, data_folders(place))) for place in (data, valid))
             require_apart(
@@ -116,64 +107,57 @@ class _Opening:
     def views(self) -> RunData:
         if self._data.kind == "kubric4d":
             self._require_family_covers_orbit()
-        whole, valid = self._dataset(self.places.data), self.places.valid
+        whole, valid = self._dataset(self.folder), self.valid
         learned, held = (whole, self._dataset(valid)) if valid is not None else self._parts(whole)
         require_apart(_worlds_of(learned), _worlds_of(held))
         sampling = sampling_of(self.recipe, self.config.frames)
         return RunData(
             clips=self._one_rate(learned, learned.fps, repeats=self._data.repeats),
             valid=self._one_rate(held, held.fps),
-            batches=self._sampled(self._pairs(learned, sampling, self.recipe.seed, self._data.repeats)),
+            drawn=self._sides(self._pairs(learned, sampling, self.recipe.seed, self._data.repeats)),
         )
 
     def lerobot(self) -> RunData:
-        held_out = 0 if self.places.valid else self._data.held_out
-        learned = self._episodes(self.places.data, (0, -held_out or None))
-        held = self._episodes(self.places.valid or self.places.data, (-held_out, None))
+        held_out = 0 if self.valid else self._data.held_out
+        learned = self._episodes(self.folder, (0, -held_out or None))
+        held = self._episodes(self.valid or self.folder, (-held_out, None))
         require_apart(*({episode.name: episode.data for episode in part.episodes} for part in (learned, held)))
-        return RunData(
-            clips=self._clips(learned, len(learned), learned.fps),
-            valid=self._clips(held, len(held.episodes), held.fps),
-            batches=self._sampled(learned),
-        )
+        return self._run(learned, held, len(held.episodes), held.fps)
 
     def videos(self) -> RunData:
-        scenes, held_out = filmed_scenes(self.places.data), self._data.held_out
-        if self.places.valid is None:
+        scenes, held_out = filmed_scenes(self.folder), self._data.held_out
+        if self.valid is None:
             if len(scenes) <= held_out:
                 raise DataError(
-                    f"{self.places.data} has {len(scenes)} scenes, and data.held_out keeps {held_out} of them to "
+                    f"{self.folder} has {len(scenes)} scenes, and data.held_out keeps {held_out} of them to "
                     "measure on; hold out fewer, or give --valid FOLDER"
                 )
             learned, held = scenes[:-held_out], scenes[-held_out:]
         else:
-            learned, held = scenes, filmed_scenes(self.places.valid)
+            learned, held = scenes, filmed_scenes(self.valid)
         require_apart(*({scene.name: scene.cameras[0].video for scene in part} for part in (learned, held)))
         fps, seed, repeats = self.recipe.unet.fps, self.recipe.seed, self._data.repeats
         size, frames = (self.config.width, self.config.height), self.config.frames
         pairs = FilmedPairs(learned, size=size, frames=frames, fps=fps, seed=seed, repeats=repeats)
         valid = FilmedPairs(held, size=size, frames=frames, fps=fps, seed=_FIXED_SEED)
-        return RunData(
-            clips=self._clips(pairs, len(pairs), fps),
-            valid=self._clips(valid, len(valid), fps),
-            batches=self._sampled(pairs),
-        )
+        return self._run(pairs, valid, len(valid), fps)
+
+    def _run(self, learned: Samples, held: Samples, count: int, fps: float) -> RunData:
+        """count: of the clips that are measured on."""
+        clips, valid = self._clips(learned, len(learned), fps), self._clips(held, count, fps)
+        return RunData(clips=clips, valid=valid, drawn=self._sides(learned))
 
     def cache(self) -> RunData:
         if self.recipe.vae is not None or self.recipe.latents is not None:
             raise RecipeError("a latent cache is of a frozen autoencoder: leave out [vae] and [latents]")
-        cache, valid = CachedLatents.open(self.places.data), self._valid_folder("a latent cache holds no pictures")
+        cache, valid = CachedLatents.open(self.folder), self._valid_folder("a latent cache holds no pictures")
         self._require_drawn_as_cached(cache)
         held = self._dataset(valid)
         if self._data.split == "last" or self._data.split_file is not None:
             held = held.only(self._part(held.scenes, "val"))
         require_apart(dict.fromkeys(cache.scenes, ""), dict.fromkeys(held.scenes, ""))
         clips = self._one_rate(held, held.fps)
-
-        def batches(networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
-            return CachedBatches(cache, networks, self.recipe.unet, precision, self._data.path)
-
-        return RunData(clips=clips, valid=clips, batches=batches)
+        return RunData(clips=clips, valid=clips, drawn=cache)
 
     def _dataset(self, root: Path) -> Dataset4D:
         cameras, published = self._data.cameras, self._data.published
@@ -187,7 +171,7 @@ class _Opening:
         learned, held_out = (self._part(whole.scenes, part) for part in ("train", "val"))
         if not learned or not held_out:
             raise DataError(
-                f"{self.places.data} has {len(whole.scenes)} scenes: {len(learned)} to learn from and {len(held_out)} "
+                f"{self.folder} has {len(whole.scenes)} scenes: {len(learned)} to learn from and {len(held_out)} "
                 'to measure on; give --valid FOLDER, or hold out the last ones with data.split "last" and data.held_out'
             )
         return whole.only(learned), whole.only(held_out)
@@ -232,28 +216,18 @@ class _Opening:
         return self._clips(pairs, len(pairs), wanted, data.ontology if semantic else None)
 
     def _clips(self, samples: Samples, count: int, fps: float, ontology: Ontology | None = None) -> Clips:
-        origin = digest_of(self._data, str(self.places.data))
-        if self._data.task == "image-to-video":
-            samples, count = VideoSamples(samples), 2 * count
+        sides = self._sides(samples)
         return MadeClips(
-            make=samples.sample if ontology is None else partial(_placed, samples, ontology.places),
-            seeds=range(count),
+            make=sides.sample if ontology is None else partial(_placed, sides, ontology.places),
+            seeds=range(count if sides is samples else 2 * count),
             camera=self.config.camera,
             fps=fps,
-            origin=origin,
+            origin=digest_of(self._data, str(self.folder)),
             classes=() if ontology is None else ontology.classes,
         )
 
-    def _sampled(self, samples: Samples) -> BatchMaker:
-        recipe = self.recipe
-        if recipe.data.task == "image-to-video":
-            samples = VideoSamples(samples)
-
-        def batches(networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
-            loader, seed = recipe.data.loader, recipe.seed
-            return SampleBatches(samples, networks, recipe.unet, self.family, precision, loader, seed, turns)
-
-        return batches
+    def _sides(self, samples: Samples) -> Samples:
+        return VideoSamples(samples) if self._data.task == "image-to-video" else samples
 
     def _episodes(self, folder: Path, episodes: tuple[int, int | None]) -> LeRobotPairs:
         options = self._data.lerobot
@@ -270,9 +244,9 @@ class _Opening:
         )
 
     def _valid_folder(self, why: str) -> Path:
-        if self.places.valid is None:
+        if self.valid is None:
             raise DataError(f"{why}: give --valid FOLDER to measure on")
-        return self.places.valid
+        return self.valid
 
     def _require_drawn_as_cached(self, cache: CachedLatents) -> None:
         """What a cache was made of cannot be drawn otherwise. Raises RecipeError naming the options."""

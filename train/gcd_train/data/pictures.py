@@ -23,7 +23,7 @@ from gcd_train.data.dataset4d import VOID, Dataset4D
 from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_manifest
 from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
-from gcd_train.data.splat import Splatted, splat
+from gcd_train.data.splat import splat
 from gcd_train.data.visibility import depth_visibility, published_picture, render_lens, visibility
 from gcd_train.errors import DataError, RenderError
 
@@ -107,35 +107,35 @@ class SplatPictures(Pictures):
     """Draws points."""
 
     def _drawn(self, scene: str, draw: Draw) -> _Drawn:
-        lens, read = self._dataset.lens(scene), Recent(partial(self._dataset.views, scene), 1)
+        options, lens, read = self._options, self._dataset.lens(scene), Recent(partial(self._dataset.views, scene), 1)
         place = list(self._dataset.cameras).index(self._dataset.source_camera)
-        made, (across, along) = _Drawn(world_from_source=draw.world_from_source), self._options.size
+        made, how = _Drawn(world_from_source=draw.world_from_source), (options.published, options.device)
+        picture = partial(published_picture, lens=lens, size=options.size, published=how[0], device=how[1])
+        points = partial(splat, lens=render_lens(lens, *options.size), published=how[0], device=how[1])
         for number, world_from_target in zip(draw.frame_numbers, draw.world_from_target, strict=True):
             views = read(number)
             own = seen = views[place]
             if draw.start is None:
                 made.world_from_source = own.world_from_camera
-                made.source.append(trained_picture(own.rgb, across, along))
+                made.source.append(trained_picture(own.rgb, *options.size))
             else:
-                made.source.append(self._picture(views, draw.world_from_source, lens))
-                if np.abs(own.world_from_camera - draw.world_from_source).max() >= SAME_POSE and self._options.visible:
-                    seen = self._seen(views, draw.world_from_source, lens)
-            values = None
-            if self._ontology is not None and self._options.modality == "classes":
-                values = [self._ontology.encode(ids) for ids in self._ids(views)]
-            made.target.append(self._picture(views, world_from_target, lens, values))
-            if self._options.class_ids:
-                made.classes.append(self._target_ids(views, world_from_target, lens))
-            if self._options.visible:
-                size, published = self._options.size, self._options.published
-                made.visible.append(visibility(seen, world_from_target, lens, size, published=published))
+                made.source.append(picture(views, draw.world_from_source))
+                if np.abs(own.world_from_camera - draw.world_from_source).max() >= SAME_POSE and options.visible:
+                    # what a camera at the drawn pose would have seen, with depth, from the points of all
+                    there = points(views, draw.world_from_source)
+                    depth, smaller = there.depth.cpu().numpy(), render_lens(lens, *options.size)
+                    seen = _view(there.picture, depth, draw.world_from_source, smaller)
+            painted = None
+            if self._ontology is not None and options.modality == "classes":
+                painted = [self._ontology.encode(ids) for ids in self._ids(views)]
+            made.target.append(picture(views, world_from_target, values=painted))
+            if options.class_ids:
+                # of the point that shows most in each pixel: colours of edges are mixed, and read back as a third class
+                ids = points(views, world_from_target, labels=self._ids(views))
+                made.classes.append(ids.labels.masked_fill(~ids.covered, VOID).byte().cpu().numpy())
+            if options.visible:
+                made.visible.append(visibility(seen, world_from_target, lens, options.size, published=how[0]))
         return made
-
-    def _target_ids(self, views: Sequence[SceneView], world_from_target: Doubles, lens: Intrinsics) -> Bytes:
-        """The class of the point that shows most in each pixel, `VOID` where none does: colours of edges are mixed, and
-        read back as a third class."""
-        drawn = self._splat(views, world_from_target, lens, self._ids(views))
-        return drawn.labels.masked_fill(~drawn.covered, VOID).byte().cpu().numpy()
 
     def _ids(self, views: Sequence[SceneView]) -> list[Bytes]:
         """Class ids of the views; of several in one colour, which pictures cannot tell apart, the lowest."""
@@ -144,36 +144,6 @@ class SplatPictures(Pictures):
         if len(classes) < len(views):
             raise DataError("classes were asked for, but the scene lacks its layer semantic_segmentation_2d")
         return [self._ontology.merge(ids) for ids in classes]
-
-    def _picture(
-        self,
-        views: Sequence[SceneView],
-        world_from_camera: Doubles,
-        lens: Intrinsics,
-        values: Sequence[Bytes] | None = None,
-    ) -> Bytes:
-        options = self._options
-        return published_picture(
-            views,
-            world_from_camera,
-            lens,
-            options.size,
-            values=values,
-            published=options.published,
-            device=options.device,
-        )
-
-    def _seen(self, views: Sequence[SceneView], world_from_source: Doubles, lens: Intrinsics) -> SceneView:
-        """What a camera at a drawn source pose would have seen, with depth, from the points of all."""
-        drawn = self._splat(views, world_from_source, lens)
-        smaller = render_lens(lens, *self._options.size)
-        return _view(drawn.picture, drawn.depth.cpu().numpy(), world_from_source, smaller)
-
-    def _splat(
-        self, views: Sequence[SceneView], at: Doubles, lens: Intrinsics, labels: Sequence[Bytes] | None = None
-    ) -> Splatted:
-        smaller, options = render_lens(lens, *self._options.size), self._options
-        return splat(views, at, smaller, labels=labels, published=options.published, device=options.device)
 
 
 class ExactPictures(Pictures):

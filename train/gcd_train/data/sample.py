@@ -96,27 +96,11 @@ class Samples(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SampleBatch:
-    """Several samples of T frames.
-
-    source, target: u8 [B, T, H, W, 3]. source_from_target: f64 [B, T, 4, 4]. deltas: f64 [B, T, 3], None in driving.
-    fps: f32 [B]. scenes: B names. skipped: of all of them.
-    """
+    """B samples of T frames. source, target: u8 [B, T, H, W, 3]. samples: the same, without pictures."""
 
     source: Tensor
     target: Tensor
-    source_from_target: Tensor
-    deltas: Tensor | None
-    fps: Tensor
-    scenes: tuple[str, ...]
-    skipped: tuple[Skipped, ...]
-
-    @property
-    def paths(self) -> list[Trajectory]:
-        """Of the target cameras, seen from the source cameras."""
-        paths = [pose_trajectory(poses) for poses in self.source_from_target]
-        if self.deltas is None:
-            return paths
-        return [replace(path, delta=delta) for path, delta in zip(paths, self.deltas, strict=True)]
+    samples: tuple[Sample, ...]
 
     def pin_memory(self) -> "SampleBatch":
         """The pictures in page-locked memory, as a loader wants to hand them over to CUDA."""
@@ -124,24 +108,19 @@ class SampleBatch:
 
 
 def collate(samples: Sequence[Sample]) -> SampleBatch:
-    """Samples as one batch, for a DataLoader; the main process gives `skipped` to its own `Skips.extend`."""
-    deltas = [sample.deltas for sample in samples if sample.deltas is not None]
-    return SampleBatch(
-        source=_stacked([sample.source for sample in samples]),
-        target=_stacked([sample.target for sample in samples]),
-        source_from_target=_stacked([sample.source_from_target for sample in samples]),
-        deltas=_stacked(deltas) if len(deltas) == len(samples) else None,
-        fps=torch.tensor([sample.fps for sample in samples]),
-        scenes=tuple(sample.scene for sample in samples),
-        skipped=tuple(skipped for sample in samples for skipped in sample.skipped),
-    )
-
-
-def _stacked(rows: Sequence[NDArray[np.generic]]) -> Tensor:
-    sizes = {row.shape for row in rows}
+    """Samples as one batch, for a DataLoader; the main process gives their `skipped` to its own `Skips.extend`."""
+    sizes = {picture.shape for sample in samples for picture in (sample.source, sample.target)}
     if len(sizes) > 1:
         raise DataError(f"samples of one batch must have one size, got {sorted(sizes)}")
-    return torch.from_numpy(np.stack(rows))
+    none = np.zeros(0, np.uint8)
+    return SampleBatch(
+        source=torch.from_numpy(np.stack([sample.source for sample in samples])),
+        target=torch.from_numpy(np.stack([sample.target for sample in samples])),
+        samples=tuple(
+            replace(sample, source=none, target=none, target_classes=None, visible=None, target_depth=None)
+            for sample in samples
+        ),
+    )
 
 
 def to_network(frames: Bytes | Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from gcd_train.live.batches import (
     with_true_references,
 )
 from gcd_train.live.clips import TrainingClips, evenly, read_clip
-from gcd_train.live.recipe import LiveStage
+from gcd_train.recipe import LiveStage
 from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.monitor import write_sheet
 

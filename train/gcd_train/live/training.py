@@ -17,16 +17,15 @@ from gcd_model.live.depth_net import DepthNet
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import LiveNetworks, weights_digest
-from gcd_train.data.open import DataPlaces
-from gcd_train.errors import DataError, RecipeError
+from gcd_train.errors import DataError
 from gcd_train.live.batches import PART_SEED
 from gcd_train.live.calibration import calibrate
 from gcd_train.live.clips import TrainingClips, clip_paths, read_clip, training_paths
 from gcd_train.live.depth_training import DepthTask
 from gcd_train.live.paint_training import DetailTask, HeldOutViews, PaintTask
-from gcd_train.live.recipe import LiveRecipe, LiveStage
 from gcd_train.live.views import InputShelf, ViewBatches, make_inputs
 from gcd_train.parallel import map_items
+from gcd_train.recipe import LiveRecipe, LiveStage
 from gcd_train.recipe_data import ComputeRecipe, LiveStageName
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.loop import Loop, LoopOptions, Task
@@ -42,32 +41,24 @@ _CLIPS_A_TURN = 4
 """Clips whose inputs a process works out at a time."""
 
 
-def valid_folder(data: DataPlaces) -> Path:
-    """That of the held-out clips. Raises: RecipeError if none is given."""
-    if data.valid is None:
-        raise RecipeError("a live model is measured on clips of their own: give --valid, see `gcd-train generate live`")
-    return data.valid
-
-
 def train_live(
-    recipe: LiveRecipe, data: DataPlaces, folder: RunFolder, stop: Event, processes: Processes = ALONE
+    recipe: LiveRecipe, data: Path, valid: Path, folder: RunFolder, stop: Event, processes: Processes = ALONE
 ) -> Path:
     """All stages, or what is left of them; returns the weight file.
 
-    Several processes share the updates of depth and paint; the first one does the rest. data: folders of
+    Several processes share the updates of depth and paint; the first one does the rest. data, valid: folders of
     `gcd-train generate live`.
 
     Raises:
         DataError: no clips, clips of another shape than the recipe's, or held-out clips among the training's.
-        RecipeError: no folder of held-out clips, or an update's parts cannot be shared.
         Interrupted: `stop` was set; the state is saved.
     """
-    held_out = clip_paths(valid_folder(data))
-    _require_fit(recipe, training_paths(data.data), held_out)
+    held_out = clip_paths(valid)
+    _require_fit(recipe, training_paths(data), held_out)
     device = Precision.of(ComputeRecipe(device=recipe.device)).device
     torch.manual_seed(recipe.seed)
     networks = _networks(recipe).to(device, memory_format=layout(device))  # pyright: ignore
-    clips, measured = TrainingClips(data.data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
+    clips, measured = TrainingClips(data, device), held_out[:: max(len(held_out) // _MEASURED, 1)]
     model, seed, out = recipe.model, recipe.seed, folder.path
     alone = partial(processes.by_the_first, stop=stop)
 

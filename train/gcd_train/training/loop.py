@@ -10,14 +10,13 @@ from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from pathlib import Path
 from threading import Event
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
 from gcd_train.errors import Interrupted
-from gcd_train.recipe import EmaRecipe, OptimiserRecipe
-from gcd_train.recipe_data import AnyStageName, Budget, LogRecipe
+from gcd_train.recipe import StageRecipe
+from gcd_train.recipe_data import AnyStageName, LogRecipe
 from gcd_train.training.checkpoint import States, Trained
 from gcd_train.training.distributed import Engine, held_back, whole
 from gcd_train.training.monitor import FiniteGuard, RunFolder
@@ -72,17 +71,6 @@ class Task:
         """Take part where the first process gathers weights of which each has a share, to measure them."""
 
 
-class StageTable(Protocol):
-    """What the tables of all training stages state."""
-
-    @property
-    def budget(self) -> Budget: ...
-    @property
-    def optimiser(self) -> OptimiserRecipe: ...
-    @property
-    def ema(self) -> EmaRecipe | None: ...
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LoopOptions:
     """How a stage runs. identity: see StateNote. frames_per_clip: for the log. parts: batches
@@ -90,7 +78,7 @@ class LoopOptions:
 
     stage: AnyStageName
     identity: str
-    table: StageTable
+    table: StageRecipe
     log: LogRecipe
     stop: Event
     frames_per_clip: int

@@ -1,6 +1,5 @@
 """The folder of a run (recipe, metrics, samples), TensorBoard, and the guard against losses that are no number."""
 
-import fcntl
 import json
 import logging
 import math
@@ -19,7 +18,7 @@ from torch import Tensor
 from gcd_model.errors import FileError
 from gcd_model.small_files import decode_toml, read_small
 from gcd_train.errors import RecipeError, RunError, TrainError
-from gcd_train.files import write_whole
+from gcd_train.files import only_writer, write_whole
 from gcd_train.pictures import png
 from gcd_train.recipe_data import AnyStageName
 from gcd_train.recipe_files import to_toml
@@ -87,20 +86,7 @@ class RunFolder:
         for path in self.path.glob("*/samples"):
             if path.is_symlink():
                 raise RunError(f"{path} is a link, and pictures go there; delete it, or choose another --out")
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            lock = (self.path / ".lock").open("a")
-        except OSError as error:
-            raise RunError(f"cannot write in {self.path}: {error.strerror}; choose another --out") from error
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise RunError(
-                    f"another run is at work in {self.path}; wait for it, or choose another --out"
-                ) from error
-            except OSError as error:
-                _log.warning("%s is on a file system without locks; start no second run in it (%s)", self.path, error)
+        with only_writer(self.path):
             self._keep(recipe, command)
             yield
 

@@ -4,7 +4,6 @@ Source: Van Hoorick et al. 2024 (GCD), section 3: noise level per clip, v-predic
 conditioning augmentation in pixel space; x0-prediction, fixed noise levels, shared noise and the class map are ours.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -82,18 +81,10 @@ class Batch:
 
 
 class BatchSource(Protocol):
-    """Where batches come from."""
+    """Where batches come from, see `data.batches`."""
 
     def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """`count` random clips; or single frames of as many, which encoded clips alone offer."""
-        ...
-
-
-class BatchMaker(Protocol):
-    """Makes batches once the networks are there that encode them."""
-
-    def __call__(self, networks: Networks, precision: Precision, turns: Sequence[int] = (0,), /) -> BatchSource:
-        """turns: see `SampleLoader`. Raises RecipeError if model and data do not go together."""
         ...
 
 

@@ -13,17 +13,17 @@ from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
 from gcd_model.weights.adapter import Adapter, base_digest
 from gcd_model.weights.card import Card
-from gcd_train.data.batches import EncodedBatches, SampleBatches
-from gcd_train.data.cache import autoencoder_digest
+from gcd_train.data.batches import CachedBatches, EncodedBatches, SampleBatches
+from gcd_train.data.cache import CachedLatents, autoencoder_digest
 from gcd_train.data.latents import Encodings, LatentClips
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips
 from gcd_train.errors import DataError, RecipeError
-from gcd_train.recipe import Recipe, VAERecipe
+from gcd_train.recipe import Recipe, StageRecipe, VAERecipe
 from gcd_train.recipe_data import AnyStageName
 from gcd_train.training.distributed import ALONE, Engine, Processes
 from gcd_train.training.export import Validation, export
-from gcd_train.training.loop import Loop, LoopOptions, StageTable, Task
+from gcd_train.training.loop import Loop, LoopOptions, Task
 from gcd_train.training.monitor import RunFolder
 from gcd_train.training.objective import BatchSource, UNetTask
 from gcd_train.training.setup import (
@@ -156,7 +156,7 @@ class Trainer:
         )
         return f"{autoencoder_digest(networks)}-{shape}{part}"
 
-    def _loop(self, task: Task, stage: AnyStageName, table: StageTable, identity: str, parts: int = 1) -> None:
+    def _loop(self, task: Task, stage: AnyStageName, table: StageRecipe, identity: str, parts: int = 1) -> None:
         options = LoopOptions(
             stage=stage,
             identity=identity,
@@ -191,14 +191,15 @@ class Trainer:
 
     def _batches(self, networks: Networks, clips: LatentClips | None) -> BatchSource:
         """clips: encoded ones, where batches are made of such."""
-        recipe, data = self._recipe.unet, self._data
+        recipe, precision = self._recipe.unet, self._precision
+        drawn = self._data.clips if self._data.drawn is None else self._data.drawn
         if clips is not None:
-            return EncodedBatches(clips, self._config, recipe, self._precision)
+            return EncodedBatches(clips, self._config, recipe, precision)
+        if isinstance(drawn, CachedLatents):
+            return CachedBatches(drawn, networks, recipe, precision, self._recipe.data.path)
         turns = [part for part, _ in self._engine.processes.batches(recipe.parts)]
-        if data.batches is not None:
-            return data.batches(networks, self._precision, turns)
         loader, seed = self._recipe.data.loader, self._recipe.seed
-        return SampleBatches(data.clips, networks, recipe, self._family, self._precision, loader, seed, turns)
+        return SampleBatches(drawn, networks, recipe, self._family, precision, loader, seed, turns)
 
     def _export(self) -> None:
         recipe, networks, config = self._recipe, self._start(), self._config

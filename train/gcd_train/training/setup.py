@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gcd_model import weights_path
-from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
+from gcd_model.conditioning import relative_pose_features, spherical_features
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.geometry import Trajectory, motion_bucket
@@ -311,16 +311,11 @@ class Conditioner:
         self, config: ModelConfig, recipe: UNetRecipe, precision: Precision, family: Family | None = None
     ) -> None:
         self._config, self._recipe, self._precision, self._family = config, recipe, precision, family
-        width = config.unet.vector_width
-        told = micro_conditioning(recipe.fps, recipe.motion_bucket, recipe.augmentation, width)
-        self._vector = told.to(precision.device)
 
-    def vector(self, motion: Tensor) -> Tensor:
-        """Micro-conditioning, [N, V]. motion: motion number of each row, [N]."""
-        vector = self._vector.expand(len(motion), -1)
-        third = vector.shape[1] // 3  # fps, motion, augmentation
-        told = sinusoid(motion.to(self._precision.device).float(), third)
-        return torch.cat([vector[:, :third], told, vector[:, 2 * third :]], dim=1)
+    def vector(self, fps: Tensor, motion: Tensor) -> Tensor:
+        """Micro-conditioning of N clips, [N, V]; see `micro_conditioning`. fps, motion: [N]."""
+        numbers = torch.stack([fps.float(), motion.float().cpu(), torch.full_like(fps, self._recipe.augmentation)], -1)
+        return sinusoid(numbers.to(self._precision.device), self._config.unet.vector_width // 3).flatten(1)
 
     def motion(self, path: Trajectory) -> float:
         """The number that tells the network how far the camera goes: the family's for the path, else the recipe's.
