@@ -59,11 +59,14 @@ def mark_and_square(place: tuple[str, int]) -> int:
 
 
 def seat_after_a_death(place: tuple[str, int]) -> str:
-    """What the environment says; kills its process the first time it meets item 0."""
+    """What the environment says, once two have said it; kills its process the first time it meets item 0."""
     folder, number = place
     first = Path(folder, "first")
     if number == 0 and not first.exists():
         first.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(0.3)  # so that every worker has some
-    return os.environ["SEAT"]
+    seat, deadline = os.environ["SEAT"], time.monotonic() + 60
+    Path(folder, f"seat-{seat}").touch()
+    while len(list(Path(folder).glob("seat-*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return seat

@@ -6,6 +6,7 @@ was doing when it was killed is done again, and what raises is told in its outco
 
 import logging
 import os
+import pickle
 import signal
 import socket
 import threading
@@ -15,6 +16,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from multiprocessing import get_context, parent_process
 from typing import Any, Generic, TypeVar
@@ -125,7 +127,7 @@ def _map_in_processes(
                 if number not in pools:
                     environment = dict(environments[number % len(environments)]) if environments else {}
                     context = get_context("spawn")  # a fork would share OpenGL's and torch's state
-                    pools[number] = ProcessPoolExecutor(1, context, _settle, (function, environment))
+                    pools[number] = ProcessPoolExecutor(1, context, _settle, (pickle.dumps(function), environment))
                 at_work[pools[number].submit(_done, given[0])] = number, *given
             if not at_work:
                 return
@@ -164,14 +166,21 @@ _FUNCTION: list[Callable[[Any], Any]] = []
 """What this process, a worker, does with each item."""
 
 
-def _settle(function: Callable[[Any], Any], environment: Mapping[str, str]) -> None:
-    """At the start of a worker, which ends with its parent."""
+def _settle(function: bytes, environment: Mapping[str, str]) -> None:
+    """At the start of a worker, which ends with its parent. function: pickled, as its libraries read the environment."""
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal: the parent decides
     signal.signal(signal.SIGTERM, _leave)
     one_thread_each()
-    _FUNCTION[:] = [function]
+    try:
+        _FUNCTION[:] = [pickle.loads(function)]
+    except Exception as error:
+        _FUNCTION[:] = [partial(_refuse, f"a worker cannot import its work ({type(error).__name__}: {error})")]
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _refuse(why: str, item: object) -> None:
+    raise RunError(why)
 
 
 def _end_with_the_parent() -> None:
