@@ -360,6 +360,5 @@ def mirrored_path(path: Trajectory) -> Trajectory:
     return Trajectory(
         source_from_target=path.source_from_target * sideways[:, None] * sideways,
         delta=None if delta is None else delta * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64),
-        at_goal=path.at_goal,
         source=path.source,
     )
