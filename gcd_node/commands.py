@@ -198,7 +198,9 @@ class NodeCommands:
             raise RequestError(f"{traits.name} has one fixed view and takes no poses", Code.VIEW_FIXED)
         pose = torch.tensor(numbers, dtype=torch.float64).reshape(4, 4)
         try:
-            delta, turned_deg = nearest_delta(pose, stated_sphere(self._live.config.source.pose) or Traits.ASSUMED_SOURCE)
+            delta, turned_deg = nearest_delta(
+                pose, stated_sphere(self._live.config.source.pose) or Traits.ASSUMED_SOURCE
+            )
         except ModelError as error:
             raise RequestError(f"the pose: {error}", Code.BAD_ARG) from error
         if turned_deg > _TOLERATED_DEG:

@@ -35,8 +35,7 @@ from gcd_model.loading import device_named, load_synthesizer, placed_synthesizer
 from gcd_model.networks import LoadedWeights, Networks, empty_networks, random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.weights.card import NO_DIFFUSION, Card
-from gcd_model.weights.families import KUBRIC90
+from gcd_model.weights.card import KUBRIC90, NO_DIFFUSION, Card
 from gcd_model.weights.load import save_weights
 
 FULL = "random:full"

@@ -17,8 +17,7 @@ from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, weights_digest
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.weights.card import FULL_PRECISION, Card, precision
-from gcd_model.weights.families import LIVE, Hints, family_named
+from gcd_model.weights.card import FULL_PRECISION, LIVE, Card, Hints, family_named, precision
 from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]

@@ -16,8 +16,7 @@ from gcd_model.live.depth_net import DepthNet, Familiarity
 from gcd_model.live.paint_net import PaintNet
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
-from gcd_model.weights.card import NO_DIFFUSION, Card, Layout
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import NO_DIFFUSION, Card, Family, Layout
 
 
 class Networks(nn.Module):

@@ -26,8 +26,7 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.live.config import LiveConfig
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import KUBRIC90, LIVE_LENS_DEG
+from gcd_model.weights.card import KUBRIC90, LIVE_LENS_DEG, Card
 
 _LOG = logging.getLogger(__name__)
 _TOLERATED_DEG = 0.05

@@ -22,8 +22,7 @@ from small_models import draw
 from gcd_model.errors import CheckpointError
 from gcd_model.loading import load_synthesizer
 from gcd_model.weights.adapter import DIFFUSION, Adapter, adapted, base_digest, carried_over, unshared
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import load_adapted, read_adapter
 from gcd_model.weights.save import write_adapter
 

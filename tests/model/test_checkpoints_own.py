@@ -28,28 +28,27 @@ from gcd_model import RenderOptions, SphericalDelta, convert_weights, load_synth
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import random_networks
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES, FamilyName, Hints, told_by_name, told_by_yaml
+from gcd_model.weights.card import FAMILIES, Card, Family, FamilyName, Hints, told_by_name, told_by_yaml
 from gcd_model.weights.load import digest, load_weights, save_weights
 
 # --- the family ------------------------------------------------------------------------------------------------------
 
 
 def test_the_family_follows_option_metadata_name_and_yaml_in_that_order(tmp_path: Path) -> None:
+    def told(path: Path, **options: str) -> tuple[Family | None, int]:
+        report = inspect(path, **options)
+        return report.family, report.move_time
+
     path = write_gcd(tmp_path, "kubric_direct_max180.ckpt")
     path.with_suffix(".yaml").write_text("move_time: 13\ndelta_azimuth_range: [-90, 90]\n")
-    report = inspect(path)
-    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric180"], "file name", 0)
-    report = inspect(path, family="kubric90")
-    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric90"], "option", 0)
+    assert told(path) == (FAMILIES["kubric180"], 0)
+    assert told(path, family="kubric90") == (FAMILIES["kubric90"], 0)
     other = path.rename(tmp_path / "mine.ckpt")
     other.with_suffix(".yaml").write_text("move_time: 5\ndelta_azimuth_range: [-90, 90]\n")
-    report = inspect(other)
-    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric90"], "yaml", 5)
+    assert told(other) == (FAMILIES["kubric90"], 5)
     card = Card(name="small", config=SMALL_GCD, family=FAMILIES["kubric180"], move_time=7)
     save_weights(filled(), tmp_path / "kubric_gradual_max90.safetensors", card)
-    report = inspect(tmp_path / "kubric_gradual_max90.safetensors")
-    assert (report.family, report.told_by, report.move_time) == (FAMILIES["kubric180"], "metadata", 7)
+    assert told(tmp_path / "kubric_gradual_max90.safetensors") == (FAMILIES["kubric180"], 7)
 
 
 def test_an_unknown_family_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -191,8 +190,7 @@ def test_a_large_file_is_digested_by_samples(tmp_path: Path, monkeypatch: pytest
 def test_published_names_tell_family_move_time_and_frames_and_others_nothing(
     names: list[str], family: FamilyName | None, move_time: int | None, frames: int | None
 ) -> None:
-    told_by = None if family is None else "file name"
-    wanted = Hints(family=family, move_time=move_time, frames=frames, told_by=told_by)
+    wanted = Hints(family=family and FAMILIES[family], move_time=move_time, frames=frames)
     assert [told_by_name(name) for name in names] == [wanted] * len(names)
 
 
@@ -212,7 +210,7 @@ BLOCK = ("delta_azimuth_range:\n    - -{0}\n    - {0}", "delta_elevation_range:\
 
 
 DRIVING = "input_mode: ego_forward\noutput_mode: topdown1\nmove_time: 13\noutput_modality: {}\n"
-KUBRIC90, KUBRIC180 = (Hints(family=f"kubric{angle}", move_time=13, told_by="yaml") for angle in (90, 180))
+KUBRIC90, KUBRIC180 = (Hints(family=FAMILIES[f"kubric{angle}"], move_time=13) for angle in (90, 180))
 
 
 def ranges(style: tuple[str, str], azimuth: int, elevation: int) -> str:
@@ -228,9 +226,9 @@ def ranges(style: tuple[str, str], azimuth: int, elevation: int) -> str:
         (ranges(BLOCK, 180, 60), KUBRIC180),
         (ranges(INLINE, 90, 60), Hints(move_time=13)),  # they contradict each other
         (ranges(INLINE, 45, 30), Hints(move_time=13)),  # of no family
-        (DRIVING.format("rgb"), Hints(family="driving", move_time=13, told_by="yaml")),
-        (DRIVING.format("segm"), Hints(family="driving-semantic", move_time=13, told_by="yaml")),
-        (DRIVING.format("'segm'"), Hints(family="driving-semantic", move_time=13, told_by="yaml")),
+        (DRIVING.format("rgb"), Hints(family=FAMILIES["driving"], move_time=13)),
+        (DRIVING.format("segm"), Hints(family=FAMILIES["driving-semantic"], move_time=13)),
+        (DRIVING.format("'segm'"), Hints(family=FAMILIES["driving-semantic"], move_time=13)),
         *((text, Hints()) for text in ("", "move_time: soon", "azimuth: [1, 2", "\x00\xff", "a: " + "-" * 200_000)),
         (" " * 200_000, Hints()),
     ],
@@ -240,10 +238,9 @@ def test_angle_ranges_or_driving_views_of_a_yaml_tell_the_family_and_others_noth
 
 
 def test_each_fact_comes_from_the_first_that_knows_it() -> None:
-    named = Hints(family="kubric180", move_time=0, told_by="file name")
-    assert Hints().over(named, Hints(family="kubric90", move_time=13, told_by="yaml")) == named
-    option = Hints(family="kubric90", told_by="option")
-    assert option.over(named) == Hints(family="kubric90", move_time=0, told_by="option")
+    named, option = Hints(family=FAMILIES["kubric180"], move_time=0), Hints(family=FAMILIES["kubric90"])
+    assert Hints().over(named, Hints(family=FAMILIES["kubric90"], move_time=13)) == named
+    assert option.over(named) == Hints(family=FAMILIES["kubric90"], move_time=0)
 
 
 CARD = Card(name="small", config=TINY, family=FAMILIES["kubric90"], move_time=2, uncertainty_scale=1.75)

@@ -26,8 +26,7 @@ from gcd_model.config import SMALL, SVD_14, ModelConfig
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.networks import Networks, empty_networks
 from gcd_model.weights.adapter import CAMERA
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.infer import LEFTOVERS
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state, write_published

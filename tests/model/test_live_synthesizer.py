@@ -38,8 +38,7 @@ from gcd_model.geometry import driving_trajectory
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.networks import LiveNetworks, random_networks
-from gcd_model.weights.card import packed, unpacked
-from gcd_model.weights.families import LIVE
+from gcd_model.weights.card import LIVE, packed, unpacked
 from gcd_model.weights.load import load_weights
 
 

@@ -16,8 +16,7 @@ from gcd_model.geometry import SphericalDelta
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.loading import PACKAGED, load_synthesizer
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import inspect_weights, save_weights
 
 

@@ -26,8 +26,7 @@ from gcd_model.geometry import SphericalDelta
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import digest
 
 

@@ -14,7 +14,7 @@ from tiny_world import tiny_recipe
 from gcd_model.config import ModelConfig
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.open import DataPlaces, RunData, open_data, sampling_of
 from gcd_train.data.paths import DrivingSampling, OrbitSampling
 from gcd_train.errors import DataError, RecipeError

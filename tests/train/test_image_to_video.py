@@ -8,7 +8,7 @@ import torch
 from tiny_world import FRAMES, TinyClips, TinyOrbits, trainer
 
 from gcd_model import load_synthesizer
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.open import DataPlaces, open_data
 from gcd_train.data.sample import video_clips
 from gcd_train.errors import RecipeError

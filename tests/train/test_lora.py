@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 from gcd_model.config import SVD_14
 from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_model.weights.adapter import adapted, base_digest
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
 from gcd_train.cli.main import app
 from gcd_train.recipe import LoraRecipe, ModelRecipe, Recipe

@@ -6,8 +6,7 @@ import msgspec
 
 from gcd_model.config import PLAIN_SMALL, ModelConfig
 from gcd_model.networks import random_networks
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import save_weights
 
 FRAMES, HEIGHT, WIDTH = 4, 32, 64

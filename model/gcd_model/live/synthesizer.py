@@ -25,8 +25,7 @@ from gcd_model.live.splat import Surfels, splat, unproject
 from gcd_model.networks import LiveNetworks
 from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import LIVE
+from gcd_model.weights.card import LIVE, Card
 from gcd_model.weights.save import write_safetensors
 
 PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2

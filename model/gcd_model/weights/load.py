@@ -23,19 +23,13 @@ from gcd_model.networks import LiveNetworks, LoadedWeights, Networks, empty_netw
 from gcd_model.weights.adapter import Adapter, adapted
 from gcd_model.weights.card import (
     CONFIG_KEY,
+    FAMILIES,
     FULL_PRECISION,
     Card,
-    Layout,
-    Leftover,
-    NetworkReport,
-    WeightsReport,
-    precision,
-)
-from gcd_model.weights.families import (
-    FAMILIES,
     Hints,
-    at_trained_size,
+    Layout,
     family_named,
+    precision,
     require_family,
 )
 from gcd_model.weights.infer import infer_config, match_weights, shapes_of
@@ -113,6 +107,54 @@ def read_adapter(path: str | Path) -> Adapter:
         return Adapter.of_file({} if file.is_pickle else file.metadata, file.tensors)
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NetworkReport:
+    """One network of a checkpoint. dtypes: as stored, for example ("float16",). size: bytes as stored."""
+
+    name: str
+    parameters: int
+    tensors: int
+    dtypes: tuple[str, ...]
+    size: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Leftover:
+    """Weights that are recognised and not used. size: bytes as stored."""
+
+    kind: str
+    tensors: int
+    size: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WeightsReport(Card):
+    """What `gcd-node weights inspect` shows: what the checkpoint says of itself, or what was worked out, and the rest.
+
+    optimizer_size: bytes of optimizer state, which is never read; 0 without. other_entries: further top-level names.
+    size: bytes on disk, all files together. digest: see `digest`.
+    """
+
+    path: str
+    layout: Layout
+    networks: tuple[NetworkReport, ...]
+    leftovers: tuple[Leftover, ...]
+    optimizer_size: int
+    other_entries: tuple[str, ...]
+    size: int
+    digest: str
+
+    @property
+    def sha256_12(self) -> str:
+        """First 12 digits of the digest: what views carry."""
+        return self.digest[:12]
+
+    @property
+    def parameters(self) -> int:
+        """All parameters that are used."""
+        return sum(network.parameters for network in self.networks)
+
+
 def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpack[Told]) -> WeightsReport:
     """Say what a checkpoint holds; checks names and shapes as `load_weights` does, reads no weights.
 
@@ -130,7 +172,6 @@ def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpa
             **{each.name: getattr(examined.card, each.name) for each in fields(examined.card)},
             path=str(path),
             layout=file.layout,
-            told_by=examined.told_by,
             networks=tuple(
                 NetworkReport(
                     name=network,
@@ -243,13 +284,12 @@ def _about(path: str | Path) -> Generator[None]:
 class _Examined:
     """A checkpoint whose every weight has its place; `networks` is still empty.
 
-    card: what it says of itself, or what was worked out. told_by: who named the family. sources: for each of our
-    names, the file's. leftovers: by kind.
+    card: what it says of itself, or what was worked out. sources: for each of our names, the file's. leftovers: names,
+    by kind.
     """
 
     file: WeightsFile
     card: Card
-    told_by: str | None
     networks: Networks | LiveNetworks
     sources: dict[str, tuple[str, ...]]
     leftovers: dict[str, list[str]]
@@ -267,19 +307,19 @@ class _Examined:
 
 def _examined(path: Path, told: Told) -> _Examined:
     """Raises CheckpointError: the file does not fit, name by name. OptionError: what is told is impossible."""
-    options = Hints(**told, told_by=None if told.get("family") is None else "option")
+    named = told.get("family")
+    options = Hints(**told | {"family": None if named is None else family_named(named)})  # pyright: ignore
     file = read_weights(path)
     naming, shapes = _NAMINGS.get(file.layout, "gcd"), shapes_of(file.tensors)
     stated = Card.from_metadata(file.metadata) if CONFIG_KEY in file.metadata else None
     if stated is None:
         known = options.over(file.hints)
-        config = at_trained_size(infer_config(shapes, naming, known), known)
+        config = infer_config(shapes, naming, known)
     else:
-        own = Hints(move_time=stated.move_time)
-        if stated.family is not None:
-            own = replace(own, family=stated.family.name, told_by="metadata")
-        known, config = options.over(own, file.hints), _with_frames(stated.config, options)
-    require_family(known, config)
+        known = options.over(Hints(move_time=stated.move_time, family=stated.family), file.hints)
+        config = _with_frames(stated.config, options)
+    if known.family is not None:
+        require_family(known.family, config)
     try:
         networks = empty_networks(config)
     except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
@@ -299,14 +339,12 @@ def _examined(path: Path, told: Told) -> _Examined:
     card = Card(
         name=file.name if stated is None or not stated.name else stated.name,
         config=config,
-        family=None if known.family is None else family_named(known.family),
+        family=known.family,
         move_time=last if known.move_time is None else min(known.move_time, last),
         trained=stated is None or stated.trained,
         uncertainty_scale=None if stated is None else stated.uncertainty_scale,
     )
-    return _Examined(
-        file=file, card=card, told_by=known.told_by, networks=networks, sources=sources, leftovers=leftovers
-    )
+    return _Examined(file=file, card=card, networks=networks, sources=sources, leftovers=leftovers)
 
 
 def _with_frames(config: ModelConfig | LiveConfig, hints: Hints) -> ModelConfig | LiveConfig:

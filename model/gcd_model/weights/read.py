@@ -16,8 +16,7 @@ from torch.utils import _pytree as pytree
 
 from gcd_model.errors import CheckpointError, FileError
 from gcd_model.small_files import decode_json, read_small
-from gcd_model.weights.card import ADAPTER_KEY, CONFIG_KEY, NOTES, Layout, unpacked
-from gcd_model.weights.families import Hints, told_by_name, told_by_yaml
+from gcd_model.weights.card import ADAPTER_KEY, CONFIG_KEY, NOTES, Hints, Layout, told_by_name, told_by_yaml, unpacked
 from gcd_model.weights.names import GCD_UNET
 from gcd_model.weights.pickle import SAVE_AGAIN, Placeholder, read_pickle
 

@@ -16,8 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from typer import Argument, BadParameter, Option, Typer
 
-from gcd_model.weights.card import precision
-from gcd_model.weights.families import FAMILIES, Family
+from gcd_model.weights.card import FAMILIES, Family, precision
 from gcd_model.weights.load import load_adapted, read_adapter, save_weights
 from gcd_model.weights.save import write_published
 from gcd_train.cli.common import Dtype, command_line, errors_shown, say

@@ -14,7 +14,7 @@ from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import ModelConfig
 from gcd_model.geometry import Trajectory
 from gcd_model.networks import Networks
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import Family
 from gcd_train.data.cache import CachedLatents, FrozenEncoders, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips
 from gcd_train.data.loader import SampleLoader

@@ -10,7 +10,7 @@ import torch
 
 from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import Family
 from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.batches import CachedBatches, SampleBatches
 from gcd_train.data.cache import CachedLatents

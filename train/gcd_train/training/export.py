@@ -13,8 +13,7 @@ from gcd_model.clip import palette
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.adapter import Adapter
-from gcd_model.weights.card import Card, precision
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import Card, Family, precision
 from gcd_model.weights.load import load_weights, save_weights
 from gcd_model.weights.save import write_adapter, write_published
 from gcd_train.data.sample import Clips, to_network

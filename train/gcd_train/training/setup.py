@@ -18,7 +18,7 @@ from gcd_model.geometry import Trajectory, motion_bucket
 from gcd_model.layers import sinusoid
 from gcd_model.networks import LoadedWeights, Networks, empty_networks
 from gcd_model.weights.adapter import DIFFUSION, carried_over
-from gcd_model.weights.families import FAMILIES, Family
+from gcd_model.weights.card import FAMILIES, Family
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state
 from gcd_train.errors import DataError, RecipeError, RunError
