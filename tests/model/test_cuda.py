@@ -12,7 +12,8 @@ from small_models import TINY, TINY_DRIVING, random_clip, relative_error, tiny_d
 from gcd_model.clip import Augmentation, View
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.diffusion import RenderOptions, unit_noise
-from gcd_model.engines.cuda import CudaEngine, CudaOptions, psnr_db
+from gcd_model.engines.cuda import CudaEngine, CudaOptions
+from gcd_model.engines.gpu_layout import psnr_db
 from gcd_model.errors import Cancelled
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
@@ -68,8 +69,8 @@ def test_a_full_device_is_our_own_error_and_leaves_the_device_usable() -> None:
     assert torch.ones(3, device="cuda").sum().item() == 3
 
 
-GRAPHS = CudaOptions(backend=None, decoder="float32")
-VARIANTS = {"graphs": GRAPHS, "compiled": CudaOptions(graphs=False, decoder="float32"), "both": CudaOptions()}
+GRAPHS = CudaOptions(backend=None, half_decoder=False)
+VARIANTS = {"graphs": GRAPHS, "compiled": CudaOptions(graphs=False, half_decoder=False), "both": CudaOptions()}
 FLOAT8 = CudaOptions(float8=True)
 
 
@@ -200,9 +201,7 @@ def test_a_full_size_window_equals_plain_torch_within_bfloat16_and_ten_gigabytes
     plain = Synthesizer(networks, traits)
     features = plain.encode(clip)
     (other,) = plain.render(features, [path], options)
-    engine = Synthesizer(
-        networks, traits, CudaEngine(networks, CudaOptions(decoder="bfloat16"))
-    )  # in place: no more plain
+    engine = Synthesizer(networks, traits, CudaEngine(networks, CudaOptions()))  # in place: no more plain
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
     (mine,) = engine.render(engine.encode(clip), [path], options)
