@@ -80,14 +80,11 @@ def test_every_layout_loads_weight_by_weight_and_never_guesses_heads(
                 load_weights(path, **told)
 
 
-def test_the_base_model_has_its_own_size_and_guidance(tmp_path: Path) -> None:
-    config = load(write_svd(tmp_path)).networks.config
+def test_the_layout_is_told_by_content_not_by_suffix_and_the_base_model_has_its_own_size(tmp_path: Path) -> None:
+    path = write_svd(tmp_path)
+    config = inspect(path).config
     assert (config.height, config.width, config.sampling.guidance) == (576, 1024, (1.0, 2.5))
-
-
-def test_the_layout_is_told_by_content_not_by_suffix(tmp_path: Path) -> None:
-    path = write_svd(tmp_path).rename(tmp_path / "blob-without-suffix")
-    assert inspect(path).layout == "sgm-safetensors"
+    assert inspect(path.rename(tmp_path / "blob-without-suffix")).layout == "sgm-safetensors"
     assert inspect(write_gcd(tmp_path).rename(tmp_path / "other")).layout == "gcd-ckpt"
 
 

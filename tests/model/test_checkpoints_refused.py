@@ -129,13 +129,8 @@ def test_no_tensor_reaches_beyond_its_record(
 
 def write_pickle(path: Path, program: bytes, records: Mapping[str, bytes] | None = None) -> Path:
     """A torch zip whose pickle is the given program."""
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("archive/data.pkl", program)
-        archive.writestr("archive/version", "3\n")
-        archive.writestr("archive/byteorder", "little")
-        for name, content in (records or {}).items():
-            archive.writestr(f"archive/{name}", content)
-    return path
+    plain = {"data.pkl": program, "version": b"3\n", "byteorder": b"little"} | dict(records or {})
+    return zipped(path, {f"archive/{name}": content for name, content in plain.items()})
 
 
 def changed(path: Path, value: Tensor) -> Path:
@@ -143,7 +138,7 @@ def changed(path: Path, value: Tensor) -> Path:
     return write_lightning(path, gcd_state(filled()) | {CONV: value})
 
 
-def zipped(path: Path, names: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> Path:
+def zipped(path: Path, names: Mapping[str, bytes], compression: int = zipfile.ZIP_STORED) -> Path:
     with zipfile.ZipFile(path, "w", compression) as archive:
         for name, content in names.items():
             archive.writestr(name, content)
@@ -220,9 +215,5 @@ BROKEN: dict[str, Callable[[Path], Path]] = {
 
 @pytest.mark.parametrize("kind", BROKEN)
 def test_what_is_no_checkpoint_is_refused_in_one_line_that_begins_with_its_name(tmp_path: Path, kind: str) -> None:
-    assert refused(BROKEN[kind](tmp_path / "a.ckpt"))
-
-
-def test_the_remedy_is_named(tmp_path: Path) -> None:
-    assert "git lfs pull" in refused(BROKEN["a pointer of Git LFS"](tmp_path / "a.ckpt"))
-    assert "truncated" in refused(BROKEN["a truncated zip"](tmp_path / "a.ckpt"))
+    message = refused(BROKEN[kind](tmp_path / "a.ckpt"))
+    assert {"a pointer of Git LFS": "git lfs pull", "a truncated zip": "truncated"}.get(kind, "") in message
