@@ -1,14 +1,16 @@
 """One guided full-size U-Net step in a process of its own, so that its time and its peak memory are its own.
 
-    python full_size_worker.py write|ours|diffusers FOLDER
+    python full_size_worker.py write|ours|diffusers|export FOLDER
 
 `write` puts random weights under diffusers' names into FOLDER/unet.safetensors; the other two map them into memory,
 run both branches of 14 frames at 32x48 latents in one batch, float32, store the result, and print a line of JSON:
 seconds of the step, CPU seconds (of user and system) of the step and of building, peak resident memory in GB, mapped
-pages included: whoever copies the 6 GB of weights has them twice.
+pages included: whoever copies the 6 GB of weights has them twice. `export` exports the step with weights that take no
+memory, and prints what came out.
 """
 
 import json
+import math
 import resource
 import sys
 import time
@@ -25,6 +27,7 @@ from gcd_model.conditioning import micro_conditioning
 from gcd_model.config import SVD_14
 from gcd_model.engines.torch import arrange
 from gcd_model.layers import prepare
+from gcd_model.networks import empty_networks
 from gcd_model.unet import VideoUNet
 from gcd_model.weights.names import Levels, published_names
 
@@ -108,9 +111,48 @@ def _measure(folder: Path, build: Callable[[dict[str, Tensor]], Step], name: str
     sys.stdout.write(json.dumps(line) + "\n")
 
 
+_SMALL = 64
+"""Numbers that make a tensor worth a place beside the graph: 256 bytes. Below are constants of shapes and shares."""
+
+
+def _fill(module: nn.Module) -> None:
+    """One zero, seen from everywhere: weights of the right shapes without memory."""
+    for name, parameter in list(module.named_parameters(recurse=False)):
+        zeros = torch.zeros(1).expand(parameter.shape) if parameter.ndim else torch.zeros(())
+        setattr(module, name, nn.Parameter(zeros, requires_grad=False))
+    for child in module.children():
+        _fill(child)
+
+
+def _export(folder: Path) -> None:
+    import onnx
+
+    from gcd_model.engines.onnx_export import graphs, write_graph
+
+    networks = empty_networks(SVD_14)
+    _fill(networks)
+    graph = next(each for each in graphs(networks) if each.name == "step")
+    files = write_graph(graph, folder)
+    model = onnx.load(folder / "step.onnx", load_external_data=False)
+    large = [each for each in model.graph.initializer if math.prod(each.dims) > _SMALL]
+    apart = [each for each in model.graph.initializer if each.data_location == onnx.TensorProto.EXTERNAL]
+    found = {
+        "inputs": {name: each.shape for name, each in graph.inputs.items()},
+        "files": list(files),
+        "graph_mb": (folder / "step.onnx").stat().st_size / 1e6,
+        "data_gb": (folder / "step.onnx.data").stat().st_size / 1e9,
+        "weights": len(large),
+        "apart": len(apart),
+        "nodes": len(model.graph.node),
+        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "cpu_s": sum(resource.getrusage(resource.RUSAGE_SELF)[:2]),
+    }
+    sys.stdout.write(json.dumps(found) + "\n")
+
+
 if __name__ == "__main__":
     task, target = sys.argv[1], Path(sys.argv[2])
-    if task == "write":
-        _write(target)
+    if task in ("write", "export"):
+        (_write if task == "write" else _export)(target)
     else:
         _measure(target, _ours if task == "ours" else _diffusers, task)
