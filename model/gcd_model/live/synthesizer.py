@@ -202,7 +202,7 @@ class LiveSynthesizer:
         Of the options, solver, guidance, motion number and initial noise mean something to diffusion models only.
         """
         self.traits.check_lengths(features.frames, trajectories)
-        return self._painted(self._placed(self._seen(features), trajectories), trajectories, options)
+        return self.paint(self._placed(self._seen(features), trajectories), trajectories, options)
 
     @out_of_memory_is_our_error
     def see(self, features: SourceFeatures) -> tuple[SeenFrame, ...]:
@@ -212,16 +212,6 @@ class LiveSynthesizer:
     def place(self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory]) -> tuple[PlacedFrame, ...]:
         self.traits.check_lengths(len(seen), trajectories)
         return tuple(self._placed(seen, trajectories))
-
-    @out_of_memory_is_our_error
-    def paint(
-        self, placed: Sequence[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        """See FrameSynthesizer.
-
-        Several samples differ where several steps draw; one step paints the mean, the same every time.
-        """
-        return self._painted(placed, trajectories, options)
 
     def _seen(self, features: SourceFeatures) -> Iterator[SeenFrame]:
         """Frame by frame, each when it is asked for: what was seen is large."""
@@ -244,10 +234,14 @@ class LiveSynthesizer:
         for t, frame in enumerate(seen):
             yield self._world.place(frame, [path.source_from_target[t].cpu() for path in trajectories])
 
-    def _painted(
-        self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None
+    @out_of_memory_is_our_error
+    def paint(
+        self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        """`cancel` is asked between two frames."""
+        """See FrameSynthesizer; `cancel` is asked between two frames.
+
+        Several samples differ where several steps draw; one step paints the mean, the same every time.
+        """
         options, frames = RenderOptions() if options is None else options, self.traits.config.frames
         steps = options.steps or self.traits.config.sampling.steps
         draws = options.samples if steps > 1 else 1
