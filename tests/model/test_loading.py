@@ -42,13 +42,12 @@ def test_float32_on_the_cpu_stays_in_the_mapped_file(tmp_path: Path, monkeypatch
     assert {name: tensor.data_ptr() for name, tensor in synthesizer.networks.state_dict().items()} == kept
 
 
-def test_a_precision_is_for_all_but_the_decoder() -> None:
+def test_a_precision_is_for_all_but_the_decoder_and_a_float16_folder_computes_in_float32_on_the_cpu(
+    tmp_path: Path,
+) -> None:
     found = dtypes(load_synthesizer("random:kubric90", device="cpu", dtype="bfloat16"))
     assert found.pop("decoder") == {torch.float32}
     assert set(map(tuple, found.values())) == {(torch.bfloat16,)}
-
-
-def test_a_float16_folder_computes_in_float32_on_the_cpu(tmp_path: Path) -> None:
     synthesizer = load_synthesizer(write_diffusers(tmp_path / "m", half=True), device="cpu", family="driving")
     assert set(map(tuple, dtypes(synthesizer).values())) == {(torch.float32,)}
     assert synthesizer.traits.family == FAMILIES["driving"]
@@ -110,12 +109,9 @@ WEIGHTS = PACKAGED / "live-small.safetensors"
 MEGABYTES = 16
 
 
-def test_one_model_ships_and_it_is_small() -> None:
+def test_one_model_ships_it_is_small_and_the_card_is_of_these_weights() -> None:
     assert list(PACKAGED.glob("*.safetensors")) == [WEIGHTS]
     assert WEIGHTS.stat().st_size <= MEGABYTES * 1e6
-
-
-def test_the_card_is_of_these_weights() -> None:
     card = WEIGHTS.with_suffix(".md").read_text()
     assert inspect_weights(WEIGHTS).sha256_12 in card
     assert "TODO-FIGURE" not in card
