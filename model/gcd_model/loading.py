@@ -122,14 +122,16 @@ def placed_synthesizer(
     """
     networks, live = loaded.networks, isinstance(loaded.networks, LiveNetworks)
     name = dtype or default_precision(device, live=live)
-    traits = Traits.of(loaded.card, sha256_12=loaded.sha256_12, precision=name, device=str(device))
+    traits = Traits.of(loaded.card, sha256_12=loaded.card.origin, precision=name, device=str(device))
     if isinstance(networks, LiveNetworks):
         if dtype == "float16":
             raise OptionError(
-                f"{loaded.name} is the live model, which was not trained for float16; take bfloat16 or float32"
+                f"{loaded.card.name} is the live model, which was not trained for float16; take bfloat16 or float32"
             )
         if engine not in (None, "torch"):
-            raise OptionError(f"{loaded.name} is the live model, which torch runs as it is; leave engine {engine} out")
+            raise OptionError(
+                f"{loaded.card.name} is the live model, which torch runs as it is; leave engine {engine} out"
+            )
         networks = networks.to(device, precision(name), memory_format=layout(device))  # pyright: ignore
         return LiveSynthesizer(networks, traits)
     for part, module in networks.named_children():

@@ -17,13 +17,11 @@ from published import (
     load,
     refused,
     shared_vae,
-    split_in_shards,
     write_diffusers,
     write_gcd,
     write_lightning,
     write_svd,
 )
-from safetensors.torch import load_file
 from torch import Tensor
 
 from gcd_model.config import ModelConfig
@@ -38,17 +36,6 @@ def plain_diffusers(folder: Path) -> Path:
     return write_diffusers(folder / "m", configs=False)
 
 
-def sharded(folder: Path) -> Path:
-    return split_in_shards(write_diffusers(folder / "m") / "unet").parent
-
-
-def with_a_pickle(folder: Path) -> Path:
-    whole = write_diffusers(folder / "m") / "vae" / "diffusion_pytorch_model.safetensors"
-    torch.save(load_file(whole), whole.with_suffix(".bin"))
-    whole.unlink()
-    return folder / "m"
-
-
 FIXED, SHARED = fixed_view(SMALL_GCD), shared_vae(SMALL_GCD)
 
 
@@ -59,8 +46,6 @@ FIXED, SHARED = fixed_view(SMALL_GCD), shared_vae(SMALL_GCD)
         (write_svd, FIXED),
         (lambda folder: write_diffusers(folder / "m"), SHARED),
         (plain_diffusers, SHARED),
-        (sharded, SHARED),
-        (with_a_pickle, SHARED),
     ],
 )
 def test_every_layout_loads_weight_by_weight_and_never_guesses_heads(

@@ -63,7 +63,7 @@ def test_an_unknown_family_is_said_once(tmp_path: Path, caplog: pytest.LogCaptur
     path = write_gcd(tmp_path, "mine.ckpt")
     with caplog.at_level(logging.WARNING):
         loaded = load(path)
-    assert loaded.family is None
+    assert loaded.card.family is None
     assert loaded.card.move_time == 13
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "--motion-bucket" in caplog.text

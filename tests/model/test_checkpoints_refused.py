@@ -16,7 +16,6 @@ from published import (
     inspect,
     load,
     refused,
-    split_in_shards,
     write_diffusers,
     write_gcd,
     write_lightning,
@@ -162,8 +161,6 @@ def cut(path: Path, keep: float) -> Path:
 def diffusers(folder: Path, file: str, content: str | None) -> Path:
     """A folder of diffusers with one file of another content, or without it."""
     write_diffusers(folder)
-    if file.endswith("index.json"):
-        split_in_shards((folder / file).parent)
     (folder / file).unlink() if content is None else (folder / file).write_text(content)
     return folder
 
@@ -176,7 +173,6 @@ def shortened(path: Path) -> Path:
     return zipped(path, content | {largest: content[largest][: len(content[largest]) // 2]})
 
 
-INDEX = "unet/diffusion_pytorch_model.safetensors.index.json"
 BROKEN: dict[str, Callable[[Path], Path]] = {
     "a tensor larger than its storage": lambda path: changed(path, torch.zeros(1).expand(10**12)),
     "quantised weights": lambda path: changed(path, gcd_state(filled())[CONV].to(torch.int8)),
@@ -202,9 +198,6 @@ BROKEN: dict[str, Callable[[Path], Path]] = {
     "one part of diffusers": lambda path: write_diffusers(path) / "unet" / "diffusion_pytorch_model.safetensors",
     "a part without weights": lambda path: diffusers(path, "vae/diffusion_pytorch_model.safetensors", None),
     "a truncated part": lambda path: diffusers(path, "vae/diffusion_pytorch_model.safetensors", "xxxxxxxx{"),
-    "an index that leaves its folder": lambda path: diffusers(path, INDEX, '{"weight_map": {"a": "../b.safetensors"}}'),
-    "an index of what is not there": lambda path: diffusers(path, INDEX, '{"weight_map": {"a": "gone.safetensors"}}'),
-    "an index that is no JSON": lambda path: diffusers(path, INDEX, "{"),
     "another activation": lambda path: diffusers(path, "image_encoder/config.json", '{"hidden_act": "quick_gelu"}'),
     "another model": lambda path: saved(path, {"state_dict": {"model.layers.0.mlp.weight": torch.zeros(2)}}),
     "a checkpoint without weights": lambda path: saved(path, {"epoch": 3, "weights": {}}),

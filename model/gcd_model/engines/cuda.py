@@ -113,9 +113,11 @@ class CudaEngine(Engine):
         return recent(self._calls, (key, shapes), lambda: RecordedCall(work, given, self._recorder))(given)
 
     def compute(self, name: NetworkName, given: Tensor) -> Tensor:
-        work = super().compute
         with self._at_work():
-            return self._called(name, lambda given: (work(name, given),), (given,))[0].clone()
+            return self._called(name, partial(self._network, name), (given,))[0].clone()
+
+    def _network(self, name: NetworkName, given: Tensor) -> tuple[Tensor]:
+        return (super().compute(name, given),)
 
     def sample(self, start: Tensor, given: Conditioning, schedule: Schedule, options: RenderOptions) -> Tensor:
         """See Engine. One view and sample after the other: so no number of them has code or graphs of its own, and none
@@ -157,13 +159,11 @@ def _tell(progress: Callable[[int, int], object], k: int, views: int, done: int,
 def of_view(given: Conditioning, k: int, views: int) -> Conditioning:
     """The rows of one of so many views, of both guidance branches if there are two."""
     shape = (-1, views, len(given.vector) // views)
-    batches = {field.name: getattr(given, field.name) for field in fields(given)}
-    return Conditioning(
-        **{
-            name: each if each is None else each.unflatten(0, shape)[:, k].flatten(0, 1)
-            for name, each in batches.items()
-        }
-    )
+
+    def rows(batch: Any) -> Any:
+        return None if batch is None else batch.unflatten(0, shape)[:, k].flatten(0, 1)
+
+    return Conditioning(**{field.name: rows(getattr(given, field.name)) for field in fields(given)})
 
 
 Update: TypeAlias = Callable[[Tensor, Tensor, Tensor, StepInputs], tuple[Tensor, Tensor]]
@@ -288,8 +288,8 @@ class CudaGraphs(Recorder):
         """On a stream of its own, as compiled code may ask which one it is on. cuDNN tries its ways of convolving and
         takes the fastest: worth it for what is done again and again, not where every run must give the same."""
         graph, side, main = torch.cuda.CUDAGraph(), torch.cuda.Stream(), torch.cuda.current_stream()
-        before, cudnn = torch.backends.cudnn.benchmark, torch.backends.cudnn
-        cudnn.benchmark = not cudnn.deterministic
+        before = torch.backends.cudnn.benchmark
+        torch.backends.cudnn.benchmark = not torch.backends.cudnn.deterministic
         try:
             side.wait_stream(main)
             with torch.cuda.stream(side):
@@ -306,7 +306,7 @@ class CudaGraphs(Recorder):
                 raise error.__context__ from None
             raise
         finally:
-            cudnn.benchmark = before
+            torch.backends.cudnn.benchmark = before
         return graph.replay
 
     def forget(self) -> None:

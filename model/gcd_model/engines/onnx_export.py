@@ -27,6 +27,7 @@ from gcd_model.layers import prepare
 from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.small_files import decode_json, read_small
 from gcd_model.unet import VideoUNet
+from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights.card import FULL_PRECISION, Card
 from gcd_model.weights.load import digest
 from gcd_model.weights.save import whole
@@ -58,6 +59,14 @@ class _Function(nn.Module):
         return self.compute(self.module, *inputs)
 
 
+def _mean(encoder: Encoder, frame: Tensor) -> Tensor:
+    return encoder(frame).mean
+
+
+def _pictures(decoder: TemporalDecoder, latents: Tensor) -> Tensor:
+    return decoder(latents, len(latents))
+
+
 def _embeddings(networks: Networks, label: Tensor, vector: Tensor, camera: Tensor | None = None) -> Tensor:
     """Noise level [1], micro-conditioning [T, V] and camera features [T, F], projected for every stage: [T, E]."""
     features = None if networks.camera is None or camera is None else networks.camera.proj(camera)
@@ -83,7 +92,7 @@ def graphs(networks: Networks) -> Iterator[Graph]:
         yield Graph("image_encoder", tower, {"pixels": pixels}, "token")
         crosses = _Function(unet, VideoUNet.crosses)
         yield Graph("crosses", crosses, {"tokens": torch.zeros(frames, tower.config.output_width)}, "crosses")
-    mean = _Function(networks.condition_encoder, lambda encoder, frame: encoder(frame).mean)
+    mean = _Function(networks.condition_encoder, _mean)
     yield Graph("condition_encoder", mean, {"frames": torch.zeros(1, 3, config.height, config.width)}, "latents")
     inputs = {"label": torch.zeros(1), "vector": torch.zeros(frames, config.unet.vector_width)}
     if networks.camera is not None:
@@ -95,7 +104,7 @@ def graphs(networks: Networks) -> Iterator[Graph]:
         attending = [stage.attention is not None for stage in unet.all_stages()]
         inputs["crosses"] = torch.zeros(frames, sum(compress(widths, attending)))
     yield Graph("step", unet, inputs, "prediction")
-    pictures = _Function(networks.decoder, lambda decoder, latents: decoder(latents, frames))
+    pictures = _Function(networks.decoder, _pictures)
     yield Graph("decoder", pictures, {"latents": latents}, "pictures")
 
 
@@ -186,7 +195,9 @@ def export_onnx(
     config, factor = networks.config, networks.config.size_factor
     height, width = height or config.height, width or config.width
     if height % factor or width % factor:
-        raise OptionError(f"height and width must be multiples of {factor} for {loaded.name}, got {height}x{width}")
+        raise OptionError(
+            f"height and width must be multiples of {factor} for {loaded.card.name}, got {height}x{width}"
+        )
     networks.config = msgspec.structs.replace(config, height=height, width=width)
     networks.requires_grad_(False).float()
     records: dict[str, dict[str, str]] = {}
@@ -201,7 +212,7 @@ def export_onnx(
         manifest = Manifest(
             format=FORMAT,
             card=replace(loaded.card, config=networks.config).to_metadata(),
-            source=loaded.sha256_12,
+            source=loaded.card.origin,
             precision=precision,
             opset=OPSET,
             exporter=f"torch {torch.__version__}, onnx {version('onnx')}, onnxscript {version('onnxscript')}",

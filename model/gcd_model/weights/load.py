@@ -87,7 +87,7 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
 
 def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
     """A base and what was trained on it, as one. Raises CheckpointError as `adapted`;"""
-    weights = {f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}
+    weights = {f"{base.card.origin}.{name}": tensor for name, tensor in adapter.tensors.items()}
     return replace(
         base,
         card=replace(

@@ -125,6 +125,6 @@ def export(
     except ModelError as error:
         raise RunError(f"cannot export to {path}: {error}") from error
     values = validation.measure(loaded.diffusion.float(), folder.stage("export") / "samples.png")
-    size = {"bytes": path.stat().st_size, "sha256_12": loaded.sha256_12}
+    size = {"bytes": path.stat().st_size, "sha256_12": loaded.card.origin}
     folder.record("export", "measured", {**size, **values})
     _log.info("wrote %s", ", ".join(map(str, written)))

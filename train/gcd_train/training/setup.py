@@ -89,8 +89,8 @@ def run_config(recipe: Recipe) -> ModelConfig:
         return model_config(recipe.model)
     teacher = loaded_base(weights)
     config, family = teacher.diffusion.config, family_of(recipe.model)
-    if teacher.family not in (None, family):
-        raise RecipeError(f"{weights} is of the family {teacher.family.name}; set model.family to it")
+    if teacher.card.family not in (None, family):
+        raise RecipeError(f"{weights} is of the family {teacher.card.family.name}; set model.family to it")
     goal = recipe.data.goal_frame(config.frames)
     if teacher.card.move_time != goal:
         raise RecipeError(
