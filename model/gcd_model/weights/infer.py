@@ -19,13 +19,13 @@ from gcd_model.config import (
     VAEConfig,
 )
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.weights.card import Hints
+from gcd_model.weights.card import Family, Hints
 from gcd_model.weights.names import Levels, Naming, published_names, published_shape
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Names and their shapes."""
 
-_PUBLISHED_GROUPS = 32  # of every group norm
+_PUBLISHED_GROUPS = UNetConfig().norm_groups  # of every group norm, in the VAE too
 
 
 def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
@@ -65,9 +65,8 @@ def levels_of(names: Iterable[str], naming: Naming) -> Levels:
 def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
     """The config of published weights, at the size and with the guidance of their family.
 
-    Raises:
-        CheckpointError: a weight the architecture hangs on is missing, the published rules do not give one, or nobody
-            tells the number of heads.
+    Raises CheckpointError: a weight the architecture hangs on is missing, the published rules do not give one, or nobody
+    tells the number of heads.
     """
     levels = levels_of(shapes, naming)
 
@@ -87,8 +86,8 @@ def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
     width, latent_channels = size("unet.stem.weight", 0), size("unet.conv_out.weight", 0)
     widths = tuple(size(f"{place}.res.spatial.conv2.weight", 0) for place in places)
     attention = tuple(found(f"{place}.attention.proj_in.weight", 0) is not None for place in places)
-    pixels, vae_levels = size("target_encoder.stem.weight", 0), range(levels.vae_levels)
-    vae_widths = tuple(size(f"target_encoder.levels.{level}.blocks.0.conv2.weight", 0) for level in vae_levels)
+    places = [f"target_encoder.levels.{level}.blocks.0" for level in range(levels.vae_levels)]
+    pixels, vae_widths = size("target_encoder.stem.weight", 0), tuple(size(f"{p}.conv2.weight", 0) for p in places)
     camera_width = found("unet.embed_camera.0.weight", 1) or 0
     token = found("unet.middle.0.attention.spatial.token.value.weight", 1)
     try:
@@ -104,14 +103,12 @@ def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
             context_width=token,
             vector_width=size("unet.embed_vector.0.weight", 1),
             camera_width=camera_width,
-            norm_groups=_PUBLISHED_GROUPS,
         )
         vae = VAEConfig(
             latent_channels=size("target_encoder.conv_out.weight", 0) // 2,
             width=pixels,
             multipliers=_multipliers("the VAE", pixels, vae_widths),
             blocks_per_level=levels.vae_blocks,
-            norm_groups=_PUBLISHED_GROUPS,
             scale=VAEConfig().scale if hints.latent_scale is None else hints.latent_scale,
             shared=naming == "diffusers",
         )
@@ -124,9 +121,11 @@ def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
         )
     except OptionError as error:
         raise CheckpointError(f"the weights fit no architecture known here: {error}") from error
-    if hints.family is None:
-        return config
-    family, sampling = hints.family, replace(config.sampling, guidance=hints.family.guidance)
+    return config if hints.family is None else _at_trained_size(config, hints.family)
+
+
+def _at_trained_size(config: ModelConfig, family: Family) -> ModelConfig:
+    sampling = replace(config.sampling, guidance=family.guidance)
     return replace(config, height=family.height, width=family.width, sampling=sampling)
 
 
