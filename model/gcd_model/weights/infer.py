@@ -65,8 +65,8 @@ def levels_of(names: Iterable[str], naming: Naming) -> Levels:
 def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
     """The config of published weights, at the size and with the guidance of their family.
 
-    Raises CheckpointError: a weight the architecture hangs on is missing, the published rules do not give one, or nobody
-    tells the number of heads.
+    Raises CheckpointError: a weight the architecture hangs on is missing, the published rules do not give one, or the
+    number of heads is not told.
     """
     levels = levels_of(shapes, naming)
 
