@@ -1,7 +1,6 @@
 """The door: what `encode` and `render` promise, on the smallest networks with every part and on their variants."""
 
 import math
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -32,7 +31,7 @@ from gcd_model.conditioning import (
 )
 from gcd_model.config import DRIVING_CLASSES, ModelConfig, SamplingConfig, SemanticClass
 from gcd_model.diffusion import RenderOptions, unit_noise
-from gcd_model.errors import Cancelled, ModelError, NonFiniteError, OptionError, ShapeError
+from gcd_model.errors import ModelError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import CameraMount, SphericalDelta, Trajectory, pose_trajectory
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
@@ -118,20 +117,6 @@ def test_the_number_of_steps_is_the_checkpoints_unless_asked_and_progress_counts
     note = RenderOptions(progress=lambda done, total: seen.append((done, total)), **options)  # type: ignore[arg-type]
     synthesizer.render(features, [path(synthesizer)], note)
     assert seen == [(done, evaluations) for done in range(1, evaluations + 1)]
-
-
-def test_cancelling_between_two_steps_raises_and_leaves_the_synthesizer_usable(synthesizer: Synthesizer) -> None:
-    features, stop = synthesizer.encode(random_clip()), threading.Event()
-
-    def note(done: int, _total: int) -> None:
-        if done == 2:
-            stop.set()
-
-    with pytest.raises(Cancelled):
-        synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, cancel=stop))
-    stop.clear()
-    (view,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(cancel=stop))
-    assert view.samples.isfinite().all()
 
 
 def test_features_of_parts_joined_equal_features_of_the_whole_clip(synthesizer: Synthesizer) -> None:
