@@ -139,7 +139,7 @@ def test_a_run_leaves_the_adapter_apart_and_merged_weights(tmp_path: Path) -> No
     trainer(out, recipe(base), TinyClips(1)).run()
     state = saved(out / "unet", "unet").module
     assert all(name.endswith((".down", ".up")) for name in state)
-    joined = load_adapted(load_weights(base, ask_family=False), read_adapter(out / "mine-adapter.safetensors"))
+    joined = load_adapted(load_weights(base), read_adapter(out / "mine-adapter.safetensors"))
     merged = load_weights(out / "mine.safetensors")
     for name, value in merged.networks.state_dict().items():
         assert torch.equal(value, joined.networks.state_dict()[name]), name

@@ -330,13 +330,11 @@ def _is_finite(view: View) -> bool:
     return all(bool(each.isfinite().all()) for each in pictures if each is not None)
 
 
-def save_live(
-    path: str | Path, networks: LiveNetworks, name: str, *, trained: bool = True, overwrite: bool = False
-) -> None:
+def save_live(path: str | Path, networks: LiveNetworks, name: str, *, overwrite: bool = False) -> None:
     """Write a live model as one of our files, in half precision.
 
     Raises: OptionError if `path` exists and `overwrite` is not set; CheckpointError if it cannot be written.
     """
     halves: dict[str, Tensor] = {name: weight.half() for name, weight in networks.state_dict().items()}
-    card = Card(name=name, config=networks.config, family=LIVE, move_time=0, trained=trained)
+    card = Card(name=name, config=networks.config, family=LIVE, move_time=0)
     write_safetensors(Path(path), halves, card.to_metadata(), overwrite=overwrite)

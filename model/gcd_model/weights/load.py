@@ -5,7 +5,6 @@ Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffu
 """
 
 import hashlib
-import logging
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -23,7 +22,6 @@ from gcd_model.networks import LiveNetworks, LoadedWeights, Networks, empty_netw
 from gcd_model.weights.adapter import Adapter, adapted
 from gcd_model.weights.card import (
     CONFIG_KEY,
-    FAMILIES,
     FULL_PRECISION,
     Card,
     Hints,
@@ -36,8 +34,6 @@ from gcd_model.weights.infer import infer_config, match_weights, shapes_of
 from gcd_model.weights.names import Levels, Naming, assembled, published_names
 from gcd_model.weights.read import WeightsFile, read_file, read_weights
 from gcd_model.weights.save import CARRIED, write_published, write_safetensors
-
-_log = logging.getLogger(__name__)
 
 _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
@@ -58,11 +54,9 @@ class Told(TypedDict, total=False):
     frames: int | None
 
 
-def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[Told]) -> LoadedWeights:
-    """Load a checkpoint of any layout.
+def load_weights(path: str | Path, **told: Unpack[Told]) -> LoadedWeights:
+    """Load a checkpoint of any layout. told: see `Told`.
 
-    Args:
-        ask_family: warn where the family is not known; False for those who only want the weights. told: see `Told`.
     Raises:
         CheckpointError: the file is missing, damaged, hostile, of another architecture, or its heads are not known.
         OptionError: an option is unknown or contradicts the file.
@@ -70,13 +64,6 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
     with _about(path):
         examined = _examined(Path(path), told)
         examined.networks.load_state_dict(examined.state(), assign=True, strict=True)
-        if ask_family and examined.card.family is None:
-            _log.warning(
-                "the family of %s is not known: no limits are checked and --motion-bucket must be given; "
-                "name it with --family %s",
-                path,
-                "|".join(FAMILIES),
-            )
         return LoadedWeights(
             card=replace(examined.card, origin=digest(examined.file.files)[:12]),
             networks=examined.networks,

@@ -298,7 +298,7 @@ def loaded_base(path: str, config: ModelConfig | None = None) -> LoadedWeights:
     """A weight file of any layout, or `package:NAME`, with the config's heads if it has none. See `load_weights`."""
     tower, width = (None, None) if config is None else (config.image_encoder, config.unet.head_width)
     heads = None if tower is None else tower.heads
-    return load_weights(weights_path(path), ask_family=False, head_width=width, image_heads=heads)
+    return load_weights(weights_path(path), head_width=width, image_heads=heads)
 
 
 class Conditioner:
