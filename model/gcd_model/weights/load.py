@@ -151,10 +151,9 @@ def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpa
     """
     with _about(path):
         examined = _examined(Path(path), told)
-        file, networks = examined.file, dict[str, list[tuple[int, torch.dtype]]]()
+        file, used = examined.file, dict[str, list[tuple[Tensor, torch.dtype]]]()
         for name, tensor in examined.networks.state_dict().items():
-            stored = file.tensors[examined.sources[name][0]].dtype
-            networks.setdefault(name.partition(".")[0], []).append((tensor.numel(), stored))
+            used.setdefault(name.partition(".")[0], []).append((tensor, file.tensors[examined.sources[name][0]].dtype))
         return WeightsReport(
             **{each.name: getattr(examined.card, each.name) for each in fields(examined.card)},
             path=str(path),
@@ -162,12 +161,12 @@ def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpa
             networks=tuple(
                 NetworkReport(
                     name=network,
-                    parameters=sum(count for count, _ in tensors),
+                    parameters=sum(tensor.numel() for tensor, _ in tensors),
                     tensors=len(tensors),
                     dtypes=tuple(sorted({str(dtype).removeprefix("torch.") for _, dtype in tensors})),
-                    size=sum(count * dtype.itemsize for count, dtype in tensors),
+                    size=sum(tensor.numel() * dtype.itemsize for tensor, dtype in tensors),
                 )
-                for network, tensors in networks.items()
+                for network, tensors in used.items()
             ),
             leftovers=tuple(
                 Leftover(kind=kind, tensors=len(names), size=sum(file.tensors[name].nbytes for name in names))
