@@ -198,17 +198,17 @@ class NodeCommands:
             raise RequestError(f"{traits.name} has one fixed view and takes no poses", Code.VIEW_FIXED)
         pose = torch.tensor(numbers, dtype=torch.float64).reshape(4, 4)
         try:
-            fit = nearest_delta(pose, stated_sphere(self._live.config.source.pose) or Traits.ASSUMED_SOURCE)
+            delta, by_deg = nearest_delta(pose, stated_sphere(self._live.config.source.pose) or Traits.ASSUMED_SOURCE)
         except ModelError as error:
             raise RequestError(f"the pose: {error}", Code.BAD_ARG) from error
-        if fit.rotation_error_deg > _TOLERATED_DEG:
+        if by_deg > _TOLERATED_DEG:
             raise RequestError(
-                f"a view looks at the centre of the scene: the nearest one is turned by {fit.rotation_error_deg:.1f} "
+                f"a view looks at the centre of the scene: the nearest one is turned by {by_deg:.1f} "
                 f"degrees from the pose, allowed are {_TOLERATED_DEG:g}; aim it there, or give angles and radius",
                 Code.OUT_OF_RANGE,
                 result={"allowed": {"rotation_error_deg": [0.0, _TOLERATED_DEG]}},
             )
-        return fit.delta, fit.rotation_error_deg
+        return delta, by_deg
 
     def _check_view(self, view_id: str, view: ViewConfig, traits: Traits) -> None:
         """Raises RequestError if the checkpoint cannot give it."""

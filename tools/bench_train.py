@@ -25,7 +25,7 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 from gcd_model.config import SMALL, SVD_14
 from gcd_model.networks import empty_networks, random_networks
 from gcd_model.unet import Stage, VideoUNet
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.batches import encode_frames
 from gcd_train.recipe import LoraRecipe, LossRecipe, ModelRecipe, NoiseRecipe, OptimiserRecipe, UNetRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe

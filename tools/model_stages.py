@@ -25,7 +25,7 @@ from gcd_model.clip import Clip, View
 from gcd_model.conditioning import Conditioning
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
-from gcd_model.engines.cuda import psnr_db
+from gcd_model.engines.gpu_layout import psnr_db
 from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Trajectory
@@ -35,8 +35,7 @@ from gcd_model.loading import device_named, load_synthesizer, placed_synthesizer
 from gcd_model.networks import LoadedWeights, Networks, empty_networks, random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.weights.card import NO_DIFFUSION, Card
-from gcd_model.weights.families import KUBRIC90
+from gcd_model.weights.card import KUBRIC90, NO_DIFFUSION, Card
 from gcd_model.weights.load import save_weights
 
 FULL = "random:full"
@@ -52,9 +51,9 @@ VARIANTS = {
     "ours on cuda": {},
     "ours on cuda, tuned": {"tuned": True},
     "ours on cuda, float8": {"float8": True},
-    "ours on cuda, float32 decoder": {"decoder": "float32"},
+    "ours on cuda, float32 decoder": {"half_decoder": False},
     "ours, compiled alone": {"graphs": False},
-    "ours, graphs alone": {"backend": None, "channels_last": False, "joined": False, "decoder": "float32"},
+    "ours, graphs alone": {"backend": None, "arranged": False, "half_decoder": False},
 }
 """Of the engine for a GPU, as its options have them; beside them there are "ours" (plain torch), "diffusers" and
 "diffusers compiled"."""

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, View
 from gcd_model.config import SVD_14
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig
 from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo

@@ -243,10 +243,14 @@ class Upsample(Derived[Tensor]):
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
     def derive(self) -> Tensor:
-        """Kernels by output phase: [2, 2, C, C, 2, 2]."""
+        """Kernels by output phase: [2, 2, C, C, 2, 2].
+
+        Phase 0 sees input rows (i-1, i) through taps (0, 1+2), phase 1 rows (i, i+1) through taps (0+1, 2).
+        """
         weight = self.conv.weight
-        precise = torch.promote_types(weight.dtype, torch.float32)  # taps are added up before they are rounded
-        return phase_kernels(weight.to(precise)).to(weight.dtype)
+        precise = weight.to(torch.promote_types(weight.dtype, torch.float32))  # taps are added before they are rounded
+        fold = precise.new_tensor([[[1, 0, 0], [0, 1, 1]], [[1, 1, 0], [0, 0, 1]]])  # [phase, row, tap]
+        return torch.einsum("ayk,bxl,oikl->aboiyx", fold, fold, precise).contiguous().to(weight.dtype)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: [N, C, H, W] -> [N, C, 2H, 2W]."""
@@ -259,15 +263,6 @@ class Upsample(Derived[Tensor]):
         for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
             window = padded[..., a : a + height + 1, b : b + width + 1]
             yield (a, b), F.conv2d(window, kernels[a, b], self.conv.bias)
-
-
-def phase_kernels(weight: Tensor) -> Tensor:
-    """Split a 3x3 kernel that follows nearest 2x up-sampling by output phase: [C', C, 3, 3] -> [2, 2, C', C, 2, 2].
-
-    Phase 0 sees input rows (i-1, i) through taps (0, 1+2), phase 1 rows (i, i+1) through taps (0+1, 2).
-    """
-    fold = weight.new_tensor([[[1, 0, 0], [0, 1, 1]], [[1, 1, 0], [0, 0, 1]]])  # [phase, row, tap]
-    return torch.einsum("ayk,bxl,oikl->aboiyx", fold, fold, weight).contiguous()
 
 
 # --- space and time: frames are flattened into the batch, time fastest: row b*T + t is frame t of clip b --------------

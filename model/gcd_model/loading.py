@@ -1,5 +1,6 @@
 """From the name of a checkpoint to a synthesizer on a device."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Unpack, get_args
@@ -17,14 +18,14 @@ from gcd_model.live.synthesizer import LiveSynthesizer
 from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, weights_digest
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.weights.card import FULL_PRECISION, Card, precision
-from gcd_model.weights.families import LIVE, Hints, family_named
+from gcd_model.weights.card import FAMILIES, FULL_PRECISION, LIVE, Card, Hints, family_named, precision
 from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]
 """What can compute networks; see `Engine`."""
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 
+_LOG = logging.getLogger(__name__)
 PACKAGED = Path(__file__).parent / "weights"
 """Where the weights that ship with the package lie."""
 
@@ -89,7 +90,7 @@ def loaded_weights(source: str | Path, *, adapter: str | Path | None = None, **t
             raise OptionError(f"{source} takes neither family, head width nor image heads; leave them out")
         loaded = random_weights(name, frames=told.get("frames"))
     else:
-        loaded = load_weights(weights_path(source), ask_family=adapter is None, **told)
+        loaded = load_weights(weights_path(source), **told)
     return loaded if adapter is None else load_adapted(loaded, read_adapter(adapter))
 
 
@@ -122,15 +123,24 @@ def placed_synthesizer(
     Raises OptionError as `load_synthesizer`.
     """
     networks, live = loaded.networks, isinstance(loaded.networks, LiveNetworks)
+    if loaded.card.family is None:
+        _LOG.warning(
+            "the family of %s is not known: no limits are checked and --motion-bucket must be given; name it with "
+            "--family %s",
+            loaded.card.name,
+            "|".join(FAMILIES),
+        )
     name = dtype or default_precision(device, live=live)
-    traits = Traits.of(loaded.card, sha256_12=loaded.sha256_12, precision=name, device=str(device))
+    traits = Traits.of(loaded.card, sha256_12=loaded.card.origin, precision=name, device=str(device))
     if isinstance(networks, LiveNetworks):
         if dtype == "float16":
             raise OptionError(
-                f"{loaded.name} is the live model, which was not trained for float16; take bfloat16 or float32"
+                f"{loaded.card.name} is the live model, which was not trained for float16; take bfloat16 or float32"
             )
         if engine not in (None, "torch"):
-            raise OptionError(f"{loaded.name} is the live model, which torch runs as it is; leave engine {engine} out")
+            raise OptionError(
+                f"{loaded.card.name} is the live model, which torch runs as it is; leave engine {engine} out"
+            )
         networks = networks.to(device, precision(name), memory_format=layout(device))  # pyright: ignore
         return LiveSynthesizer(networks, traits)
     for part, module in networks.named_children():

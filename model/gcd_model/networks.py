@@ -17,7 +17,6 @@ from gcd_model.live.paint_net import PaintNet
 from gcd_model.unet import VideoUNet
 from gcd_model.vae import Encoder, TemporalDecoder
 from gcd_model.weights.card import NO_DIFFUSION, Card, Layout
-from gcd_model.weights.families import Family
 
 
 class Networks(nn.Module):
@@ -71,25 +70,10 @@ class LoadedWeights:
     carried: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
 
     @property
-    def name(self) -> str:
-        """Of the checkpoint."""
-        return self.card.name
-
-    @property
-    def family(self) -> Family | None:
-        """None if nobody could tell."""
-        return self.card.family
-
-    @property
-    def sha256_12(self) -> str:
-        """First 12 digits of `digest`."""
-        return self.card.origin
-
-    @property
     def diffusion(self) -> Networks:
         """The networks of a diffusion model. Raises CheckpointError for the live model."""
         if isinstance(self.networks, LiveNetworks):
-            raise CheckpointError(f"{self.name} {NO_DIFFUSION}")
+            raise CheckpointError(f"{self.card.name} {NO_DIFFUSION}")
         return self.networks
 
 

@@ -26,11 +26,10 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.live.config import LiveConfig
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import KUBRIC90, LIVE_LENS_DEG
+from gcd_model.weights.card import KUBRIC90, LIVE_LENS_DEG, Card
 
 _LOG = logging.getLogger(__name__)
-_TOLERATED_M, _TOLERATED_DEG = 1e-3, 0.05
+_TOLERATED_DEG = 0.05
 
 ASSUMED_SOURCE = Spherical(azimuth_deg=0.0, elevation_deg=5.0, radius_m=15.0)
 """Where the source camera is taken to stand when nobody says: low, looking at the scene's centre."""
@@ -214,24 +213,19 @@ class Traits(Card):
             raise PoseError(f"poses must be [{self.config.frames}, 4, 4], got {list(source_from_target.shape)}")
         if self.takes_any_pose:
             return pose_trajectory(source_from_target)
-        fitted, fits = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
+        fitted, turned_deg = fitted_trajectory(source_from_target, source or ASSUMED_SOURCE)
         assert fitted.delta is not None
         for azimuth, elevation, radius in fitted.delta.tolist():
             self._check_limits(SphericalDelta(azimuth_deg=azimuth, elevation_deg=elevation, radius_m=radius), source)
-        if self.config.camera == "spherical":
-            position_m, rotation_deg = (
-                max(getattr(fit, name) for fit in fits) for name in ("position_error_m", "rotation_error_deg")
+        if self.config.camera != "spherical":
+            return replace(fitted, source_from_target=pose_trajectory(source_from_target).source_from_target)
+        if turned_deg > _TOLERATED_DEG:
+            _LOG.warning(
+                "the network is steered by angles and radius: the nearest path turns the asked poses by up to %.3g "
+                "degrees",
+                turned_deg,
             )
-            if position_m > _TOLERATED_M or rotation_deg > _TOLERATED_DEG:
-                _LOG.warning(
-                    "the network is steered by angles and radius: the nearest path misses the asked poses by up to "
-                    "%.3g m and %.3g degrees",
-                    position_m,
-                    rotation_deg,
-                )
-            return fitted
-        asked = pose_trajectory(source_from_target)
-        return replace(fitted, source_from_target=asked.source_from_target, at_goal=asked.at_goal)
+        return fitted
 
     def _fixed_view(self, delta: SphericalDelta | None, move_time: int) -> Trajectory:
         if delta is not None and delta != SphericalDelta():

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from small_models import randomise
 from torch import Tensor, nn
 
@@ -163,19 +163,6 @@ def write_diffusers(folder: Path, *, half: bool = False, configs: bool = True) -
         if configs:
             (folder / part / "config.json").write_text(json.dumps(facts[part]))
     return folder
-
-
-def split_in_shards(part: Path) -> Path:
-    """Split a part's weights in two files with an index, as diffusers does."""
-    whole = part / f"{stem_of(part.name)}.safetensors"
-    state = load_file(whole)
-    whole.unlink()
-    files = [f"{whole.stem}-0000{i}-of-00002.safetensors" for i in (1, 2)]
-    index = {name: files[i % 2] for i, name in enumerate(state)}
-    for file in files:
-        save_file({name: state[name] for name in state if index[name] == file}, part / file)
-    (part / f"{whole.name}.index.json").write_text(json.dumps({"metadata": {}, "weight_map": index}))
-    return part
 
 
 def manifest(layout: str) -> dict[str, tuple[int, ...]]:

@@ -12,8 +12,7 @@ from gcd_model.geometry import Trajectory
 from gcd_model.networks import LoadedWeights, Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import DRIVING_SEMANTIC, KUBRIC90
+from gcd_model.weights.card import DRIVING_SEMANTIC, KUBRIC90, Card
 
 UNET = UNetConfig(
     width=64,

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from gcd_model.engines.graphs import Recorder, Replay
+from gcd_model.engines.cuda import Recorder, Replay
 
 _ATEN = torch.ops.aten
 _HOST = {_ATEN._local_scalar_dense, _ATEN.nonzero, _ATEN.equal, _ATEN.is_nonzero, _ATEN.lift_fresh, _ATEN.item}

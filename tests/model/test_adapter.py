@@ -22,9 +22,8 @@ from small_models import draw
 from gcd_model.errors import CheckpointError
 from gcd_model.loading import load_synthesizer
 from gcd_model.weights.adapter import DIFFUSION, Adapter, adapted, base_digest, carried_over, unshared
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
-from gcd_model.weights.load import load_adapted, read_adapter
+from gcd_model.weights.card import FAMILIES, Card
+from gcd_model.weights.load import read_adapter
 from gcd_model.weights.save import write_adapter
 
 LAYER = "unet.middle.0.attention.spatial.attention.query"
@@ -59,49 +58,37 @@ def test_base_and_adapter_are_the_bases_weights_the_factors_and_the_whole_weight
             assert torch.equal(value, given.tensors[name] if name in given.tensors else base[name]), name
 
 
-def test_an_adapter_survives_its_file(tmp_path: Path) -> None:
-    given, path = adapter(), tmp_path / "adapter.safetensors"
+def test_an_adapter_survives_its_file_and_its_base_is_told_by_its_values_whatever_file_holds_them(
+    tmp_path: Path,
+) -> None:
+    given, path, base = adapter(), tmp_path / "adapter.safetensors", write_svd(tmp_path)
     write_adapter(path, given, overwrite=False)
     again = read_adapter(path)
     assert (again.rank, again.alpha, again.base, again.card) == (given.rank, given.alpha, given.base, given.card)
     assert set(again.tensors) == set(given.tensors)
     assert all(torch.equal(again.tensors[name], tensor) for name, tensor in given.tensors.items())
-
-
-def test_the_base_is_told_by_its_values_whatever_file_holds_them(tmp_path: Path) -> None:
-    path, given = write_svd(tmp_path), adapter()
-    convert(path, tmp_path / "ours.safetensors")
-    write_adapter(tmp_path / "adapter.safetensors", given, overwrite=False)
-    for base in (path, tmp_path / "ours.safetensors"):
-        loaded = load_adapted(load(base), read_adapter(tmp_path / "adapter.safetensors"))
-        assert loaded.family is not None
-        assert (loaded.name, loaded.family.name, loaded.card.move_time) == ("steered", "kubric90", 13)
-
-
-def test_a_synthesizer_loads_base_and_adapter_and_its_digest_tells_them_apart(tmp_path: Path) -> None:
-    base = write_svd(tmp_path)
-    write_adapter(tmp_path / "adapter.safetensors", adapter(), overwrite=False)
+    convert(base, tmp_path / "ours.safetensors")
     plain = load_synthesizer(base, device="cpu", **HEADS)
-    joined = load_synthesizer(base, device="cpu", adapter=tmp_path / "adapter.safetensors", **HEADS)
-    assert joined.traits.config.camera == "spherical"
-    assert plain.traits.sha256_12 != joined.traits.sha256_12
+    for file in (base, tmp_path / "ours.safetensors"):
+        told = HEADS if file is base else {}
+        traits = load_synthesizer(file, device="cpu", adapter=path, **told).traits
+        assert (traits.name, traits.family, traits.move_time) == ("steered", FAMILIES["kubric90"], 13)
+        assert traits.config.camera == "spherical"
+        assert traits.sha256_12 != plain.traits.sha256_12
 
 
-def test_another_base_is_refused_by_its_digest() -> None:
-    with pytest.raises(CheckpointError):
-        adapted(filled(FIXED), adapter(base="f" * 12))
-    with pytest.raises(CheckpointError):
-        adapted(filled(FIXED, seed=1), adapter())
-
-
-def test_an_adapter_is_no_model_and_a_model_no_adapter(tmp_path: Path) -> None:
-    write_adapter(tmp_path / "adapter.safetensors", adapter(), overwrite=False)
-    with pytest.raises(CheckpointError):
-        load(tmp_path / "adapter.safetensors")
-    with pytest.raises(CheckpointError):
-        read_adapter(write_gcd(tmp_path))
-    with pytest.raises(CheckpointError):
-        read_adapter(tmp_path / "absent.safetensors")
+def test_another_base_is_refused_and_an_adapter_is_no_model_and_a_model_no_adapter(tmp_path: Path) -> None:
+    path = tmp_path / "adapter.safetensors"
+    write_adapter(path, adapter(), overwrite=False)
+    for wrong in (
+        lambda: adapted(filled(FIXED), adapter(base="f" * 12)),
+        lambda: adapted(filled(FIXED, seed=1), adapter()),
+        lambda: load(path),
+        lambda: read_adapter(write_gcd(tmp_path)),
+        lambda: read_adapter(tmp_path / "absent.safetensors"),
+    ):
+        with pytest.raises(CheckpointError):
+            wrong()
 
 
 @pytest.mark.parametrize(
@@ -115,33 +102,25 @@ def test_an_adapter_that_does_not_fit_is_refused(name: str, shape: tuple[int, ..
         adapted(filled(FIXED), broken)
 
 
-def test_a_model_without_camera_gives_all_but_the_camera() -> None:
-    over = carried_over(filled(FIXED), SMALL_GCD)
-    assert {name.rsplit(".", 1)[0] for name in over.fresh} == {
-        "camera.proj",
-        "unet.embed_camera.0",
-        "unet.embed_camera.2",
-    }
-    state = filled(FIXED).state_dict()
+def test_a_model_without_camera_gives_all_but_the_camera_and_from_scratch_autoencoders_and_tower_alone() -> None:
+    over, state = carried_over(filled(FIXED), SMALL_GCD), filled(FIXED).state_dict()
+    parts = {name.rsplit(".", 1)[0] for name in over.fresh}
+    assert parts == {"camera.proj", "unet.embed_camera.0", "unet.embed_camera.2"}
     assert set(over.weights) == set(state)
-    assert all(over.weights[name] is not None and torch.equal(over.weights[name], state[name]) for name in state)
-
-
-def test_from_scratch_keeps_autoencoders_and_image_tower_alone() -> None:
+    assert all(torch.equal(over.weights[name], state[name]) for name in state)
     over = carried_over(filled(), SMALL_GCD, anew=DIFFUSION)
-    kept = {name.partition(".")[0] for name in over.weights}
+    kept, fresh = ({name.partition(".")[0] for name in names} for names in (over.weights, over.fresh))
     assert kept == {"image_encoder", "target_encoder", "own_condition_encoder", "decoder"}
-    assert {name.partition(".")[0] for name in over.fresh} == {"unet", "camera"}
+    assert fresh == {"unet", "camera"}
 
 
-def test_a_diffusers_folder_starts_the_papers_two_encoders(tmp_path: Path) -> None:
+def test_a_diffusers_folder_starts_the_papers_two_encoders_and_another_architecture_starts_nothing(
+    tmp_path: Path,
+) -> None:
     over = carried_over(load(write_diffusers(tmp_path / "model")).networks, SMALL_GCD)
     wanted = unshared(filled(shared_vae(SMALL_GCD)).state_dict())
     assert set(over.weights) == set(wanted)
     assert all(torch.equal(over.weights[name], wanted[name]) for name in wanted)
-
-
-def test_another_architecture_is_named_by_its_first_weights() -> None:
     narrow = msgspec.structs.replace(SMALL_GCD, unet=msgspec.structs.replace(SMALL_GCD.unet, embedding_width=32))
     with pytest.raises(CheckpointError):
         carried_over(filled(), narrow)

@@ -1,7 +1,11 @@
-"""Checkpoints of every layout load mapped and strictly, weight by weight."""
+"""Checkpoints of every layout load mapped and strictly, weight by weight; what is wrong or hostile is refused."""
 
 import gc
-from collections.abc import Callable
+import pickle
+import sys
+import types
+import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -17,13 +21,11 @@ from published import (
     load,
     refused,
     shared_vae,
-    split_in_shards,
     write_diffusers,
     write_gcd,
     write_lightning,
     write_svd,
 )
-from safetensors.torch import load_file
 from torch import Tensor
 
 from gcd_model.config import ModelConfig
@@ -38,17 +40,6 @@ def plain_diffusers(folder: Path) -> Path:
     return write_diffusers(folder / "m", configs=False)
 
 
-def sharded(folder: Path) -> Path:
-    return split_in_shards(write_diffusers(folder / "m") / "unet").parent
-
-
-def with_a_pickle(folder: Path) -> Path:
-    whole = write_diffusers(folder / "m") / "vae" / "diffusion_pytorch_model.safetensors"
-    torch.save(load_file(whole), whole.with_suffix(".bin"))
-    whole.unlink()
-    return folder / "m"
-
-
 FIXED, SHARED = fixed_view(SMALL_GCD), shared_vae(SMALL_GCD)
 
 
@@ -59,8 +50,6 @@ FIXED, SHARED = fixed_view(SMALL_GCD), shared_vae(SMALL_GCD)
         (write_svd, FIXED),
         (lambda folder: write_diffusers(folder / "m"), SHARED),
         (plain_diffusers, SHARED),
-        (sharded, SHARED),
-        (with_a_pickle, SHARED),
     ],
 )
 def test_every_layout_loads_weight_by_weight_and_never_guesses_heads(
@@ -80,14 +69,11 @@ def test_every_layout_loads_weight_by_weight_and_never_guesses_heads(
                 load_weights(path, **told)
 
 
-def test_the_base_model_has_its_own_size_and_guidance(tmp_path: Path) -> None:
-    config = load(write_svd(tmp_path)).networks.config
+def test_the_layout_is_told_by_content_not_by_suffix_and_the_base_model_has_its_own_size(tmp_path: Path) -> None:
+    path = write_svd(tmp_path)
+    config = inspect(path).config
     assert (config.height, config.width, config.sampling.guidance) == (576, 1024, (1.0, 2.5))
-
-
-def test_the_layout_is_told_by_content_not_by_suffix(tmp_path: Path) -> None:
-    path = write_svd(tmp_path).rename(tmp_path / "blob-without-suffix")
-    assert inspect(path).layout == "sgm-safetensors"
+    assert inspect(path.rename(tmp_path / "blob-without-suffix")).layout == "sgm-safetensors"
     assert inspect(write_gcd(tmp_path).rename(tmp_path / "other")).layout == "gcd-ckpt"
 
 
@@ -164,3 +150,193 @@ def test_leftovers_are_recognised_and_counted(tmp_path: Path) -> None:
         "EMA": 1,
     }
     assert next(left.size for left in report.leftovers if left.kind == "LPIPS") == 16
+
+
+# Whatever is wrong or hostile in a file is said in one line, and nothing in it ever runs.
+
+CONV = f"{UNET}.input_blocks.1.0.in_layers.2.weight"
+
+
+def foreign_class(monkeypatch: pytest.MonkeyPatch) -> type:
+    """A class of a module that exists only while the checkpoint is written."""
+    module = types.ModuleType("made_up_trainer")
+    kind = type("Callback", (dict,), {"__module__": "made_up_trainer"})
+    monkeypatch.setattr(module, "Callback", kind, raising=False)
+    monkeypatch.setitem(sys.modules, "made_up_trainer", module)
+    return kind
+
+
+class Hostile:
+    """Unpickled by pickle itself, creates a file."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (Path.touch, (self.trace,))
+
+
+class Listed(list[int]):
+    """Rebuilt by appending to an instance with state."""
+
+
+def test_foreign_objects_and_hostile_code_beside_the_weights_do_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trace = tmp_path / "trace"
+    callback, listed, hostile = foreign_class(monkeypatch)(monitor="loss"), Listed([1, 2, 3]), Hostile(trace)
+    listed.note = "kept in the instance's dictionary"
+    entries = {
+        "callbacks": {"best": callback, "worst": hostile},
+        "loops": [listed, {1, 2}, Path("a/b")],
+        "hyper_parameters": callback,
+    }
+    path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()), **entries, optimizer_states=[hostile])
+    monkeypatch.undo()
+    assert_same_weights(load(path).networks, filled())
+    assert set(entries) < set(inspect(path).other_entries)
+    assert not trace.exists()
+    pickle.loads(pickle.dumps(hostile))
+    assert trace.exists(), "the attack must work on pickle itself, else this test shows nothing"
+
+
+def test_what_is_no_tensor_among_the_weights_is_refused_by_name_and_never_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trace = tmp_path / "trace"
+    path = write_lightning(tmp_path / "a.ckpt", gcd_state(filled()) | {"extra": foreign_class(monkeypatch)()})
+    monkeypatch.undo()
+    message = refused(path)
+    assert "made_up_trainer.Callback" in message
+    assert "'extra'" in message
+    assert CONV in refused(write_lightning(tmp_path / "b.ckpt", gcd_state(filled()) | {CONV: Hostile(trace)}))
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["posix.system", "builtins.eval", "builtins.getattr", "torch.load", "torch.storage._load_from_bytes"]
+)
+def test_no_function_but_rebuilding_is_ever_called(tmp_path: Path, name: str) -> None:
+    module, _, function = name.rpartition(".")
+    trace = tmp_path / "trace"
+    call = f"c{module}\n{function}\n(V{trace}\ntR.".encode()
+    assert "object of" in refused(write_pickle(tmp_path / "a.ckpt", call))
+
+
+def test_a_pickle_cannot_change_what_rebuilds_tensors(tmp_path: Path) -> None:
+    change = b"ctorch._utils\n_rebuild_tensor_v2\n(N}(V__defaults__\nNutb."
+    assert "cannot be unpickled" in refused(write_pickle(tmp_path / "a.ckpt", change))
+    assert torch._utils._rebuild_tensor_v2.__defaults__ == (None,)
+
+
+STORAGE = b"(Vstorage\nctorch\nFloatStorage\nV%s\nVcpu\nI%d\ntQ"
+REBUILT = b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE + b"I%d\n(I%d\nt(I%d\ntI00\nNtR"
+
+
+@pytest.mark.parametrize(
+    ("key", "count", "start", "size", "stride"),
+    [
+        (b"0", 100, 0, 4, 1),  # more than the record holds
+        (b"1", 4, 0, 4, 1),  # no record
+        (b"../version", 4, 0, 4, 1),
+        (b"0", -4, 0, 4, 1),
+        (b"0", 4, 2, 4, 1),  # a tensor that reaches beyond its storage
+        (b"0", 4, -2, 4, 1),
+        (b"0", 4, 3, 4, -1),
+        (b"0", 4, 0, 10**18, 1),
+    ],
+)
+def test_no_tensor_reaches_beyond_its_record(
+    tmp_path: Path, key: bytes, count: int, start: int, size: int, stride: int
+) -> None:
+    program = b"(Va\n" + REBUILT % (key, count, start, size, stride) + b"d."
+    message = refused(write_pickle(tmp_path / "a.ckpt", program, {"data/0": bytes(16)}))
+    assert "no layout known" not in message, "that a tensor was made"
+    whole = b"(Va\n" + REBUILT % (b"0", 4, 0, 4, 1) + b"d."
+    assert "no layout known" in refused(write_pickle(tmp_path / "b.ckpt", whole, {"data/0": bytes(16)}))
+
+
+def write_pickle(path: Path, program: bytes, records: Mapping[str, bytes] | None = None) -> Path:
+    """A torch zip whose pickle is the given program."""
+    plain = {"data.pkl": program, "version": b"3\n", "byteorder": b"little"} | dict(records or {})
+    return zipped(path, {f"archive/{name}": content for name, content in plain.items()})
+
+
+def with_weight(path: Path, value: Tensor) -> Path:
+    """A checkpoint in which one weight is something else."""
+    return write_lightning(path, gcd_state(filled()) | {CONV: value})
+
+
+def zipped(path: Path, names: Mapping[str, bytes], compression: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, content in names.items():
+            archive.writestr(name, content)
+    return path
+
+
+def saved(path: Path, content: object) -> Path:
+    torch.save(content, path)
+    return path
+
+
+def written(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def cut(path: Path, keep: float) -> Path:
+    return written(path, path.read_bytes()[: int(keep * path.stat().st_size)])
+
+
+def diffusers(folder: Path, file: str, content: str | None) -> Path:
+    """A folder of diffusers with one file of another content, or without it."""
+    write_diffusers(folder)
+    (folder / file).unlink() if content is None else (folder / file).write_text(content)
+    return folder
+
+
+def shortened(path: Path) -> Path:
+    """The largest record holds half of what its pickle claims."""
+    with zipfile.ZipFile(write_gcd(path.parent)) as source:
+        content = {entry.filename: source.read(entry) for entry in source.infolist()}
+    largest = max((name for name in content if "/data/" in name), key=lambda name: len(content[name]))
+    return zipped(path, content | {largest: content[largest][: len(content[largest]) // 2]})
+
+
+BROKEN: dict[str, Callable[[Path], Path]] = {
+    "a tensor larger than its storage": lambda path: with_weight(path, torch.zeros(1).expand(10**12)),
+    "quantised weights": lambda path: with_weight(path, gcd_state(filled())[CONV].to(torch.int8)),
+    "a record shorter than its tensor": shortened,
+    "a truncated zip": lambda path: cut(write_gcd(path.parent), 0.7),
+    "truncated safetensors": lambda path: cut(write_svd(path.parent), 0.7),
+    "a truncated header": lambda path: cut(write_svd(path.parent), 0.0001),
+    "nothing": lambda path: path,
+    "an empty file": lambda path: written(path, b""),
+    "a pointer of Git LFS": lambda path: written(path, b"version https://git-lfs.github.com/spec/v1\nsize 1\n"),
+    "a web page": lambda path: written(path, b"\n<!DOCTYPE html><html><body>Sign in</body></html>"),
+    "text": lambda path: written(path, b"text, no weights"),
+    "a header that is no JSON": lambda path: written(path, (50).to_bytes(8, "little") + b"{" * 50),
+    "a header too long to be true": lambda path: written(path, (1 << 60).to_bytes(8, "little") + b"{" * 50),
+    "a header beyond the file": lambda path: written(path, (5000).to_bytes(8, "little") + b"{" * 50),
+    "the first bytes of a zip": lambda path: written(path, b"PK\x03\x04 and then nothing"),
+    "torch's old format": lambda path: written(path, pickle.dumps({"a": 1}, protocol=2)),
+    "a huge pickle": lambda path: zipped(path, {"a/data.pkl": b"\x80\x02" + b"]" * 2**24, "a/version": b"3"}),
+    "a zip of something else": lambda path: zipped(path, {"a/b.txt": b"x"}),
+    "TorchScript": lambda path: zipped(path, {"a/constants.pkl": b"x", "a/data.pkl": b"x"}),
+    "a compressed zip": lambda path: zipped(path, {"a/data.pkl": b"x" * 100}, zipfile.ZIP_DEFLATED),
+    "a folder of something else": lambda path: path.parent,
+    "one part of diffusers": lambda path: write_diffusers(path) / "unet" / "diffusion_pytorch_model.safetensors",
+    "a part without weights": lambda path: diffusers(path, "vae/diffusion_pytorch_model.safetensors", None),
+    "a truncated part": lambda path: diffusers(path, "vae/diffusion_pytorch_model.safetensors", "xxxxxxxx{"),
+    "another activation": lambda path: diffusers(path, "image_encoder/config.json", '{"hidden_act": "quick_gelu"}'),
+    "another model": lambda path: saved(path, {"state_dict": {"model.layers.0.mlp.weight": torch.zeros(2)}}),
+    "a checkpoint without weights": lambda path: saved(path, {"epoch": 3, "weights": {}}),
+    "a list": lambda path: saved(path, [1, 2]),
+    "a list of weights": lambda path: saved(path, {"state_dict": [1]}),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_is_no_checkpoint_is_refused_in_one_line_that_begins_with_its_name(tmp_path: Path, kind: str) -> None:
+    message = refused(BROKEN[kind](tmp_path / "a.ckpt"))
+    assert {"a pointer of Git LFS": "git lfs pull", "a truncated zip": "truncated"}.get(kind, "") in message

@@ -24,33 +24,19 @@ def arranged(module: nn.Module) -> nn.Module:
     return wrapped
 
 
-def _unet() -> VideoUNet:
-    unet = VideoUNet(UNET, FRAMES)
-    randomise(unet)
-    prepare(unet)
-    return unet
-
-
-def _inputs(unet: VideoUNet) -> tuple[Tensor, Tensor | None]:
-    rows = CLIPS * FRAMES
-    vector, camera, tokens = (
-        draw(rows, UNET.vector_width),
-        draw(rows, UNET.camera_width, seed=2),
-        draw(rows, 48, seed=3),
-    )
-    return unet.plan(draw(1, seed=1), vector, camera, tokens).step(0)
-
-
 @pytest.mark.parametrize("floats", [20_000, engine.REUSED_FLOATS])
 def test_the_u_net_is_the_same_however_little_memory_is_used_at_once(
     monkeypatch: pytest.MonkeyPatch, floats: int
 ) -> None:
-    unet, latents, seen = _unet(), draw(CLIPS * FRAMES, 4, 8, 16, seed=4), list[int]()
-    wrapped = arranged(unet)
+    unet, rows, seen = VideoUNet(UNET, FRAMES), CLIPS * FRAMES, list[int]()
+    randomise(unet)
+    prepare(unet)
+    wrapped, latents = arranged(unet), draw(rows, 4, 8, 16, seed=4)
     wrapped.stem.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
     monkeypatch.setattr(engine, "REUSED_FLOATS", floats)
     with torch.no_grad():
-        inputs = _inputs(unet)
+        given = (draw(rows, width, seed=seed) for seed, width in enumerate((UNET.vector_width, UNET.camera_width, 48)))
+        inputs = unet.plan(draw(1, seed=1), *given).step(0)
         whole, pieces = (each(latents, latents, *inputs) for each in (unet, wrapped))
     assert whole.abs().max() > 0.1
     assert_close(pieces, whole, rtol=1e-4, atol=1e-5)

@@ -3,7 +3,7 @@
 import copy
 import os
 import threading
-from collections.abc import Generator, Hashable
+from collections.abc import Callable, Generator, Hashable, Iterable
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -18,20 +18,16 @@ from torch import nn
 from gcd_model.clip import Clip, View
 from gcd_model.config import ModelConfig
 from gcd_model.diffusion import RenderOptions, Schedule
-from gcd_model.engines.cuda import (
-    CudaEngine,
-    CudaOptions,
+from gcd_model.engines.cuda import CudaEngine, CudaGraphs, CudaOptions, Recorder, Replay, keep_compiled, recent, regions
+from gcd_model.engines.gpu_layout import (
     Float8,
     Float8Linear,
     checked_decoder,
     join_attention,
-    keep_compiled,
     linear,
     multiply_in_float8,
     psnr_db,
-    regions,
 )
-from gcd_model.engines.graphs import CudaGraphs, Recorder, Replay, recent
 from gcd_model.errors import Cancelled, DeviceMemoryError, OptionError
 from gcd_model.geometry import SphericalDelta, Trajectory
 from gcd_model.layers import Attention, ResBlock
@@ -39,7 +35,7 @@ from gcd_model.loading import load_synthesizer
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 
-PLAIN = CudaOptions(backend=None, channels_last=False, joined=False, decoder="float32")
+PLAIN = CudaOptions(backend=None, arranged=False, half_decoder=False)
 
 
 def with_engine(
@@ -55,7 +51,9 @@ def views_of(synthesizer: Synthesizer, options: RenderOptions, clip: Clip, azimu
 
 
 def orbits(synthesizer: Synthesizer, azimuths: tuple[float, ...]) -> list[Trajectory]:
-    return [synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=azimuth)) for azimuth in azimuths]
+    steered = synthesizer.traits.config.camera != "none"
+    deltas = (SphericalDelta(azimuth_deg=azimuth) if steered else None for azimuth in azimuths)
+    return [synthesizer.traits.plan_view(delta) for delta in deltas]
 
 
 @pytest.fixture(scope="module")
@@ -63,39 +61,41 @@ def plain() -> Synthesizer:
     return tiny_synthesizer()
 
 
-def test_euler_steps_of_several_views_and_samples_are_plain_torch(plain: Synthesizer) -> None:
-    options = RenderOptions(steps=2, samples=2, guidance=(1.0, 2.5))
-    ours, theirs = (views_of(s, options, random_clip(), (30.0, -20.0)) for s in (with_engine(plain), plain))
+def assert_alike(ours: Iterable[View], theirs: Iterable[View]) -> None:
     for mine, other in zip(ours, theirs, strict=True):
         assert relative_error(mine.latents, other.latents) < 1e-5
         assert relative_error(mine.samples, other.samples) < 1e-5
 
 
-def test_multistep_with_guidance_in_an_interval_and_convolutions_laid_out_anew_is_plain_torch(
-    plain: Synthesizer,
+@pytest.mark.parametrize(
+    ("options", "engine", "azimuths"),
+    [
+        (RenderOptions(steps=2, samples=2, guidance=(1.0, 2.5)), PLAIN, (30.0, -20.0)),
+        (
+            RenderOptions(steps=3, solver="dpmpp_2m", guidance=(1.0, 3.0), guidance_interval=(0.5, 100.0)),
+            replace(PLAIN, arranged=True),
+            (30.0,),
+        ),
+    ],
+    ids=["Euler steps of several views and samples", "multistep, guided at times, arranged"],
+)
+def test_the_engine_is_plain_torch(
+    plain: Synthesizer, options: RenderOptions, engine: CudaOptions, azimuths: tuple[float, ...]
 ) -> None:
-    options = RenderOptions(steps=3, solver="dpmpp_2m", guidance=(1.0, 3.0), guidance_interval=(0.5, 100.0))
-    engine = with_engine(plain, options=replace(PLAIN, channels_last=True))
-    assert set(Schedule.of(TINY, options).guided) == {True, False}
-    (mine,), (other,) = (views_of(s, options, random_clip(), (30.0,)) for s in (engine, plain))
-    assert relative_error(mine.latents, other.latents) < 1e-5
-    assert relative_error(mine.samples, other.samples) < 1e-5
+    if options.guidance_interval is not None:
+        assert set(Schedule.of(TINY, options).guided) == {True, False}
+    found = (views_of(each, options, random_clip(), azimuths) for each in (with_engine(plain, options=engine), plain))
+    assert_alike(*found)
 
 
-def test_class_maps_of_a_driving_model_are_plain_torch() -> None:
+def test_a_painted_view_of_the_engine_is_plain_torchs_bit_by_bit_class_maps_too() -> None:
     plain = tiny_driving()
-    tape = TapeRecorder()
-    engine = with_engine(plain, tape)
-    for steps, seed in ((2, 0), (2, 1)):
-        options = RenderOptions(steps=steps, seed=seed)
-        clip = random_clip(TINY_DRIVING, seed=seed)
-        mine, other = (s.render(s.encode(clip), [s.traits.plan_view()], options)[0] for s in (engine, plain))
-        assert torch.equal(mine.latents, other.latents)
-        assert torch.equal(mine.samples, other.samples)
-        assert mine.classes is not None
-        assert other.classes is not None
-        assert torch.equal(mine.classes, other.classes)
-    assert tape.recorded == 4  # the encoder for two frames and for one, a step, the decoder
+    engine = with_engine(plain, TapeRecorder())
+    for seed in (0, 1):
+        clip, options = random_clip(TINY_DRIVING, seed=seed), RenderOptions(steps=2, seed=seed)
+        (mine,), (other,) = (views_of(each, options, clip, (0.0,)) for each in (engine, plain))
+        for name in ("latents", "samples", "classes"):
+            assert torch.equal(getattr(mine, name), getattr(other, name)), name
 
 
 def test_what_was_recorded_serves_other_clips_paths_steps_solvers_and_guidance(plain: Synthesizer) -> None:
@@ -112,10 +112,7 @@ def test_what_was_recorded_serves_other_clips_paths_steps_solvers_and_guidance(p
     )
     for seed, options in enumerate(others, start=1):
         clip = Clip(video=random_clip(seed=seed).video, fps=7.0)
-        pairs = zip(*(views_of(s, options, clip, (-70.0,)) for s in (engine, plain)), strict=True)
-        for mine, other in pairs:
-            assert relative_error(mine.latents, other.latents) < 1e-5
-            assert relative_error(mine.samples, other.samples) < 1e-5
+        assert_alike(*(views_of(s, options, clip, (-70.0,)) for s in (engine, plain)))
     assert tape.recorded == recorded
 
 
@@ -132,15 +129,16 @@ def test_guided_and_plain_steps_are_recorded_once_for_any_number_of_views_and_sa
     assert tape.recorded - before == 3
 
 
-def test_a_window_is_abandoned_between_two_steps_and_the_next_one_is_whole(plain: Synthesizer) -> None:
-    engine, stop = with_engine(plain), threading.Event()
+@pytest.mark.parametrize("wrap", [with_engine, lambda plain: plain], ids=["engine", "plain torch"])
+def test_a_window_is_abandoned_between_two_steps_and_the_next_one_is_whole(
+    plain: Synthesizer, wrap: Callable[[Synthesizer], Synthesizer]
+) -> None:
+    engine, stop, told = wrap(plain), threading.Event(), list[tuple[int, int]]()
     features, path = engine.encode(random_clip()), orbits(engine, (30.0,))
-    told: list[tuple[int, int]] = []
 
-    def note(done: int, steps: int) -> None:
-        told.append((done, steps))
-        if done == 1:
-            stop.set()
+    def note(*progress: int) -> None:
+        told.append(progress)  # type: ignore[arg-type]
+        stop.set()
 
     with pytest.raises(Cancelled):
         engine.render(features, path, RenderOptions(steps=2, progress=note, cancel=stop))
@@ -207,7 +205,7 @@ def test_every_convolution_of_the_unet_but_its_ends_lies_in_a_compiled_region(co
 def test_compiled_code_is_kept_in_the_folder_that_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GCD_CACHE_DIR", str(tmp_path))
     for name in ("TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR"):
-        monkeypatch.setenv(name, "")
+        monkeypatch.setenv(name, "")  # so that it is as before in the end
         monkeypatch.delenv(name)
     keep_compiled()
     assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(tmp_path / "compiled" / torch.__version__)
@@ -302,7 +300,7 @@ def test_the_engine_decodes_in_half_precision_where_pictures_stay_alike(
     assert decoder.stem.weight.dtype == dtype
     assert psnr > 50
     taken = copy.deepcopy(networks)
-    engine = CudaEngine(taken, CudaOptions(backend=None, channels_last=False))
+    engine = CudaEngine(taken, CudaOptions(backend=None))
     assert taken.decoder.stem.weight.dtype == dtype
     assert networks.decoder.stem.weight.dtype == torch.float32
     assert engine.decode(torch.zeros(TINY.frames, 4, 2, 2)).dtype == torch.float32
@@ -312,14 +310,12 @@ def test_compiled_blocks_are_plain_torch_compiling_is_heard_and_many_shapes_are_
     from torch._dynamo import config
 
     told: list[int] = []
-    compiled = with_engine(plain, options=CudaOptions(backend="eager", decoder="float32"))
+    compiled = with_engine(plain, options=CudaOptions(backend="eager", half_decoder=False))
     asked = RenderOptions(steps=2, guidance=(1.0, 2.5), progress=lambda done, _: told.append(done))
-    (mine,) = views_of(compiled, asked, random_clip(TINY), (30.0,))
+    views = views_of(compiled, asked, random_clip(TINY), (30.0,))
     assert told.count(0) > 10
     assert [done for done in told if done] == [1, 2]
-    (other,) = views_of(plain, replace(asked, progress=None), random_clip(TINY), (30.0,))
-    assert relative_error(mine.latents, other.latents) < 1e-5
-    assert relative_error(mine.samples, other.samples) < 1e-5
+    assert_alike(views, views_of(plain, replace(asked, progress=None), random_clip(TINY), (30.0,)))
     assert config.recompile_limit >= 256
     assert config.accumulated_recompile_limit >= 4096
 
@@ -355,8 +351,8 @@ def test_products_in_8_bits_stay_near_plain_torch_and_leave_an_adapter_alone(pla
     """On random weights of widths of 32: 37 to 38 dB; bfloat16 keeps 47."""
     options = RenderOptions(steps=3, guidance=(1.0, 1.5))
     (other,) = views_of(plain, options, random_clip(), (30.0,))
-    for joined in (False, True):
-        engine = with_engine(plain, options=replace(PLAIN, float8=True, joined=joined))
+    for arranged in (False, True):
+        engine = with_engine(plain, options=replace(PLAIN, float8=True, arranged=arranged))
         (mine,) = views_of(engine, options, random_clip(), (30.0,))
         assert 32 < psnr_db(mine.samples, other.samples) < 45
     changed = Attention(16, 2)

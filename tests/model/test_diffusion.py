@@ -37,7 +37,6 @@ from gcd_model.diffusion import (
 )
 from gcd_model.errors import OptionError
 from gcd_model.geometry import SphericalDelta
-from gcd_model.synthesizer import Synthesizer
 
 PUBLISHED = SamplingConfig()
 
@@ -136,14 +135,10 @@ def test_the_first_step_asks_for_nothing_before_and_the_last_leaves_no_noise(sol
 
 
 def test_unit_noise_is_fixed_by_seed_and_stream_and_differs_between_them() -> None:
-    shape = (4, 5000)
-    first = unit_noise(shape, seed=3, stream=1)
-    assert torch.equal(first, unit_noise(shape, seed=3, stream=1))
-    others = [
-        unit_noise(shape, seed=3, stream=2),
-        unit_noise(shape, seed=4, stream=1),
-        unit_noise(shape, seed=1, stream=3),
-    ]
+    first, again, *others = (
+        unit_noise((4, 5000), seed=seed, stream=stream) for seed, stream in [(3, 1), (3, 1), (3, 2), (4, 1), (1, 3)]
+    )
+    assert torch.equal(first, again)
     for other in others:
         assert torch.corrcoef(torch.stack([first.flatten(), other.flatten()]))[0, 1].abs() < 0.03
     assert first.mean().abs() < 0.03
@@ -176,30 +171,26 @@ def error(solver: SolverName, steps: int) -> float:
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_exact_is_what_was_published_and_few_steps_are_their_checkpoints_own(quality: Quality) -> None:
+def test_exact_is_what_was_published_few_steps_are_their_checkpoints_own_and_what_is_named_wins(
+    quality: Quality,
+) -> None:
     assert Sampler.of(PUBLISHED, RenderOptions()) == Sampler(steps=25, solver="euler", guidance=(1.0, 1.5))
     few = PLAIN_SMALL.sampling
     own = Sampler(steps=few.steps, solver="euler", guidance=few.guidance)
     assert Sampler.of(few, RenderOptions(quality=quality)) == own
-
-
-@pytest.mark.parametrize("steps", [1, 2, 5, 25, 59])
-def test_no_quality_takes_more_of_the_network_than_a_better_one(steps: int) -> None:
-    config = structs.replace(SVD_14, sampling=SamplingConfig(steps=steps))
-    cost = [Schedule.of(config, RenderOptions(quality=quality)).evaluations for quality in QUALITIES]
-    assert cost == sorted(cost, reverse=True)
-    assert cost[0] == 2 * steps
-
-
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_what_is_named_wins_over_the_quality_and_what_is_not_is_as_the_quality_has_it(quality: Quality) -> None:
-    named = RenderOptions(quality=quality, steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0))
-    assert Sampler.of(PUBLISHED, named) == Sampler(
-        steps=7, solver="euler", guidance=(2.0, 3.0), guidance_interval=(0.5, 5.0)
-    )
+    wanted = {"steps": 7, "solver": "euler", "guidance": (2.0, 3.0), "guidance_interval": (0.5, 5.0)}
+    assert Sampler.of(PUBLISHED, RenderOptions(quality=quality, **wanted)) == Sampler(**wanted)  # type: ignore[arg-type]
     usual = Sampler.of(PUBLISHED, RenderOptions(quality=quality))
     assert Sampler.of(PUBLISHED, RenderOptions(quality=quality, steps=7)) == replace(usual, steps=7)
     assert Sampler.of(PUBLISHED, RenderOptions(quality=quality, solver="heun")) == replace(usual, solver="heun")
+
+
+def test_no_quality_takes_more_of_the_network_than_a_better_one() -> None:
+    for steps in (1, 2, 5, 25, 59):
+        config = structs.replace(SVD_14, sampling=SamplingConfig(steps=steps))
+        cost = [Schedule.of(config, RenderOptions(quality=quality)).evaluations for quality in QUALITIES]
+        assert cost == sorted(cost, reverse=True)
+        assert cost[0] == 2 * steps
 
 
 def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are_and_fastest_at_most_three_times_as_far() -> None:
@@ -207,40 +198,16 @@ def test_fast_is_no_farther_from_the_limit_than_25_euler_steps_are_and_fastest_a
     assert fast <= exact < fastest <= 3 * exact
 
 
-STEPS = 4
-
-
-@pytest.fixture(scope="module")
-def synthesizer() -> Synthesizer:
-    return tiny_synthesizer()
-
-
-def latents(synthesizer: Synthesizer, options: RenderOptions) -> Tensor:
-    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
-    return synthesize(synthesizer, random_clip(), path, replace(options, steps=STEPS)).latents
-
-
-def test_guidance_applies_within_its_interval_alone() -> None:
-    levels = [step.sigma for step in Schedule.of(TINY, RenderOptions(steps=STEPS)).steps]
-    schedule = Schedule.of(TINY, RenderOptions(steps=STEPS, guidance_interval=(levels[2], levels[1])))
+def test_guidance_applies_within_its_interval_alone_and_elsewhere_the_network_sees_conditional_rows_alone() -> None:
+    synthesizer, seen = tiny_synthesizer(), list[int]()
+    levels = [step.sigma for step in Schedule.of(TINY, RenderOptions(steps=4)).steps]
+    options = RenderOptions(steps=4, guidance_interval=(levels[2], levels[1]))
+    schedule = Schedule.of(TINY, options)
     assert schedule.guided == (False, True, True, False)
-    assert (schedule.branches, schedule.evaluations) == (2, STEPS + 2)
-
-
-def test_outside_the_interval_the_network_sees_the_conditional_rows_alone(
-    synthesizer: Synthesizer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    unet, seen = synthesizer.networks.unet, list[int]()
-    forward = unet.forward
-
-    def counted(rows: Tensor, *inputs: Tensor) -> Tensor:
-        seen.append(len(rows))
-        return forward(rows, *inputs)
-
-    monkeypatch.setattr(unet, "forward", counted)
-    levels = [step.sigma for step in Schedule.of(TINY, RenderOptions(steps=STEPS)).steps]
-    latents(synthesizer, RenderOptions(guidance_interval=(levels[1], levels[0])))
-    assert seen == [2 * TINY.frames, 2 * TINY.frames, TINY.frames, TINY.frames]
+    assert (schedule.branches, schedule.evaluations) == (2, 6)
+    synthesizer.networks.unet.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
+    synthesize(synthesizer, random_clip(), synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0)), options)
+    assert seen == [TINY.frames, 2 * TINY.frames, 2 * TINY.frames, TINY.frames]
 
 
 @pytest.mark.parametrize("interval", [(2.0, 1.0), (-1.0, 1.0), (float("nan"), 1.0)])

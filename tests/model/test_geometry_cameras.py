@@ -40,14 +40,10 @@ def point(x: float, y: float, z: float) -> Tensor:
     return torch.tensor([x, y, z], dtype=torch.float64)
 
 
-def test_inverse_undoes_a_pose_from_both_sides() -> None:
-    poses = random_poses(8, seed=1)
-    assert_close(invert_rigid(poses) @ poses, IDENTITY.expand(8, 4, 4), rtol=0, atol=1e-12)
-    assert_close(poses @ invert_rigid(poses), IDENTITY.expand(8, 4, 4), rtol=0, atol=1e-12)
-
-
-def test_relative_poses_compose() -> None:
+def test_poses_invert_and_compose() -> None:
     a, b, c = random_poses(3, seed=3)
+    for product_ in (invert_rigid(a) @ a, a @ invert_rigid(a)):
+        assert_close(product_, IDENTITY, rtol=0, atol=1e-12)
     assert_close(relative_pose(a, b) @ relative_pose(b, c), relative_pose(a, c), rtol=0, atol=1e-12)
     assert_close(a @ relative_pose(a, b), b, rtol=0, atol=1e-12)
 
@@ -143,12 +139,9 @@ def pixels(camera: Intrinsics) -> Tensor:
     return project_points(POINTS, camera.matrix.expand(len(POINTS), 3, 3))
 
 
-def test_projecting_then_resizing_is_resizing_then_projecting() -> None:
+def test_a_resized_or_cropped_camera_sees_the_resized_or_cropped_picture() -> None:
     scale = torch.tensor([384 / 640, 256 / 480], dtype=torch.float64)
     assert_close(pixels(CAMERA.resized(384, 256)), pixels(CAMERA) * scale)
-
-
-def test_projecting_then_cropping_is_cropping_then_projecting() -> None:
     corner = torch.tensor([30.0, 17.0], dtype=torch.float64)
     assert_close(pixels(CAMERA.cropped(30, 17, 500, 400)), pixels(CAMERA) - corner)
 
@@ -215,10 +208,6 @@ ORBITS = [
 ]
 
 
-def swing_seconds(orbit: Orbit) -> float:
-    return 4 * orbit.amplitude_deg / abs(orbit.rate_deg_s)
-
-
 def ends_together(one: Orbit, other: Orbit) -> bool:
     """The same motion up to rounding: same place, and same way unless both are at a turn."""
     near = math.isclose(one.azimuth_deg, other.azimuth_deg, abs_tol=1e-6)
@@ -227,23 +216,16 @@ def ends_together(one: Orbit, other: Orbit) -> bool:
 
 
 @pytest.mark.parametrize("orbit", ORBITS)
-def test_the_azimuth_never_leaves_the_amplitude(orbit: Orbit) -> None:
+def test_an_orbit_stays_within_its_amplitude_its_times_add_up_and_a_whole_swing_leads_back(orbit: Orbit) -> None:
     steps = [0.0, 0.01, 0.5, 0.583333, 3.0, 100.0, 12345.678]
     visited = list(accumulate(steps * 5, lambda place, step: place.advanced(step), initial=orbit))
     assert all(abs(place.azimuth_deg) <= orbit.amplitude_deg for place in visited)
     assert {place.amplitude_deg for place in visited} == {orbit.amplitude_deg}
-
-
-@pytest.mark.parametrize("orbit", ORBITS)
-@pytest.mark.parametrize(("first_s", "second_s"), [(0.13, 0.4), (2.0, 9.1), (3.3, -1.2)])
-def test_two_steps_are_one_step_of_their_sum(orbit: Orbit, first_s: float, second_s: float) -> None:
-    assert ends_together(orbit.advanced(first_s).advanced(second_s), orbit.advanced(first_s + second_s))
-
-
-@pytest.mark.parametrize("orbit", ORBITS)
-def test_a_whole_swing_leads_back_and_half_a_swing_to_the_mirror_image(orbit: Orbit) -> None:
-    whole, half = orbit.advanced(swing_seconds(orbit)), orbit.advanced(swing_seconds(orbit) / 2)
-    assert ends_together(whole, orbit)
+    for first_s, second_s in [(0.13, 0.4), (2.0, 9.1), (3.3, -1.2)]:
+        assert ends_together(orbit.advanced(first_s).advanced(second_s), orbit.advanced(first_s + second_s))
+    swing_s = 4 * orbit.amplitude_deg / abs(orbit.rate_deg_s)
+    half = orbit.advanced(swing_s / 2)
+    assert ends_together(orbit.advanced(swing_s), orbit)
     assert half.azimuth_deg == pytest.approx(-orbit.azimuth_deg, abs=1e-9)
     assert half.direction == -orbit.direction
 

@@ -38,8 +38,7 @@ from gcd_model.geometry import driving_trajectory
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer, save_live
 from gcd_model.networks import LiveNetworks, random_networks
-from gcd_model.weights.card import packed, unpacked
-from gcd_model.weights.families import LIVE
+from gcd_model.weights.card import LIVE, packed, unpacked
 from gcd_model.weights.load import load_weights
 
 
@@ -65,25 +64,19 @@ def same(a: View, b: View, tolerance: float = 0.0) -> None:
 @pytest.mark.parametrize("known", [True, False])
 def test_features_joined_frame_by_frame_are_those_encoded_at_once(live: LiveSynthesizer, known: bool) -> None:
     clip = room() if known else room(depth=None, odometry=None)
+    tensors = {name: each for name in ("video", "depth", "odometry") if (each := getattr(clip, name)) is not None}
     whole = live.encode(clip)
     parts = [
-        live.encode(
-            replace(
-                clip,
-                video=clip.video[t : t + 1],
-                depth=None if clip.depth is None else clip.depth[t : t + 1],
-                odometry=None if clip.odometry is None else clip.odometry[t : t + 1],
-            )
-        )
-        for t in range(FRAMES)
+        live.encode(replace(clip, **{name: each[t : t + 1] for name, each in tensors.items()})) for t in range(FRAMES)
     ]
     joined = parts[0].followed_by(*parts[1:])
+    assert joined.frames == FRAMES
     for name in ("metres", "stated"):
         assert torch.equal(getattr(whole, name), getattr(joined, name))
-    assert joined.frames == FRAMES
-    options = RenderOptions(seed=3)
-    same(live.render(whole, [path()], options)[0], live.render(joined, [path()], options)[0])
-    same(live.render(whole, [path()])[0], live.render(whole.rows(0, 7).followed_by(whole.rows(7, 14)), [path()])[0])
+    halves = whole.rows(0, 7).followed_by(whole.rows(7, 14))
+    expected, *others = (live.render(each, [path()], RenderOptions(seed=3))[0] for each in (whole, joined, halves))
+    for other in others:
+        same(expected, other)
 
 
 def test_the_lens_is_the_clips_then_the_mounts_then_the_forward_cameras(live: LiveSynthesizer) -> None:
@@ -95,24 +88,6 @@ def test_the_lens_is_the_clips_then_the_mounts_then_the_forward_cameras(live: Li
 
 
 # Bad input at the door.
-
-
-@pytest.mark.parametrize(
-    ("wrong", "error"),
-    [
-        ({"depth": torch.ones(FRAMES, HEIGHT, WIDTH + 1)}, ShapeError),
-        ({"depth": torch.ones(FRAMES, HEIGHT, WIDTH, dtype=torch.float64)}, ShapeError),
-        ({"odometry": torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)}, ShapeError),
-        ({"odometry": 2 * torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)}, PoseError),
-        ({"lens": Intrinsics.from_hfov(70.0, 96, 64)}, ShapeError),
-    ],
-)
-def test_what_does_not_belong_to_the_video_is_refused_in_one_line(
-    wrong: dict[str, object], error: type[Exception]
-) -> None:
-    with pytest.raises(error) as raised:
-        room(**wrong)
-    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), -2.0, float("inf"), 0.0])
@@ -136,20 +111,25 @@ def test_any_size_in_multiples_of_32(live: LiveSynthesizer, size: tuple[int, int
 
 
 @pytest.mark.parametrize(
-    ("clip", "paths", "error"),
+    ("make", "paths", "error"),
     [
-        (Clip(video=torch.zeros(1, 3, 32, 40), fps=10.0), [path()], OptionError),
-        (Clip(video=torch.zeros(1, 3, 16, 64), fps=10.0), [path()], OptionError),
-        (room(3), [path(frames=3)], ShapeError),
-        (room(), [], ShapeError),
+        (lambda: Clip(video=torch.zeros(1, 3, 32, 40), fps=10.0), [path()], OptionError),
+        (lambda: Clip(video=torch.zeros(1, 3, 16, 64), fps=10.0), [path()], OptionError),
+        (lambda: room(3), [path(frames=3)], ShapeError),
+        (lambda: room(), [], ShapeError),
+        (lambda: room(depth=torch.ones(FRAMES, HEIGHT, WIDTH + 1)), [path()], ShapeError),
+        (lambda: room(depth=torch.ones(FRAMES, HEIGHT, WIDTH, dtype=torch.float64)), [path()], ShapeError),
+        (lambda: room(odometry=torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)), [path()], ShapeError),
+        (lambda: room(odometry=2 * torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)), [path()], PoseError),
+        (lambda: room(lens=Intrinsics.from_hfov(70.0, 96, 64)), [path()], ShapeError),
     ],
-    ids=["no multiple", "too low", "short", "no path"],
 )
-def test_other_sizes_lengths_and_no_view_are_refused(
-    live: LiveSynthesizer, clip: Clip, paths: list[Trajectory], error: type[Exception]
+def test_other_sizes_lengths_no_view_and_what_does_not_belong_to_the_video_are_refused_in_one_line(
+    live: LiveSynthesizer, make: Callable[[], Clip], paths: list[Trajectory], error: type[Exception]
 ) -> None:
-    with pytest.raises(error):
-        live.render(live.encode(clip), paths)
+    with pytest.raises(error) as raised:
+        live.render(live.encode(make()), paths)
+    assert "\n" not in str(raised.value)
 
 
 # Rendering.
@@ -157,15 +137,20 @@ def test_other_sizes_lengths_and_no_view_are_refused(
 
 def test_a_view_is_what_its_type_says(live: LiveSynthesizer) -> None:
     view = live.render(live.encode(room()), [path()])[0]
-    assert view.samples.dtype == torch.float32
+    frame, shapes = (
+        (FRAMES, HEIGHT, WIDTH),
+        {"samples": (1, FRAMES, 3, HEIGHT, WIDTH), "classes": (1, FRAMES, HEIGHT, WIDTH)},
+    )
+    for name, dtype in {
+        "samples": torch.float32,
+        "classes": torch.uint8,
+        "visibility": torch.uint8,
+        "inverse_depth": torch.float32,
+        "log_variance": torch.float32,
+    }.items():
+        each = getattr(view, name)
+        assert (each.dtype, tuple(each.shape)) == (dtype, shapes.get(name, frame)), name
     assert 0.0 <= float(view.samples.min()) <= float(view.samples.max()) <= 1.0
-    each = {"classes": view.classes, "visibility": view.visibility}
-    assert {name: value.dtype for name, value in each.items() if value is not None} == dict.fromkeys(each, torch.uint8)
-    assert view.classes is not None
-    assert view.classes.shape == (1, FRAMES, HEIGHT, WIDTH)
-    for map_ in (view.visibility, view.inverse_depth, view.log_variance):
-        assert map_ is not None
-        assert map_.shape == (FRAMES, HEIGHT, WIDTH)
     assert view.visibility is not None
     assert set(view.visibility.unique().tolist()) <= {0, 1, 2}
     assert view.ood is not None
@@ -294,7 +279,7 @@ def test_weights_survive_their_file(tmp_path: Path) -> None:
     assert converted.networks[0].dtypes == ("float32",)
 
 
-def resaved(path: Path, change: Callable[[dict[str, str], dict[str, Tensor]], None]) -> Path:
+def resaved(path: Path, change: Callable[[dict[str, str], dict[str, Tensor]], object]) -> Path:
     save_live(path, LiveNetworks(LIVE_TINY), "mine", overwrite=True)
     tensors = load_file(path)
     with safe_open(path, framework="pt") as file:
@@ -326,39 +311,32 @@ HOSTILE: dict[str, object] = {
 }
 
 
-@pytest.mark.parametrize("hostile", HOSTILE.values(), ids=HOSTILE.keys())
-def test_a_hostile_config_is_refused_in_one_line(tmp_path: Path, hostile: object) -> None:
-    def change(metadata: dict[str, str], tensors: dict[str, Tensor]) -> None:
-        own = json.loads(metadata["gcd.config"])
-        stated = {
-            name: {**own[name], **value} if isinstance(value, dict) and name in own else value
-            for name, value in (hostile.items() if isinstance(hostile, dict) else ())
-        }
-        metadata["gcd.config"] = json.dumps(own | stated if isinstance(hostile, dict) else hostile)
+def stated(hostile: object, metadata: dict[str, str]) -> None:
+    own = json.loads(metadata["gcd.config"])
+    if isinstance(hostile, dict):
+        inner = {n: {**own[n], **each} for n, each in hostile.items() if isinstance(each, dict) and n in own}
+        hostile = own | hostile | inner
+    metadata["gcd.config"] = json.dumps(hostile)
 
+
+CHANGES: dict[str, Callable[[dict[str, str], dict[str, Tensor]], object]] = {
+    **{name: lambda metadata, _, hostile=hostile: stated(hostile, metadata) for name, hostile in HOSTILE.items()},
+    "missing weights": lambda _, tensors: tensors.pop("depth.trunk.stem.weight"),
+    "other weights": lambda _, tensors: tensors.update(extra=torch.zeros(1)),
+    "misshapen weights": lambda _, tensors: tensors.update({"paint.votes.bias": torch.zeros(99)}),
+    "another family": lambda metadata, _: metadata.update({"gcd.family": "driving"}),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_a_hostile_config_and_other_weights_are_refused_in_one_line(
+    tmp_path: Path, change: Callable[[dict[str, str], dict[str, Tensor]], object]
+) -> None:
     file = resaved(tmp_path / "bad.safetensors", change)
     for read in (load_synthesizer, inspect_weights):
         with pytest.raises(CheckpointError) as raised:
             read(file)
         assert "\n" not in str(raised.value)
-
-
-def test_missing_unknown_and_misshapen_weights_are_refused(tmp_path: Path) -> None:
-    def drop(_: dict[str, str], tensors: dict[str, Tensor]) -> None:
-        del tensors["depth.trunk.stem.weight"]
-
-    def add(_: dict[str, str], tensors: dict[str, Tensor]) -> None:
-        tensors["extra"] = torch.zeros(1)
-
-    def bend(_: dict[str, str], tensors: dict[str, Tensor]) -> None:
-        tensors["paint.votes.bias"] = torch.zeros(99)
-
-    def rename(metadata: dict[str, str], _: dict[str, Tensor]) -> None:
-        metadata["gcd.family"] = "driving"
-
-    for change in (drop, add, bend, rename):
-        with pytest.raises(CheckpointError):
-            load_synthesizer(resaved(tmp_path / "bad.safetensors", change), device="cpu")
 
 
 def test_a_live_file_is_no_diffusion_model_and_says_so(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The live view frame by frame: state, reset, lenses, and what may be called seen."""
 
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -197,26 +198,25 @@ def test_what_the_earlier_frame_did_not_see_costs_the_same_at_any_depth() -> Non
     assert bool((made == 1.0).all())
 
 
+def filmed(places: Iterable[float], metres: Tensor) -> References:
+    kept = References()
+    for i, x in enumerate(places):
+        kept.add(torch.full((3, 4, 4), float(i)), aside(x), metres)
+    return kept
+
+
 def test_the_oldest_frame_from_which_the_scene_looks_alike_is_chosen() -> None:
-    kept, metres = References(), torch.full((4, 4), 2.0)
+    metres = torch.full((4, 4), 2.0)
     metres[0] = 1000.0
-    assert kept.chosen(HERE) is None
-    for i in range(10):
-        kept.add(torch.full((3, 4, 4), float(i)), aside(0.2 * i), metres)
-    chosen = kept.chosen(aside(2.0))
+    assert References().chosen(HERE) is None
+    chosen, still = (
+        filmed([0.2 * i for i in range(10)], metres).chosen(aside(2.0)),
+        filmed([0.0] * 10, metres).chosen(HERE),
+    )
     assert chosen is not None
     assert float(chosen.reference_from_camera[0, 3]) == pytest.approx(0.6)  # at most LONGEST of 2 m
     assert LONGEST * 2.0 >= 0.6
-    standing = References()
-    for i in range(10):
-        standing.add(torch.full((3, 4, 4), float(i)), HERE, metres)
-    still = standing.chosen(HERE)
     assert still is not None
     assert float(still.picture[0, 0, 0]) == 4.0  # the oldest of the six that are kept
-
-
-def test_one_depth_everywhere_is_a_median_and_nothing_but_sky_is_none() -> None:
-    for metres, moved, known in ((2.0, 0.5, True), (2.0, 0.7, False), (1000.0, 0.1, False), (0.0, 0.1, False)):
-        kept = References()
-        kept.add(torch.zeros(3, 4, 4), HERE, torch.full((4, 4), metres))
-        assert (kept.chosen(aside(moved)) is not None) == known
+    for depth, moved, known in ((2.0, 0.5, True), (2.0, 0.7, False), (1000.0, 0.1, False), (0.0, 0.1, False)):
+        assert (filmed([0.0], torch.full((4, 4), depth)).chosen(aside(moved)) is not None) == known

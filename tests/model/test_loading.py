@@ -16,8 +16,7 @@ from gcd_model.geometry import SphericalDelta
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.loading import PACKAGED, load_synthesizer
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import inspect_weights, save_weights
 
 
@@ -43,13 +42,12 @@ def test_float32_on_the_cpu_stays_in_the_mapped_file(tmp_path: Path, monkeypatch
     assert {name: tensor.data_ptr() for name, tensor in synthesizer.networks.state_dict().items()} == kept
 
 
-def test_a_precision_is_for_all_but_the_decoder() -> None:
+def test_a_precision_is_for_all_but_the_decoder_and_a_float16_folder_computes_in_float32_on_the_cpu(
+    tmp_path: Path,
+) -> None:
     found = dtypes(load_synthesizer("random:kubric90", device="cpu", dtype="bfloat16"))
     assert found.pop("decoder") == {torch.float32}
     assert set(map(tuple, found.values())) == {(torch.bfloat16,)}
-
-
-def test_a_float16_folder_computes_in_float32_on_the_cpu(tmp_path: Path) -> None:
     synthesizer = load_synthesizer(write_diffusers(tmp_path / "m", half=True), device="cpu", family="driving")
     assert set(map(tuple, dtypes(synthesizer).values())) == {(torch.float32,)}
     assert synthesizer.traits.family == FAMILIES["driving"]
@@ -68,13 +66,13 @@ def test_random_networks_have_their_familys_control(family: str) -> None:
             traits.plan_view(SphericalDelta(azimuth_deg=10.0))
 
 
-def test_random_networks_are_the_same_every_time() -> None:
-    first, second = (load_synthesizer("random:kubric90", device="cpu") for _ in range(2))
-    assert first.traits.sha256_12 == second.traits.sha256_12
+def test_random_networks_are_the_same_every_time_and_of_another_family_others() -> None:
+    first, second, other = (
+        load_synthesizer(f"random:{name}", device="cpu") for name in ("kubric90", "kubric90", "svd")
+    )
+    assert first.traits.sha256_12 == second.traits.sha256_12 != other.traits.sha256_12
     state: dict[str, Tensor] = second.networks.state_dict()
-    for name, tensor in first.networks.state_dict().items():
-        torch.testing.assert_close(tensor, state[name], rtol=0, atol=0)
-    assert first.traits.sha256_12 != load_synthesizer("random:driving", device="cpu").traits.sha256_12
+    assert all(torch.equal(tensor, state[name]) for name, tensor in first.networks.state_dict().items())
 
 
 def test_packaged_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,12 +109,9 @@ WEIGHTS = PACKAGED / "live-small.safetensors"
 MEGABYTES = 16
 
 
-def test_one_model_ships_and_it_is_small() -> None:
+def test_one_model_ships_it_is_small_and_the_card_is_of_these_weights() -> None:
     assert list(PACKAGED.glob("*.safetensors")) == [WEIGHTS]
     assert WEIGHTS.stat().st_size <= MEGABYTES * 1e6
-
-
-def test_the_card_is_of_these_weights() -> None:
     card = WEIGHTS.with_suffix(".md").read_text()
     assert inspect_weights(WEIGHTS).sha256_12 in card
     assert "TODO-FIGURE" not in card

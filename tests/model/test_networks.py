@@ -125,26 +125,19 @@ def theirs(ours: _Vae) -> AutoencoderKLTemporalDecoder:
     return model
 
 
-def test_the_encoder_equals_diffusers(ours: _Vae, theirs: AutoencoderKLTemporalDecoder) -> None:
-    frames = draw(2, 3, 32, 48)
+def test_encoder_and_temporal_decoder_equal_diffusers(ours: _Vae, theirs: AutoencoderKLTemporalDecoder) -> None:
+    frames, latents = draw(2, 3, 32, 48), draw(2 * FRAMES, 4, 4, 6)
     with torch.inference_mode():
-        (expected,) = theirs.encode(frames, return_dict=False)
-        result = ours.encoder(frames)
-    assert result.mean.shape == (2, 4, 4, 6)
-    assert relative_error(result.mean, expected.mean) < 1e-5
-    assert relative_error(result.log_variance, expected.logvar) < 1e-5
+        (posterior,) = theirs.encode(frames, return_dict=False)
+        (pictures,) = theirs.decode(latents, num_frames=FRAMES, return_dict=False)
+        result, decoded = ours.encoder(frames), ours.decoder(latents, FRAMES)
+    assert (result.mean.shape, decoded.shape) == ((2, 4, 4, 6), (6, 3, 32, 48))
+    assert relative_error(result.mean, posterior.mean) < 1e-5
+    assert relative_error(result.log_variance, posterior.logvar) < 1e-5
+    assert relative_error(decoded, pictures) < 1e-5
 
 
-def test_the_temporal_decoder_equals_diffusers(ours: _Vae, theirs: AutoencoderKLTemporalDecoder) -> None:
-    latents = draw(2 * FRAMES, 4, 4, 6)
-    with torch.inference_mode():
-        (expected,) = theirs.decode(latents, num_frames=FRAMES, return_dict=False)
-        result = ours.decoder(latents, FRAMES)
-    assert result.shape == (6, 3, 32, 48)
-    assert relative_error(result, expected) < 1e-5
-
-
-def test_a_fresh_decoder_has_temporal_branches_that_add_nothing_and_even_shares() -> None:
+def test_a_fresh_decoder_has_temporal_branches_that_add_nothing_even_shares_and_the_published_epsilons() -> None:
     decoder = TemporalDecoder(VAE)
     blocks = [module for module in decoder.modules() if isinstance(module, VideoResBlock)]
     assert len(blocks) == 4 * 3 + 2
@@ -152,10 +145,6 @@ def test_a_fresh_decoder_has_temporal_branches_that_add_nothing_and_even_shares(
         assert block.share.mix.item() == 0.0
         x = draw(FRAMES, block.spatial.norm1.num_channels, 2, 2)
         assert torch.equal(block(x, FRAMES), block.spatial(x))
-
-
-def test_norms_of_the_autoencoders_have_the_published_epsilons() -> None:
-    decoder = TemporalDecoder(VAE)
     for name, module in [*decoder.named_modules(), *Encoder(VAE, quant=True).named_modules()]:
         if isinstance(module, nn.GroupNorm):
             assert module.eps == (1e-5 if ".temporal." in name else 1e-6), name
@@ -174,20 +163,15 @@ def test_a_posterior_splits_its_moments_clamps_its_spread_and_samples() -> None:
 PATCHED = VAEConfig(latent_channels=6, width=8, multipliers=(1, 2), blocks_per_level=1, norm_groups=4, patch=2)
 
 
-def test_patches_make_an_autoencoder_coarser_without_another_level() -> None:
-    assert PATCHED.down_factor == 4
+def test_patches_make_an_autoencoder_coarser_and_unrelated_frames_are_decoded_apart() -> None:
     encoder, decoder = Encoder(PATCHED, quant=True), TemporalDecoder(PATCHED)
-    posterior = encoder(draw(FRAMES, 3, 16, 24))
-    assert posterior.mean.shape == (FRAMES, 6, 4, 6)
-    assert decoder(posterior.mean, FRAMES).shape == (FRAMES, 3, 16, 24)
-
-
-def test_unrelated_frames_are_decoded_apart_and_any_number_of_them() -> None:
-    decoder, latents = TemporalDecoder(PATCHED), draw(5, 6, 4, 6)
     randomise(decoder)
-    together = decoder(latents, None)
-    assert_close(together[3:4], decoder(latents[3:4], None))
-    assert relative_error(decoder(latents, 5), together) > 1e-3
+    latents = encoder(draw(5, 3, 16, 24)).mean
+    assert (PATCHED.down_factor, latents.shape) == (4, (5, 6, 4, 6))
+    apart = decoder(latents, None)
+    assert apart.shape == (5, 3, 16, 24)
+    assert_close(apart[3:4], decoder(latents[3:4], None))
+    assert relative_error(decoder(latents, 5), apart) > 1e-3
 
 
 TOWER = ImageEncoderConfig(image_size=28, patch=7, width=32, layers=3, heads=4, hidden_width=64, output_width=24)

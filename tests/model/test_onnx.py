@@ -1,20 +1,24 @@
 """Graphs of one clip each give what the networks give in one batch; and what is refused of exports."""
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import pytest
 import torch
 from msgspec import structs
-from small_models import TINY, as_loaded, random_clip, relative_error, tiny_synthesizer
+from small_models import TINY, TINY_DRIVING, as_loaded, random_clip, relative_error, tiny_driving, tiny_synthesizer
 from torch import Tensor
 
+from gcd_model.clip import View
 from gcd_model.diffusion import RenderOptions, SolverName
+from gcd_model.engines import onnx_export
 from gcd_model.engines.onnx import CPU_PROVIDER, TENSORRT_PROVIDER, OnnxEngine, Sessions, load_export, provider_options
 from gcd_model.engines.onnx_export import (
     FORMAT,
     MANIFEST,
-    FileRecord,
     Manifest,
     export_onnx,
     graphs,
@@ -26,8 +30,7 @@ from gcd_model.geometry import SphericalDelta
 from gcd_model.loading import load_synthesizer
 from gcd_model.networks import empty_networks
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import digest
 
 
@@ -117,17 +120,15 @@ def test_running_out_of_memory_is_told_apart(tmp_path: Path, monkeypatch: pytest
     def full(*_: object) -> None:
         raise RuntimeException("[ONNXRuntimeError] : 6 : Failed to allocate memory for requested buffer of size 9")
 
-    monkeypatch.setattr(sessions._sessions["decoder"], "session", type("Full", (), {"run": full})())
+    full_device = SimpleNamespace(run=full, get_inputs=lambda: ())
+    monkeypatch.setattr(sessions._sessions["decoder"], "session", full_device)
     with pytest.raises(DeviceMemoryError):
-        sessions.run("decoder", torch.zeros(2), torch.zeros(2))
+        sessions.run("decoder")
 
 
-def test_an_absent_provider_is_refused(tmp_path: Path) -> None:
+def test_an_absent_provider_is_refused_the_cpu_comes_last_and_tensorrt_keeps_what_it_built(tmp_path: Path) -> None:
     with pytest.raises(OptionError):
         Sessions(one_graph(tmp_path), [(TENSORRT_PROVIDER, {})])
-
-
-def test_the_cpu_comes_last_and_tensorrt_keeps_what_it_built(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     chosen = provider_options("cuda:1", (TENSORRT_PROVIDER, CPU_PROVIDER), cache, half=True)
     assert [name for name, _ in chosen] == [TENSORRT_PROVIDER, CPU_PROVIDER]
@@ -141,7 +142,7 @@ def test_the_cpu_comes_last_and_tensorrt_keeps_what_it_built(tmp_path: Path) -> 
         provider_options("cpu:1", (), cache, half=False)
 
 
-def manifest(*files: FileRecord, height: int = TINY.height) -> Manifest:
+def manifest(*, height: int = TINY.height, **files: str) -> Manifest:
     card = Card(name="tiny", config=structs.replace(TINY, height=height), family=FAMILIES["kubric90"], move_time=2)
     return Manifest(
         format=FORMAT,
@@ -157,8 +158,8 @@ def manifest(*files: FileRecord, height: int = TINY.height) -> Manifest:
 def an_export(folder: Path, name: str = "decoder.onnx") -> Path:
     """A folder with one file that is a graph by name."""
     (folder / name).write_bytes(b"a graph")
-    record = FileRecord(name=name, size=7, sha256=digest((folder / name,)))
-    (folder / MANIFEST).write_bytes(msgspec.json.encode(manifest(record)))
+    stated = manifest(**{name: digest((folder / name,))})
+    (folder / MANIFEST).write_bytes(msgspec.json.encode(stated))
     return folder
 
 
@@ -190,26 +191,19 @@ def test_a_manifest_that_cannot_be_used_is_refused(tmp_path: Path, text: bytes) 
 
 
 @pytest.mark.parametrize("content", [b"A graph", b"a gra", None])
-def test_whole_folders_are_read_and_damaged_ones_are_not(tmp_path: Path, content: bytes | None) -> None:
+def test_whole_folders_are_read_and_damaged_ones_or_others_files_are_not(tmp_path: Path, content: bytes | None) -> None:
     folder = an_export(tmp_path)
     assert is_export(folder)
-    assert read_manifest(folder).graphs["decoder"][0].size == 7
+    assert list(read_manifest(folder).graphs["decoder"]) == ["decoder.onnx"]
+    with pytest.raises(CheckpointError):
+        load_export(folder)  # it lacks the other graphs of its model
     (folder / "decoder.onnx").unlink()
     if content is not None:
         (folder / "decoder.onnx").write_bytes(content)
-    with pytest.raises(CheckpointError):
-        read_manifest(folder)
-
-
-def test_a_manifest_names_no_file_outside_its_folder(tmp_path: Path) -> None:
-    (tmp_path / "export").mkdir()
-    with pytest.raises(CheckpointError):
-        read_manifest(an_export(tmp_path / "export", "../secret"))
-
-
-def test_an_export_without_all_graphs_of_its_model_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError):
-        load_export(an_export(tmp_path))
+    (tmp_path / "inner").mkdir()
+    for wrong in (folder, an_export(tmp_path / "inner", "../secret")):
+        with pytest.raises(CheckpointError):
+            read_manifest(wrong)
 
 
 @pytest.mark.parametrize(
@@ -226,19 +220,18 @@ def test_onnxruntime_runs_nothing_but_exports(options: dict[str, object]) -> Non
         load_synthesizer("random:kubric90", **options)
 
 
-@pytest.mark.parametrize(("out", "options"), [("mine", {}), ("mine", {"overwrite": True}), ("no/where", {})])
-def test_nothing_is_written_over_that_is_no_export_or_into_nowhere(
-    tmp_path: Path, out: str, options: dict[str, bool]
+@pytest.mark.parametrize(
+    ("out", "options"),
+    [("mine", {}), ("mine", {"overwrite": True}), ("no/where", {}), ("export", {"height": 36})],
+    ids=["there", "no export", "no folder", "no size of the network"],
+)
+def test_nothing_is_written_over_what_is_no_export_into_nowhere_or_of_another_size(
+    tmp_path: Path, out: str, options: dict[str, Any]
 ) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(OptionError):
         export_onnx(as_loaded(tiny_synthesizer()), tmp_path / out, **options)
     assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
-
-
-def test_a_size_the_network_cannot_take_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OptionError):
-        export_onnx(as_loaded(tiny_synthesizer()), tmp_path / "export", height=36)
 
 
 def test_an_export_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,3 +242,70 @@ def test_an_export_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(CheckpointError):
         export_onnx(as_loaded(tiny_synthesizer()), tmp_path / "export")
     assert list(tmp_path.iterdir()) == []
+
+
+# Whole exports, run by onnxruntime, against torch.
+
+
+def whole_export(test: Callable[..., None]) -> Callable[..., None]:
+    """Minutes, as exporting is slow."""
+    pytest.importorskip("onnxscript", reason="needs the extra `onnx`")
+    return pytest.mark.slow(pytest.mark.timeout(3600)(test))
+
+
+def view(synthesizer: Synthesizer) -> View:
+    """Two guided steps and two samples of a random clip."""
+    config, steered = synthesizer.traits.config, synthesizer.traits.config.camera != "none"
+    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=10.0) if steered else None)
+    options = RenderOptions(seed=1, steps=2, guidance=(1.0, 2.0), samples=2)
+    return synthesizer.render(synthesizer.encode(random_clip(config)), [path], options)[0]
+
+
+@whole_export
+@pytest.mark.parametrize("made", [tiny_synthesizer, tiny_driving], ids=["published", "ours"])
+def test_an_export_gives_what_torch_gives(
+    made: Callable[[], Synthesizer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(onnx_export, "APART_ABOVE", 1 << 16)
+    torched = made()
+    stated = export_onnx(as_loaded(torched), tmp_path / "export")
+    assert any(len(files) == 2 for files in stated.graphs.values()), "no weights lie apart: nothing was tried"
+    onnxed = load_synthesizer(tmp_path / "export", engine="onnxruntime")
+    expected, found = view(torched), view(onnxed)
+    assert expected.video.std() > 0.01, "a constant picture would show nothing"
+    assert relative_error(found.latents, expected.latents) < 1e-4
+    assert relative_error(found.video, expected.video) < 1e-4
+    assert onnxed.traits.sha256_12 == stated.sha256_12
+    assert onnxed.traits.family == torched.traits.family
+    assert "/work" not in "".join(path.read_bytes().decode("latin1") for path in (tmp_path / "export").glob("*.onnx"))
+
+
+@whole_export
+def test_half_precision_misses_by_little_and_takes_less_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No graph becomes a single message on the way: one of over 2 GiB cannot."""
+    import onnx.shape_inference
+
+    monkeypatch.setattr(onnx.shape_inference, "infer_shapes", None)
+    torched = tiny_driving()
+    for precision in ("float32", "float16"):
+        export_onnx(as_loaded(torched), tmp_path / precision, precision=precision)  # type: ignore[arg-type]
+    sizes = {
+        name: [(tmp_path / each / f"{name}.onnx").stat().st_size for each in ("float32", "float16")]
+        for name in ("step", "decoder")
+    }
+    assert sizes["step"][1] < 0.75 * sizes["step"][0]
+    assert sizes["decoder"][0] == sizes["decoder"][1], "what is looked at stays as it is"
+    found, expected = view(load_synthesizer(tmp_path / "float16")), view(torched)
+    assert 0 < relative_error(found.video, expected.video) < 0.02
+
+
+@whole_export
+def test_another_size_is_another_export(tmp_path: Path) -> None:
+    torched = tiny_driving()
+    config = structs.replace(torched.traits.config, height=64)
+    export_onnx(as_loaded(torched), tmp_path / "export", height=64)
+    larger = load_synthesizer(tmp_path / "export")
+    assert larger.traits.config == config
+    assert larger.encode(random_clip(config)).latents.shape[-2:] == (16, 12)
+    with pytest.raises(OptionError):
+        larger.encode(random_clip(TINY_DRIVING))

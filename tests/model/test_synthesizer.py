@@ -1,18 +1,27 @@
-"""The door: what `encode` and `render` promise, on the smallest network that has every part, and on its variants."""
+"""The door: what `encode` and `render` promise, on the smallest networks with every part and on their variants."""
 
 import math
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
 import pytest
 import torch
-from small_models import TINY, draw, random_clip, relative_error, synthesize, tiny_synthesizer
+from small_models import (
+    TINY,
+    TINY_CLASSES,
+    TINY_DRIVING,
+    draw,
+    random_clip,
+    relative_error,
+    synthesize,
+    tiny_driving,
+    tiny_synthesizer,
+)
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from gcd_model.clip import Augmentation, Clip
+from gcd_model.clip import Augmentation, Clip, View, nearest_classes, palette
 from gcd_model.conditioning import (
     CameraEmbedder,
     SourceFeatures,
@@ -20,10 +29,11 @@ from gcd_model.conditioning import (
     spherical_features,
     with_unconditional,
 )
-from gcd_model.config import ModelConfig, SamplingConfig
+from gcd_model.config import DRIVING_CLASSES, ModelConfig, SamplingConfig, SemanticClass
 from gcd_model.diffusion import RenderOptions, unit_noise
-from gcd_model.errors import Cancelled, ModelError, NonFiniteError, OptionError, ShapeError
-from gcd_model.geometry import SphericalDelta, Trajectory, pose_trajectory
+from gcd_model.errors import ModelError, NonFiniteError, OptionError, ShapeError
+from gcd_model.geometry import CameraMount, SphericalDelta, Trajectory, pose_trajectory
+from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 
 LATENTS = (TINY.frames, 4, TINY.height // 4, TINY.width // 4)
@@ -99,34 +109,14 @@ def test_injected_noise_reproduces_the_draws_it_stands_for(synthesizer: Synthesi
     assert torch.equal(by_seed.samples, by_noise.samples)
 
 
-def test_the_number_of_steps_is_the_checkpoints_unless_asked_and_progress_counts_them(synthesizer: Synthesizer) -> None:
+@pytest.mark.parametrize(("options", "evaluations"), [({}, 3), ({"steps": 1}, 1), ({"steps": 2, "solver": "heun"}, 3)])
+def test_the_number_of_steps_is_the_checkpoints_unless_asked_and_progress_counts_evaluations(
+    synthesizer: Synthesizer, options: dict[str, object], evaluations: int
+) -> None:
     features, seen = synthesizer.encode(random_clip()), list[tuple[int, int]]()
-
-    def note(done: int, total: int) -> None:
-        seen.append((done, total))
-
-    synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-    seen.clear()
-    synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, steps=1))
-    assert seen == [(1, 1)]
-    seen.clear()
-    synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, steps=2, solver="heun"))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-
-
-def test_cancelling_between_two_steps_raises_and_leaves_the_synthesizer_usable(synthesizer: Synthesizer) -> None:
-    features, stop = synthesizer.encode(random_clip()), threading.Event()
-
-    def note(done: int, _total: int) -> None:
-        if done == 2:
-            stop.set()
-
-    with pytest.raises(Cancelled):
-        synthesizer.render(features, [path(synthesizer)], RenderOptions(progress=note, cancel=stop))
-    stop.clear()
-    (view,) = synthesizer.render(features, [path(synthesizer)], RenderOptions(cancel=stop))
-    assert view.samples.isfinite().all()
+    note = RenderOptions(progress=lambda done, total: seen.append((done, total)), **options)  # type: ignore[arg-type]
+    synthesizer.render(features, [path(synthesizer)], note)
+    assert seen == [(done, evaluations) for done in range(1, evaluations + 1)]
 
 
 def test_features_of_parts_joined_equal_features_of_the_whole_clip(synthesizer: Synthesizer) -> None:
@@ -190,15 +180,6 @@ def test_guidance_of_one_throughout_runs_the_conditional_branch_alone_and_gives_
     assert relative_error(alone.latents, both.latents) < 1e-5
 
 
-@pytest.mark.parametrize("shape", [(3, 4, 8, 8), (2, *LATENTS)])
-def test_noise_of_another_shape_is_refused(synthesizer: Synthesizer, shape: tuple[int, ...]) -> None:
-    features = synthesizer.encode(random_clip())
-    with pytest.raises(OptionError):
-        synthesizer.render(features, [path(synthesizer)], RenderOptions(initial_noise=draw(*shape)))
-    with pytest.raises(ShapeError):
-        synthesizer.encode(random_clip(), Augmentation(noise=draw(*shape)))
-
-
 @pytest.mark.parametrize(
     ("video", "fps", "error"),
     [
@@ -220,23 +201,42 @@ def test_a_clip_that_is_none_or_of_a_size_the_network_cannot_take_is_refused(
         synthesizer.encode(Clip(video=video, fps=fps))
 
 
-@pytest.mark.parametrize("frames", [2, 4])
-def test_clip_and_trajectory_must_have_the_trained_length(synthesizer: Synthesizer, frames: int) -> None:
-    features = synthesizer.encode(random_clip())
-    with pytest.raises(ShapeError):
-        synthesizer.render(synthesizer.encode(random_clip(frames=frames)), [path(synthesizer)])
-    still = pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1))
-    with pytest.raises(ShapeError):
-        synthesizer.render(features, [still])
+def still(frames: int) -> Trajectory:
+    return pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1))
 
 
-def test_at_least_one_trajectory_sample_and_step_are_wanted(synthesizer: Synthesizer) -> None:
-    with pytest.raises(ShapeError):
-        synthesizer.render(synthesizer.encode(random_clip()), [])
-    with pytest.raises(OptionError):
-        RenderOptions(samples=0)
-    with pytest.raises(OptionError):
-        RenderOptions(steps=0)
+FEATURES = SourceFeatures(tokens=None, latents=torch.zeros(2, 4, 1, 1), fps=12.0, augmentation=0.02)
+
+
+def render(synthesizer: Synthesizer, *paths: Trajectory, frames: int | None = None, **options: object) -> list[View]:
+    features = synthesizer.encode(random_clip(frames=frames))
+    return synthesizer.render(features, paths, RenderOptions(**options))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        *(
+            (lambda synthesizer, shape=shape: render(synthesizer, still(3), initial_noise=draw(*shape)), OptionError)
+            for shape in [(3, 4, 8, 8), (2, *LATENTS)]
+        ),
+        (lambda synthesizer: synthesizer.encode(random_clip(), Augmentation(noise=draw(3, 4, 8, 8))), ShapeError),
+        *((lambda synthesizer, n=n: render(synthesizer, path(synthesizer), frames=n), ShapeError) for n in (2, 4)),
+        *((lambda synthesizer, n=n: render(synthesizer, still(n)), ShapeError) for n in (2, 4)),
+        (lambda synthesizer: render(synthesizer), ShapeError),
+        (lambda _: RenderOptions(samples=0), OptionError),
+        (lambda _: RenderOptions(steps=0), OptionError),
+        (lambda _: FEATURES.followed_by(replace(FEATURES, tokens=torch.zeros(2, 5))), ShapeError),
+        (lambda _: FEATURES.followed_by(replace(FEATURES, fps=6.0)), ShapeError),
+        (lambda _: CameraEmbedder("spherical", 5)(still(3)), ShapeError),  # it is steered by angles
+        (lambda synthesizer: synthesizer.traits.plan_view(mount=CameraMount()), OptionError),  # nor by a vehicle
+    ],
+)
+def test_other_lengths_noises_numbers_and_features_are_refused(
+    synthesizer: Synthesizer, wrong: Callable[[Synthesizer], object], error: type[ModelError]
+) -> None:
+    with pytest.raises(error):
+        wrong(synthesizer)
 
 
 def _unet_end(synthesizer: Synthesizer) -> nn.Conv2d:
@@ -266,24 +266,9 @@ def test_without_a_family_the_motion_number_must_be_given() -> None:
     assert view.motion_bucket == 127.0
 
 
-def test_features_of_another_kind_are_not_joined() -> None:
-    latents = torch.zeros(2, 4, 1, 1)
-    plain = SourceFeatures(tokens=None, latents=latents, fps=12.0, augmentation=0.02)
-    for other in (replace(plain, tokens=torch.zeros(2, 5)), replace(plain, fps=6.0)):
-        with pytest.raises(ShapeError):
-            plain.followed_by(other)
-
-
 def with_unet(**changes: object) -> ModelConfig:
     """TINY with other fields in its U-Net."""
     return msgspec.structs.replace(TINY, unet=msgspec.structs.replace(TINY.unet, **changes))
-
-
-def test_a_model_without_image_tower_has_no_tokens_and_still_renders() -> None:
-    unet = msgspec.structs.replace(TINY.unet, context_width=None)
-    synthesizer = tiny_synthesizer(msgspec.structs.replace(TINY, unet=unet, image_encoder=None))
-    assert synthesizer.encode(random_clip()).tokens is None
-    assert synthesize(synthesizer, random_clip(), path(synthesizer)).samples.isfinite().all()
 
 
 @pytest.mark.parametrize("control", ["relative_pose", "none"])
@@ -312,24 +297,29 @@ def test_networks_in_bfloat16_give_float32_views_near_those_of_float32(synthesiz
     assert 0 < relative_error(rounded.latents, exact.latents) < 0.05
 
 
-def test_a_render_at_another_number_of_frames_levels_and_latent_channels_has_the_shapes_the_config_says() -> None:
+def test_other_frames_levels_and_channels_and_no_image_tower_give_the_shapes_the_config_says() -> None:
     config = ModelConfig(
         frames=5,
         height=16,
         width=32,
         unet=msgspec.structs.replace(
-            TINY.unet, latent_channels=8, condition_channels=8, multipliers=(1, 1, 2), attention=(True, False, True)
+            TINY.unet,
+            latent_channels=8,
+            condition_channels=8,
+            multipliers=(1, 1, 2),
+            attention=(True, False, True),
+            context_width=None,
         ),
         vae=msgspec.structs.replace(TINY.vae, latent_channels=8, multipliers=(1, 2)),
-        image_encoder=TINY.image_encoder,
+        image_encoder=None,
         sampling=SamplingConfig(steps=2),
     )
     assert (config.vae.down_factor, config.unet.size_factor, config.size_factor) == (2, 4, 8)
     synthesizer = tiny_synthesizer(config)
     features = synthesizer.encode(random_clip(config))
+    assert features.tokens is None
     (view,) = synthesizer.render(features, [path(synthesizer)])
-    assert view.video.shape == (5, 3, 16, 32)
-    assert view.latents.shape == (1, 5, 8, 8, 16)
+    assert (view.video.shape, view.latents.shape) == ((5, 3, 16, 32), (1, 5, 8, 8, 16))
 
 
 @pytest.mark.parametrize(
@@ -370,12 +360,6 @@ def test_relative_poses_become_their_top_three_rows_row_by_row() -> None:
     assert relative_pose_features(poses).dtype == torch.float32
 
 
-def test_a_free_path_is_refused_by_spherical_control_with_the_way_out() -> None:
-    free = pose_trajectory(torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
-    with pytest.raises(ShapeError):
-        CameraEmbedder("spherical", 5)(free)
-
-
 @pytest.mark.parametrize("views", [1, 3])
 @pytest.mark.parametrize("rows", [draw(3, 5), draw(3, 4, 2, 3)], ids=["tokens", "latents"])
 def test_the_unconditional_branch_comes_first_and_sees_zeros_in_both_image_streams(rows: Tensor, views: int) -> None:
@@ -385,8 +369,10 @@ def test_the_unconditional_branch_comes_first_and_sees_zeros_in_both_image_strea
     assert torch.equal(with_unconditional(rows, views, False), both[1].flatten(0, 1))
 
 
-def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_and_not_scaled() -> None:
-    synthesizer, clip = tiny_synthesizer(), random_clip()
+def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_not_scaled_and_the_tower_sees_them_clean(
+    synthesizer: Synthesizer,
+) -> None:
+    clip = random_clip()
     noise = draw(*clip.video.shape, seed=7)
     features = synthesizer.encode(clip, Augmentation(strength=0.3, noise=noise))
     with torch.inference_mode():
@@ -394,13 +380,106 @@ def test_condition_latents_are_the_posterior_mean_of_the_noised_frames_and_not_s
     assert TINY.vae.scale == 0.18215
     assert_close(features.latents, posterior.mean)
     assert features.augmentation == 0.3
-
-
-def test_the_image_tower_sees_the_frames_clean() -> None:
-    synthesizer, clip = tiny_synthesizer(), random_clip()
     clean = synthesizer.encode(clip, Augmentation(strength=0.0))
-    noisy = synthesizer.encode(clip, Augmentation(strength=0.5))
     assert clean.tokens is not None
-    assert noisy.tokens is not None
-    assert torch.equal(clean.tokens, noisy.tokens)
-    assert not torch.allclose(clean.latents, noisy.latents)
+    assert features.tokens is not None
+    assert torch.equal(clean.tokens, features.tokens)
+    assert not torch.allclose(clean.latents, features.latents)
+
+
+# A small driving model with every switch that is ours: x0, shared noise, patches; and it paints its classes.
+
+FRAMES, HEIGHT, WIDTH = TINY_DRIVING.frames, TINY_DRIVING.height, TINY_DRIVING.width
+
+
+@pytest.fixture(scope="module")
+def driving() -> Synthesizer:
+    return tiny_driving()
+
+
+def rendered(synthesizer: Synthesizer, options: RenderOptions | None = None) -> View:
+    features = synthesizer.encode(random_clip(TINY_DRIVING))
+    return synthesizer.render(features, [synthesizer.traits.plan_view()], options)[0]
+
+
+def test_a_painted_view_comes_with_the_classes_of_its_colours(driving: Synthesizer) -> None:
+    view = rendered(driving, options=RenderOptions(samples=2))
+    assert driving.traits.classes == TINY_CLASSES
+    assert view.classes is not None
+    assert view.classes.shape == (2, FRAMES, HEIGHT, WIDTH)
+    away = (view.samples.unsqueeze(3) - palette(TINY_CLASSES).T[:, :, None, None] / 255).square().sum(dim=2)
+    assert torch.equal(view.classes.long(), away.argmin(dim=2))
+
+
+def test_every_frame_starts_from_the_same_noise_and_one_step_gives_what_the_network_says() -> None:
+    driving = tiny_driving()
+    calls, said = _Calls(driving), list[Tensor]()
+    driving.networks.unet.conv_out.register_forward_hook(lambda *given: said.append(given[2]))
+    view = rendered(driving, options=RenderOptions(samples=2))
+    first, second = calls.inputs[0][0].unflatten(0, (2, FRAMES))
+    for each in (first, second):
+        assert_close(each, each[:1].expand_as(each))
+    assert not torch.allclose(first, second)
+    assert_close(view.latents.flatten(0, 1), said[0])
+
+
+def test_the_checkpoint_names_its_augmentation(driving: Synthesizer) -> None:
+    clip = random_clip(TINY_DRIVING)
+    assert [driving.encode(clip, each).augmentation for each in (None, Augmentation(seed=3))] == [0.0, 0.0]
+    assert driving.encode(clip, Augmentation(strength=0.1)).augmentation == 0.1
+    assert tiny_synthesizer().encode(random_clip()).augmentation == 0.02
+
+
+def test_an_ontology_that_cannot_be_told_apart_is_refused() -> None:
+    content = msgspec.to_builtins(TINY_DRIVING)
+    for classes, words in (([0, 0], "a colour of its own"), ([0], "2 to 256 classes, got 1")):
+        content["semantic_classes"] = [msgspec.to_builtins(TINY_CLASSES[i]) for i in classes]
+        with pytest.raises(msgspec.ValidationError, match=words):
+            msgspec.convert(content, ModelConfig)
+    with pytest.raises(OptionError):
+        SemanticClass(name="car", colour=(0, 300, 0))
+
+
+@pytest.mark.parametrize("classes", [TINY_CLASSES, DRIVING_CLASSES])
+def test_a_painted_map_is_read_back_even_a_little_off_colour(classes: tuple[SemanticClass, ...]) -> None:
+    generator = torch.Generator().manual_seed(3)
+    truth = torch.randint(len(classes), (2, 7, 9), generator=generator)
+    painted = palette(classes)[truth].permute(0, 3, 1, 2) / 255
+    noisy = (painted + 0.03 * (torch.rand(painted.shape, generator=generator) - 0.5)).clamp(0, 1)
+    for pixels in (painted, noisy):
+        found = nearest_classes(pixels, classes)
+        assert found.dtype == torch.uint8
+        assert torch.equal(found.long(), truth)
+
+
+def unet_rows(networks: Networks, rows: int, *, image_mode: bool, order: Tensor | None = None) -> Tensor:
+    config, order = networks.config.unet, torch.arange(rows) if order is None else order
+    latents, condition = draw(rows, 4, 8, 12, seed=1), draw(rows, config.condition_channels, 8, 12, seed=2)
+    plan = networks.unet.plan(torch.tensor([0.7]), draw(rows, config.vector_width, seed=3)[order], None, None)
+    return networks.unet(latents[order], condition[order], *plan.step(0), image_mode=image_mode)
+
+
+def test_in_image_mode_rows_are_unrelated_frames_in_any_order_and_number() -> None:
+    networks = tiny_driving().networks
+    order = torch.tensor([3, 0, 4, 1, 2])
+    plain = unet_rows(networks, 5, image_mode=True)
+    assert_close(unet_rows(networks, 5, image_mode=True, order=order), plain[order])
+    clip, frames = unet_rows(networks, 3, image_mode=False), unet_rows(networks, 3, image_mode=True)
+    assert relative_error(clip, frames) > 1e-3
+
+
+def test_what_single_frames_taught_a_fresh_network_holds_for_clips_at_first() -> None:
+    networks = Networks(TINY_DRIVING)
+    learnt = [
+        parameter
+        for name, parameter in networks.named_parameters()
+        if not any(part in name for part in (".temporal.", ".positions.", ".share.", "mix_frames"))
+    ]
+    with torch.no_grad():
+        for i, parameter in enumerate(learnt):
+            parameter.copy_(draw(*parameter.shape, seed=i) * 0.2)
+    clip, frames = unet_rows(networks, 3, image_mode=False), unet_rows(networks, 3, image_mode=True)
+    assert frames.abs().max() > 0.1
+    assert_close(clip, frames, rtol=1e-4, atol=1e-5)
+    latents = draw(FRAMES, 4, HEIGHT // 4, WIDTH // 4)
+    assert_close(networks.decoder(latents, FRAMES), networks.decoder(latents, None), rtol=1e-4, atol=1e-5)

@@ -1,6 +1,6 @@
 """The U-Net against its plain twin and against diffusers; what it costs at full size, and what is computed once."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -123,7 +123,7 @@ def test_gradients_through_derived_values_equal_the_published_ones() -> None:
     assert all(theirs[name].abs().max() < 1e-9 for name in dormant)  # the published network does not use them either
 
 
-def test_a_fresh_u_net_starts_as_published_with_zero_output_and_even_shares() -> None:
+def test_a_fresh_u_net_starts_as_published_with_zero_output_even_shares_and_the_published_epsilons() -> None:
     unet = VideoUNet(UNET, FRAMES)
     assert not batch().ours(unet).any()
     zero = {name.rsplit(".", 1)[0] for name, p in unet.named_parameters() if p.ndim > 1 and not p.any()}
@@ -134,15 +134,9 @@ def test_a_fresh_u_net_starts_as_published_with_zero_output_and_even_shares() ->
     expected |= {f"{name}.proj_out" for name, m in unet.named_modules() if isinstance(m, VideoTransformer)}
     assert zero == expected
     assert {p.item() for name, p in unet.named_parameters() if name.endswith("share.mix")} == {0.5}
-
-
-def test_norms_have_the_published_epsilons() -> None:
-    unet = VideoUNet(UNET, FRAMES)
     for name, module in unet.named_modules():
-        if isinstance(module, nn.GroupNorm):
+        if isinstance(module, nn.GroupNorm | nn.LayerNorm):
             assert module.eps == (1e-6 if name.endswith("attention.norm") else 1e-5), name
-        if isinstance(module, nn.LayerNorm):
-            assert module.eps == 1e-5, name
 
 
 def small_diffusers_unet() -> UNetSpatioTemporalConditionModel:
@@ -252,51 +246,29 @@ def test_parameter_counts_at_full_size_are_the_published_ones(full_size: Network
     assert _count(full_size.decoder) == 63_579_183
 
 
-class _Counter:
-    """How often each module of a kind ran."""
-
-    def __init__(self, modules: Mapping[str, nn.Module]) -> None:
-        self.calls = dict.fromkeys(modules, 0)
-        for name, module in modules.items():
-            module.register_forward_hook(self._hook(name))
-
-    def _hook(self, name: str) -> Callable[[nn.Module, object, object], None]:
-        def count(_module: nn.Module, _given: object, _result: object) -> None:
-            self.calls[name] += 1
-
-        return count
+def _counted(modules: Mapping[str, nn.Module]) -> dict[str, int]:
+    """How often each module runs from now on."""
+    calls = dict.fromkeys(modules, 0)
+    for name, module in modules.items():
+        module.register_forward_hook(lambda *_, name=name: calls.update({name: calls[name] + 1}))
+    return calls
 
 
-def _once_a_window(unet: VideoUNet) -> dict[str, nn.Module]:
-    """Embeddings, their projections and cross-attention: they depend on the window and the schedule alone."""
+def test_embeddings_and_cross_attention_run_once_a_window_however_many_steps_and_the_source_is_encoded_once() -> None:
+    """Once for all views, samples and both guidance branches; two frames a call."""
+    synthesizer = tiny_synthesizer()
+    networks, unet = synthesizer.networks, synthesizer.networks.unet
     endings = ("embed_noise", "embed_vector", "embed_camera", ".embed", ".token.value", ".token.out")
-    return {name: module for name, module in unet.named_modules() if name.endswith(endings)}
-
-
-def test_embeddings_and_cross_attention_run_once_a_window_however_many_steps_it_takes() -> None:
-    synthesizer = tiny_synthesizer()
-    features = synthesizer.encode(random_clip())
-    path = synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=30.0))
-    once, stem = _once_a_window(synthesizer.networks.unet), {"stem": synthesizer.networks.unet.stem}
-    planned, looped = _Counter(once), _Counter(stem)
-    assert len(once) > 10
-    synthesizer.render(features, [path], RenderOptions(steps=5))
-    assert looped.calls == {"stem": 5}
-    assert set(planned.calls.values()) == {1}
-
-
-def test_the_source_is_encoded_once_for_all_views_samples_and_both_guidance_branches() -> None:
-    synthesizer = tiny_synthesizer()
-    networks = synthesizer.networks
+    once = _counted({name: module for name, module in unet.named_modules() if name.endswith(endings)})
     assert networks.image_encoder is not None
-    counter = _Counter({"tower": networks.image_encoder, "encoder": networks.condition_encoder})
-    features = synthesizer.encode(random_clip(frames=2))
-    assert counter.calls == {"tower": 1, "encoder": 1}  # two frames a call
-    features = features.followed_by(synthesizer.encode(random_clip(frames=1)))
-    counter.calls = dict.fromkeys(counter.calls, 0)
+    parts = {"tower": networks.image_encoder, "encoder": networks.condition_encoder, "stem": unet.stem}
+    calls = _counted(parts)
+    features = synthesizer.encode(random_clip(frames=2)).followed_by(synthesizer.encode(random_clip(frames=1)))
     paths = [synthesizer.traits.plan_view(SphericalDelta(azimuth_deg=azimuth)) for azimuth in (10.0, 20.0)]
-    synthesizer.render(features, paths, RenderOptions(samples=2))
-    assert counter.calls == {"tower": 0, "encoder": 0}
+    synthesizer.render(features, paths, RenderOptions(samples=2, steps=5))
+    assert calls == {"tower": 2, "encoder": 2, "stem": 5}
+    assert len(once) > 10
+    assert set(once.values()) == {1}
 
 
 def test_what_the_weights_determine_is_not_derived_again_in_a_prepared_network(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from published import HEADS, SMALL_GCD, fixed_view, manifest, shared_vae
 from gcd_model.config import SVD_14, ModelConfig, UNetConfig
 from gcd_model.errors import CheckpointError
 from gcd_model.networks import empty_networks
-from gcd_model.weights.families import Hints
+from gcd_model.weights.card import Hints
 from gcd_model.weights.infer import Shapes, infer_config, match_weights
 from gcd_model.weights.names import Levels, Naming, assembled, published_names, published_shape, taken_apart
 

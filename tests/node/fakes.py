@@ -29,8 +29,7 @@ from gcd_model import (
 )
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL
 from gcd_model.networks import random_networks
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import save_weights
 from gcd_node.auth import Client, Role, ServerSecurity, new_key_pair
 from gcd_node.config import NodeConfig, parse_config

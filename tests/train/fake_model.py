@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures, Traits, Trajectory, View
 from gcd_model.config import ModelConfig
-from gcd_model.weights.families import FAMILIES, FamilyName
+from gcd_model.weights.card import FAMILIES, FamilyName
 
 Shows = Callable[[SourceFeatures, RenderOptions], Tensor]
 

@@ -16,7 +16,7 @@ from gcd_model.config import ModelConfig
 from gcd_model.geometry import CameraMount, driving_trajectory
 from gcd_model.loading import random_weights
 from gcd_model.networks import random_networks
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.batches import CachedBatches
 from gcd_train.data.open import RunData, open_data, sampling_of
 from gcd_train.data.pairs import PairedClips

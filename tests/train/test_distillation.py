@@ -13,8 +13,7 @@ from gcd_model import Clip, RenderOptions, load_synthesizer
 from gcd_model.config import SVD_14
 from gcd_model.networks import Networks, random_networks
 from gcd_model.synthesizer import Synthesizer
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import load_weights, read_adapter, save_weights
 from gcd_train.data.batches import SampleBatches
 from gcd_train.data.sample import to_network

@@ -11,7 +11,7 @@ from fake_model import FakeModel
 from gcd_model import Trajectory
 from gcd_model.config import DRIVING_CLASSES, SMALL, ModelConfig, SemanticClass
 from gcd_model.geometry import CameraMount, Spherical, SphericalDelta, driving_trajectory, spherical_trajectory
-from gcd_model.weights.families import FAMILIES, Family
+from gcd_model.weights.card import FAMILIES, Family
 from gcd_train.errors import DataError
 from gcd_train.evaluation.baselines import CopySource
 from gcd_train.evaluation.clips import PairedSet

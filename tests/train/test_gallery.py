@@ -25,7 +25,7 @@ from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics
 from gcd_model.traits import ASSUMED_SOURCE
-from gcd_model.weights.families import FAMILIES, FamilyName
+from gcd_model.weights.card import FAMILIES, FamilyName
 from gcd_train.cli.look import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import (

@@ -59,7 +59,7 @@ def colours(views: list[SceneView]) -> Tensor:
 def source_clip() -> SourceClip:
     """The box from a camera that stands; the view that is wanted stands too."""
     pose = relative_pose(pose_of(SOURCE), pose_of(HELD_OUT)).expand(FRAMES, 4, 4)
-    path = Trajectory(source_from_target=pose, delta=None, at_goal=(True,) * FRAMES, source=None)
+    path = Trajectory(source_from_target=pose)
     seen = video(SOURCE)
     return SourceClip(
         source=np.stack([each.rgb for each in seen]),

@@ -15,7 +15,7 @@ from tiny_world import tiny_recipe
 from typer.testing import CliRunner
 
 from gcd_model.config import ModelConfig
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.cli.main import app
 from gcd_train.data.files import FileFault
 from gcd_train.data.lerobot import CAMERA_FILE, CameraCalibration, LeRobotPairs

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from gcd_model.networks import Networks, random_networks
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.batches import SampleBatches
 from gcd_train.data.sample import to_network
 from gcd_train.recipe import LossRecipe, NoiseRecipe, UNetRecipe

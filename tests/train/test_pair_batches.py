@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
 from gcd_model.config import SMALL, ModelConfig
 from gcd_model.networks import Networks, random_networks
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.batches import SampleBatches, SampleLoader, SampleOrder
 from gcd_train.data.files import Skips
 from gcd_train.data.sample import Sample

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from gcd_model.config import SVD_14
 from gcd_model.geometry import Spherical
-from gcd_model.weights.families import FamilyName
+from gcd_model.weights.card import FamilyName
 from gcd_train.cli.main import app
 from gcd_train.data.files import MANIFEST, SceneManifest
 from gcd_train.data.paths import FrameSampling, OrbitSampling

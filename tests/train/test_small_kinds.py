@@ -17,7 +17,7 @@ from gcd_model.conditioning import micro_conditioning, spherical_features
 from gcd_model.config import DRIVING_CLASSES
 from gcd_model.geometry import SphericalDelta
 from gcd_model.networks import random_networks
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.cache import EncodedRows
 from gcd_train.data.latents import Encodings, LatentClips
 from gcd_train.data.open import open_data

@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.networks import Networks, empty_networks, random_networks
 from gcd_model.weights.adapter import adapted, base_digest
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
 from gcd_model.weights.save import gcd_state, write_published
 from gcd_train.cli.main import app
@@ -346,7 +345,7 @@ def test_a_run_leaves_the_adapter_apart_and_merged_weights(tmp_path: Path) -> No
     trainer(out, adapted_recipe(base), TinyClips(1)).run()
     state = saved(out / "unet", "unet").module
     assert all(name.endswith((".down", ".up")) for name in state)
-    joined = load_adapted(load_weights(base, ask_family=False), read_adapter(out / "mine-adapter.safetensors"))
+    joined = load_adapted(load_weights(base), read_adapter(out / "mine-adapter.safetensors"))
     merged = load_weights(out / "mine.safetensors")
     for name, value in merged.networks.state_dict().items():
         assert torch.equal(value, joined.networks.state_dict()[name]), name

@@ -13,7 +13,7 @@ import pytest
 from tiny_world import tiny_recipe
 
 from gcd_model.config import ModelConfig
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES
 from gcd_train.data.files import FileFault
 from gcd_train.data.open import RunData, open_data
 from gcd_train.data.videos import CAMERA_FILE, FilmedPairs, filmed_scenes

@@ -22,8 +22,7 @@ from gcd_model.geometry import (
     spherical_trajectory,
 )
 from gcd_model.networks import random_networks
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import FAMILIES
+from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import save_weights
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips, Sample, to_network

@@ -49,7 +49,7 @@ def load_export(folder: str | Path, *, device: str = "auto", providers: Sequence
     if manifest.graphs.keys() != wanted:
         raise CheckpointError(f"{folder}: its {MANIFEST} must name {', '.join(sorted(wanted))}; export it again")
     chosen = provider_options(device, providers, folder / "tensorrt", half=manifest.precision == "float16")
-    files = {name: folder / record[0].name for name, record in manifest.graphs.items()}
+    files = {name: folder / next(iter(parts)) for name, parts in manifest.graphs.items()}
     traits = Traits.of(card, sha256_12=manifest.sha256_12, precision=manifest.precision, device="cpu")
     networks = empty_networks(card.diffusion)
     return Synthesizer(networks, traits, OnnxEngine(Sessions(files, chosen), networks))
@@ -129,11 +129,11 @@ class _Session(nn.Module):
     def __init__(self, session: Any) -> None:
         super().__init__()
         self.session = session
-        self.names = [each.name for each in session.get_inputs()]
 
     def forward(self, inputs: Sequence[Tensor]) -> Tensor:
-        arrays = {name: each.detach().cpu().contiguous().numpy() for name, each in zip(self.names, inputs, strict=True)}
-        return torch.from_numpy(self.session.run(None, arrays)[0])
+        arrays = (each.detach().cpu().contiguous().numpy() for each in inputs)
+        feed = {given.name: array for given, array in zip(self.session.get_inputs(), arrays, strict=True)}
+        return torch.from_numpy(self.session.run(None, feed)[0])
 
 
 class Sessions:

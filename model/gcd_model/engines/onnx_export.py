@@ -34,7 +34,7 @@ from gcd_model.weights.save import whole
 
 MANIFEST = "manifest.json"
 """The file that makes a folder an export."""
-FORMAT = "gcd-onnx-3"
+FORMAT = "gcd-onnx-4"
 OPSET = 20
 """Of the ONNX operators: what TensorRT 10 and onnxruntime 1.20 know."""
 APART_ABOVE = 1 << 30  # bytes of weights beside a graph instead of in it; one file of ONNX holds 2 GiB at most
@@ -104,22 +104,16 @@ def graphs(networks: Networks) -> Iterator[Graph]:
         attending = [stage.attention is not None for stage in unet.all_stages()]
         inputs["crosses"] = torch.zeros(frames, sum(compress(widths, attending)))
     yield Graph("step", unet, inputs, "prediction")
-    yield Graph("decoder", _Function(networks.decoder, _pictures), {"latents": latents}, "pictures")
-
-
-class FileRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One file of the folder. sha256: see `digest`."""
-
-    name: str
-    size: int
-    sha256: str
+    pictures = _Function(networks.decoder, _pictures)
+    yield Graph("decoder", pictures, {"latents": latents}, "pictures")
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole export.
 
     card: as in the metadata of our weight files; the config's height and width are the export's.
-    graphs: files of each: the graph first, then what it keeps its weights in beside it, if any.
+    graphs: files of each, by name, with their digests, see `digest`: the graph first, then what it keeps its weights in
+        beside it, if any.
     source: 12 digits that name the weights it was made from. exporter: versions it was made with, for people.
     """
 
@@ -129,7 +123,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     precision: ExportPrecision
     opset: int
     exporter: str
-    graphs: dict[str, Annotated[tuple[FileRecord, ...], Meta(min_length=1)]]
+    graphs: dict[str, Annotated[dict[str, str], Meta(min_length=1)]]
 
     @property
     def sha256_12(self) -> str:
@@ -164,13 +158,11 @@ def read_manifest(folder: str | Path) -> Manifest:
         if (found := decode_json(text, dict[str, Any]).get("format")) != FORMAT:
             raise FileError(f"has format {found!r}, this version reads {FORMAT!r}")
         manifest = decode_json(text, Manifest)
-        for file in chain.from_iterable(manifest.graphs.values()):
-            path = folder / file.name
-            if Path(file.name).name != file.name or not path.is_file():
-                raise CheckpointError(f"{folder}: lacks its file {file.name}; export it again")
-            if path.stat().st_size != file.size or digest((path,)) != file.sha256:
+        for name, sha256 in chain.from_iterable(each.items() for each in manifest.graphs.values()):
+            path = folder / name
+            if Path(name).name != name or not path.is_file() or digest((path,)) != sha256:
                 raise CheckpointError(
-                    f"{folder}: its file {file.name} is not the one that was written; copy or export it again"
+                    f"{folder}: lacks its file {name}, or has another than was written; copy or export it again"
                 )
     except FileError as error:
         raise CheckpointError(f"{folder}: its {MANIFEST} {error}; export it again") from error
@@ -187,7 +179,6 @@ def export_onnx(
     height: int | None = None,
     width: int | None = None,
     overwrite: bool = False,
-    apart_above: int = APART_ABOVE,
     progress: Report | None = None,
 ) -> Manifest:
     """Write every network of a checkpoint as a graph.
@@ -195,7 +186,6 @@ def export_onnx(
     Args:
         loaded: weights on the CPU; they are widened to float32 first. precision: the decoder stays float32.
         height, width: pixels, instead of the trained size; graphs take this size alone.
-        apart_above: weights of more bytes lie in a file beside the graph.
     Raises:
         OptionError: `out` exists and `overwrite` is not set or is no export; the size does not fit; the extra is
             missing. CheckpointError: it cannot be written.
@@ -205,10 +195,12 @@ def export_onnx(
     config, factor = networks.config, networks.config.size_factor
     height, width = height or config.height, width or config.width
     if height % factor or width % factor:
-        raise OptionError(f"height and width must be multiples of {factor} for {loaded.name}, got {height}x{width}")
+        raise OptionError(
+            f"height and width must be multiples of {factor} for {loaded.card.name}, got {height}x{width}"
+        )
     networks.config = msgspec.structs.replace(config, height=height, width=width)
     networks.requires_grad_(False).float()
-    records: dict[str, tuple[FileRecord, ...]] = {}
+    records: dict[str, dict[str, str]] = {}
     with whole(Path(out), replaces=overwrite and _is_export_of_ours(Path(out))) as folder:
         folder.mkdir()
         wanted = list(graphs(networks))
@@ -216,11 +208,11 @@ def export_onnx(
             if progress is not None:
                 progress(graph.name, len(records), len(wanted))
             own: ExportPrecision = "float32" if graph.name in FULL_PRECISION else precision
-            records[graph.name] = write_graph(graph, folder, own, apart_above=apart_above)
+            records[graph.name] = write_graph(graph, folder, own)
         manifest = Manifest(
             format=FORMAT,
             card=replace(loaded.card, config=networks.config).to_metadata(),
-            source=loaded.sha256_12,
+            source=loaded.card.origin,
             precision=precision,
             opset=OPSET,
             exporter=f"torch {torch.__version__}, onnx {version('onnx')}, onnxscript {version('onnxscript')}",
@@ -236,10 +228,9 @@ def require_onnx() -> None:
         raise OptionError("ONNX needs the extra `onnx`: pip install 'gcd-node[onnx]'")
 
 
-def write_graph(
-    graph: Graph, folder: Path, precision: ExportPrecision = "float32", *, apart_above: int = APART_ABOVE
-) -> tuple[FileRecord, ...]:
-    """Export one graph into a folder. What its weights alone determine is computed, and no path of ours is in it."""
+def write_graph(graph: Graph, folder: Path, precision: ExportPrecision = "float32") -> dict[str, str]:
+    """Export one graph into a folder: its files' digests. What its weights alone determine is computed, and no path of
+    ours is in it."""
     import onnx_ir
     from onnxscript import optimizer
 
@@ -262,13 +253,12 @@ def write_graph(
     optimizer.remove_unused_nodes(model)
     for node in model.graph.all_nodes():
         node.metadata_props.clear()  # file names and lines of this machine
-    apart = sum(tensor.nbytes for tensor in graph.module.state_dict().values()) > apart_above
+    apart = sum(tensor.nbytes for tensor in graph.module.state_dict().values()) > APART_ABOVE
     path, beside = folder / f"{graph.name}.onnx", folder / f"{graph.name}.onnx.data"
     onnx_ir.save(model, path, external_data=beside.name if apart else None)
     if precision == "float16":
         _halve(path, beside, apart=apart)
-    files = (path, *(each for each in [beside] if each.exists()))
-    return tuple(FileRecord(name=f.name, size=f.stat().st_size, sha256=digest((f,))) for f in files)
+    return {each.name: digest((each,)) for each in (path, beside) if each.exists()}
 
 
 def _halve(path: Path, beside: Path, *, apart: bool) -> None:

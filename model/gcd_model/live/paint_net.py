@@ -23,12 +23,10 @@ from gcd_model.live.splat import Splat
 SIGMA_DATA = 0.3
 """Standard deviation of a true view about the base, in [-1, 1]."""
 _VOTE_CHANNELS = 4
-_SEEN_CHANNELS = 3 + 5 + _VOTE_CHANNELS  # colour; coverage, now, age, log-depth, known; classes
-_PAINTED_CHANNELS = 3 + 1
-_GOAL_CHANNELS = 2 + 2
-_NOISE_CHANNELS = 3
 _CAMERA_FEATURES = 12
-INPUTS = _SEEN_CHANNELS + _PAINTED_CHANNELS + _GOAL_CHANNELS + _NOISE_CHANNELS + 3
+INPUTS = (3 + 5 + _VOTE_CHANNELS) + (3 + 1) + (2 + 2) + 3 + 3
+"""Channels: colour, coverage, now, age, log-depth, known and classes of what is seen; what was painted; rays and
+ground; noise; base."""
 _AGE_FRAMES = 20.0
 _VOTE_LOGITS = 6.0
 """How sure the class of a seen pixel is at first, as a difference of logits."""

@@ -25,8 +25,7 @@ from gcd_model.live.splat import Surfels, splat, unproject
 from gcd_model.networks import LiveNetworks
 from gcd_model.synthesizer import out_of_memory_is_our_error, whole_levels
 from gcd_model.traits import Traits
-from gcd_model.weights.card import Card
-from gcd_model.weights.families import LIVE
+from gcd_model.weights.card import LIVE, Card
 from gcd_model.weights.save import write_safetensors
 
 PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2
@@ -203,7 +202,7 @@ class LiveSynthesizer:
         Of the options, solver, guidance, motion number and initial noise mean something to diffusion models only.
         """
         self.traits.check_lengths(features.frames, trajectories)
-        return self._painted(self._placed(self._seen(features), trajectories), trajectories, options)
+        return self.paint(self._placed(self._seen(features), trajectories), trajectories, options)
 
     @out_of_memory_is_our_error
     def see(self, features: SourceFeatures) -> tuple[SeenFrame, ...]:
@@ -213,16 +212,6 @@ class LiveSynthesizer:
     def place(self, seen: Sequence[SeenFrame], trajectories: Sequence[Trajectory]) -> tuple[PlacedFrame, ...]:
         self.traits.check_lengths(len(seen), trajectories)
         return tuple(self._placed(seen, trajectories))
-
-    @out_of_memory_is_our_error
-    def paint(
-        self, placed: Sequence[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
-    ) -> list[View]:
-        """See FrameSynthesizer.
-
-        Several samples differ where several steps draw; one step paints the mean, the same every time.
-        """
-        return self._painted(placed, trajectories, options)
 
     def _seen(self, features: SourceFeatures) -> Iterator[SeenFrame]:
         """Frame by frame, each when it is asked for: what was seen is large."""
@@ -245,10 +234,14 @@ class LiveSynthesizer:
         for t, frame in enumerate(seen):
             yield self._world.place(frame, [path.source_from_target[t].cpu() for path in trajectories])
 
-    def _painted(
-        self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None
+    @out_of_memory_is_our_error
+    def paint(
+        self, placed: Iterable[PlacedFrame], trajectories: Sequence[Trajectory], options: RenderOptions | None = None
     ) -> list[View]:
-        """`cancel` is asked between two frames."""
+        """See FrameSynthesizer; `cancel` is asked between two frames.
+
+        Several samples differ where several steps draw; one step paints the mean, the same every time.
+        """
         options, frames = RenderOptions() if options is None else options, self.traits.config.frames
         steps = options.steps or self.traits.config.sampling.steps
         draws = options.samples if steps > 1 else 1
@@ -337,13 +330,11 @@ def _is_finite(view: View) -> bool:
     return all(bool(each.isfinite().all()) for each in pictures if each is not None)
 
 
-def save_live(
-    path: str | Path, networks: LiveNetworks, name: str, *, trained: bool = True, overwrite: bool = False
-) -> None:
+def save_live(path: str | Path, networks: LiveNetworks, name: str, *, overwrite: bool = False) -> None:
     """Write a live model as one of our files, in half precision.
 
     Raises: OptionError if `path` exists and `overwrite` is not set; CheckpointError if it cannot be written.
     """
     halves: dict[str, Tensor] = {name: weight.half() for name, weight in networks.state_dict().items()}
-    card = Card(name=name, config=networks.config, family=LIVE, move_time=0, trained=trained)
+    card = Card(name=name, config=networks.config, family=LIVE, move_time=0)
     write_safetensors(Path(path), halves, card.to_metadata(), overwrite=overwrite)

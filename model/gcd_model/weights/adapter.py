@@ -97,13 +97,11 @@ def adapted(networks: Networks, adapter: Adapter) -> Networks:
                 raise CheckpointError(f"the adapter holds {name} {list(tensor.shape)}, which the model does not have")
             state[name] = tensor
     for layer in {name.removesuffix(UP) for name in tensors if name.endswith(UP)}:
-        if f"{layer}.weight" not in base.weights or layer + DOWN not in tensors:
+        weight, up, down = base.weights.get(f"{layer}.weight"), tensors[layer + UP], tensors.get(layer + DOWN)
+        if weight is None or down is None or down.ndim != 2 or up.shape != (len(weight), len(down)):
             raise CheckpointError(f"{layer} is not whole: the adapter does not belong to this model, or is damaged")
-        weight, up, down = base.weights[f"{layer}.weight"], tensors[layer + UP], tensors[layer + DOWN]
-        if weight.shape != (up.shape[0], down.shape[1]) or up.shape[1] != down.shape[0]:
-            raise CheckpointError(
-                f"{layer} is {list(weight.shape)}, its factors are {list(up.shape)} and {list(down.shape)}"
-            )
+        if weight.shape != (len(up), down.shape[1]):
+            raise CheckpointError(f"{layer} does not fit: the adapter does not belong to this model, or is damaged")
         state[f"{layer}.weight"] = added(weight, up, down, adapter.alpha / adapter.rank)
     lacking = [name for name in base.fresh if name not in state]
     if lacking:

@@ -4,9 +4,9 @@ Pure: tensors are never looked into. What names and shapes do not tell (heads) i
 """
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 
+from msgspec.structs import replace
 from torch import Tensor
 
 from gcd_model.config import (
@@ -19,13 +19,13 @@ from gcd_model.config import (
     VAEConfig,
 )
 from gcd_model.errors import CheckpointError, OptionError
-from gcd_model.weights.families import Hints
+from gcd_model.weights.card import Family, Hints
 from gcd_model.weights.names import Levels, Naming, published_names, published_shape
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Names and their shapes."""
 
-_PUBLISHED_GROUPS = 32  # of every group norm
+_PUBLISHED_GROUPS = UNetConfig().norm_groups  # of every group norm, in the VAE too
 
 
 def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
@@ -63,71 +63,70 @@ def levels_of(names: Iterable[str], naming: Naming) -> Levels:
 
 
 def infer_config(shapes: Shapes, naming: Naming, hints: Hints) -> ModelConfig:
-    """The config of published weights, at the size of GCD's checkpoints.
+    """The config of published weights, at the size and with the guidance of their family.
 
-    Raises:
-        CheckpointError: a weight the architecture hangs on is missing, the published rules do not give one, or nobody
-            tells the number of heads.
+    Raises CheckpointError: a weight the architecture hangs on is missing, the published rules do not give one, or the
+    number of heads is not told.
     """
-    probe = _Probe(shapes, naming, levels_of(shapes, naming))
-    places = [f"unet.down.{level}.stages.0" for level in range(len(probe.levels.attention))]
-    width, latent_channels = probe.size("unet.stem.weight", 0), probe.size("unet.conv_out.weight", 0)
-    widths = tuple(probe.size(f"{place}.res.spatial.conv2.weight", 0) for place in places)
-    attention = tuple(probe.optional(f"{place}.attention.proj_in.weight", 0) is not None for place in places)
-    pixels, levels = probe.size("target_encoder.stem.weight", 0), range(probe.levels.vae_levels)
-    vae_widths = tuple(probe.size(f"target_encoder.levels.{level}.blocks.0.conv2.weight", 0) for level in levels)
+    levels = levels_of(shapes, naming)
+
+    def found(name: str, axis: int) -> int | None:
+        """One side of a published tensor, by our name; None where it is absent."""
+        published = published_names(name, naming, levels)
+        shape = shapes.get(published[0], ()) if published else ()
+        return shape[axis] if axis < len(shape) and shape[axis] > 0 else None
+
+    def size(name: str, axis: int) -> int:
+        if (side := found(name, axis)) is None:
+            place = published_names(name, naming, levels)[0]
+            raise CheckpointError(f"1 weight that tells the architecture is missing or misshapen: {place}")
+        return side
+
+    places = [f"unet.down.{level}.stages.0" for level in range(len(levels.attention))]
+    width, latent_channels = size("unet.stem.weight", 0), size("unet.conv_out.weight", 0)
+    widths = tuple(size(f"{place}.res.spatial.conv2.weight", 0) for place in places)
+    attention = tuple(found(f"{place}.attention.proj_in.weight", 0) is not None for place in places)
+    places = [f"target_encoder.levels.{level}.blocks.0" for level in range(levels.vae_levels)]
+    pixels, vae_widths = size("target_encoder.stem.weight", 0), tuple(size(f"{p}.conv2.weight", 0) for p in places)
+    camera_width = found("unet.embed_camera.0.weight", 1) or 0
+    token = found("unet.middle.0.attention.spatial.token.value.weight", 1)
     try:
         unet = UNetConfig(
             latent_channels=latent_channels,
-            condition_channels=probe.size("unet.stem.weight", 1) - latent_channels,
+            condition_channels=size("unet.stem.weight", 1) - latent_channels,
             width=width,
             multipliers=_multipliers("the U-Net", width, widths),
             attention=attention,
-            blocks_per_level=probe.levels.unet_blocks,
-            embedding_width=probe.size("unet.embed_noise.0.weight", 0),
+            blocks_per_level=levels.unet_blocks,
+            embedding_width=size("unet.embed_noise.0.weight", 0),
             head_width=_head_width(attention, widths, hints),
-            context_width=probe.optional("unet.middle.0.attention.spatial.token.value.weight", 1),
-            vector_width=probe.size("unet.embed_vector.0.weight", 1),
-            camera_width=probe.optional("unet.embed_camera.0.weight", 1) or 0,
-            norm_groups=_PUBLISHED_GROUPS,
+            context_width=token,
+            vector_width=size("unet.embed_vector.0.weight", 1),
+            camera_width=camera_width,
         )
         vae = VAEConfig(
-            latent_channels=probe.size("target_encoder.conv_out.weight", 0) // 2,
+            latent_channels=size("target_encoder.conv_out.weight", 0) // 2,
             width=pixels,
             multipliers=_multipliers("the VAE", pixels, vae_widths),
-            blocks_per_level=probe.levels.vae_blocks,
-            norm_groups=_PUBLISHED_GROUPS,
+            blocks_per_level=levels.vae_blocks,
             scale=VAEConfig().scale if hints.latent_scale is None else hints.latent_scale,
             shared=naming == "diffusers",
         )
-        camera, tower = _camera_control(probe, unet.camera_width), _image_encoder(probe, unet.context_width, hints)
-        frames = hints.frames or SVD_14.frames
-        return ModelConfig(frames=frames, camera=camera, unet=unet, vae=vae, image_encoder=tower)
+        config = ModelConfig(
+            frames=hints.frames or SVD_14.frames,
+            camera=_camera_control(camera_width, found("camera.proj.weight", 1)),
+            unet=unet,
+            vae=vae,
+            image_encoder=None if token is None else _image_encoder(found, size, token, levels.image_layers, hints),
+        )
     except OptionError as error:
         raise CheckpointError(f"the weights fit no architecture known here: {error}") from error
+    return config if hints.family is None else _at_trained_size(config, hints.family)
 
 
-@dataclass(frozen=True, slots=True)
-class _Probe:
-    """Asks for sizes by our names."""
-
-    shapes: Shapes
-    naming: Naming
-    levels: Levels
-
-    def optional(self, name: str, axis: int) -> int | None:
-        """One side of a published tensor; None where it is absent."""
-        published = published_names(name, self.naming, self.levels)
-        shape = self.shapes.get(published[0], ()) if published else ()
-        return shape[axis] if axis < len(shape) and shape[axis] > 0 else None
-
-    def size(self, name: str, axis: int) -> int:
-        """The same, of one that must be there."""
-        found = self.optional(name, axis)
-        if found is None:
-            place = published_names(name, self.naming, self.levels)[0]
-            raise CheckpointError(f"1 weight that tells the architecture is missing or misshapen: {place}")
-        return found
+def _at_trained_size(config: ModelConfig, family: Family) -> ModelConfig:
+    sampling = replace(config.sampling, guidance=family.guidance)
+    return replace(config, height=family.height, width=family.width, sampling=sampling)
 
 
 def _multipliers(what: str, width: int, widths: tuple[int, ...]) -> tuple[int, ...]:
@@ -156,12 +155,12 @@ def _head_width(attends: tuple[bool, ...], widths: tuple[int, ...], hints: Hints
     raise CheckpointError(f"a U-Net of widths {list(widths)} does not tell its attention heads; {_GIVE_WIDTH}")
 
 
-_GIVE_WIDTH = "give the width of one with --head-width; `gcd-node weights convert` writes a file that states it"
+_STATED = "; `gcd-node weights convert` writes a file that states it"
+_GIVE_WIDTH = f"give the width of one with --head-width{_STATED}"
 
 
-def _camera_control(probe: _Probe, camera_width: int) -> CameraControl:
+def _camera_control(camera_width: int, features: int | None) -> CameraControl:
     """The control whose number of features the camera embedder takes."""
-    features = probe.optional("camera.proj.weight", 1)
     if not camera_width or features is None:
         return "spherical" if camera_width else "none"  # of a camera with half its weights, the check names the rest
     for control, count in CAMERA_FEATURES.items():
@@ -172,28 +171,31 @@ def _camera_control(probe: _Probe, camera_width: int) -> CameraControl:
     )
 
 
-def _image_encoder(probe: _Probe, context_width: int | None, hints: Hints) -> ImageEncoderConfig | None:
-    """None only for a U-Net without cross-attention: a tower that is wanted and absent is found missing later."""
-    if context_width is None:
-        return None
-    tokens = probe.optional("image_encoder.positions", 0)
+def _image_encoder(
+    found: Callable[[str, int], int | None],
+    size: Callable[[str, int], int],
+    output_width: int,
+    layers: int,
+    hints: Hints,
+) -> ImageEncoderConfig:
+    """Of a U-Net with cross-attention; the published one where it is absent, whose weights are found missing later."""
+    tokens, published = found("image_encoder.positions", 0), ImageEncoderConfig(output_width=output_width)
     if tokens is None:
-        return ImageEncoderConfig(output_width=context_width)
-    patch, width = probe.size("image_encoder.patches.weight", 2), probe.size("image_encoder.patches.weight", 0)
-    published = ImageEncoderConfig()
+        return published
+    patch, width = size("image_encoder.patches.weight", 2), size("image_encoder.patches.weight", 0)
     if hints.image_heads is None and width != published.width:
         raise CheckpointError(
-            f"an image tower {width} wide does not tell its attention heads; give their number with --image-heads; "
-            "`gcd-node weights convert` writes a file that states it"
+            f"an image tower {width} wide does not tell its attention heads; give their number with "
+            f"--image-heads{_STATED}"
         )
-    return ImageEncoderConfig(
+    return replace(
+        published,
         image_size=round((tokens - 1) ** 0.5) * patch,
         patch=patch,
         width=width,
-        layers=probe.levels.image_layers,
+        layers=layers,
         heads=hints.image_heads or published.heads,
-        hidden_width=probe.size("image_encoder.layers.0.expand.weight", 0),
-        output_width=context_width,
+        hidden_width=size("image_encoder.layers.0.expand.weight", 0),
     )
 
 

@@ -5,7 +5,6 @@ Layouts are told by content: GCD's Lightning `.ckpt`, `svd.safetensors`, a diffu
 """
 
 import hashlib
-import logging
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -25,25 +24,16 @@ from gcd_model.weights.card import (
     CONFIG_KEY,
     FULL_PRECISION,
     Card,
-    Layout,
-    Leftover,
-    NetworkReport,
-    WeightsReport,
-    precision,
-)
-from gcd_model.weights.families import (
-    FAMILIES,
     Hints,
-    at_trained_size,
+    Layout,
     family_named,
+    precision,
     require_family,
 )
 from gcd_model.weights.infer import infer_config, match_weights, shapes_of
 from gcd_model.weights.names import Levels, Naming, assembled, published_names
 from gcd_model.weights.read import WeightsFile, read_file, read_weights
 from gcd_model.weights.save import CARRIED, write_published, write_safetensors
-
-_log = logging.getLogger(__name__)
 
 _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
@@ -64,11 +54,9 @@ class Told(TypedDict, total=False):
     frames: int | None
 
 
-def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[Told]) -> LoadedWeights:
-    """Load a checkpoint of any layout.
+def load_weights(path: str | Path, **told: Unpack[Told]) -> LoadedWeights:
+    """Load a checkpoint of any layout. told: see `Told`.
 
-    Args:
-        ask_family: warn where the family is not known; False for those who only want the weights. told: see `Told`.
     Raises:
         CheckpointError: the file is missing, damaged, hostile, of another architecture, or its heads are not known.
         OptionError: an option is unknown or contradicts the file.
@@ -76,13 +64,6 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
     with _about(path):
         examined = _examined(Path(path), told)
         examined.networks.load_state_dict(examined.state(), assign=True, strict=True)
-        if ask_family and examined.card.family is None:
-            _log.warning(
-                "the family of %s is not known: no limits are checked and --motion-bucket must be given; "
-                "name it with --family %s",
-                path,
-                "|".join(FAMILIES),
-            )
         return LoadedWeights(
             card=replace(examined.card, origin=digest(examined.file.files)[:12]),
             networks=examined.networks,
@@ -93,7 +74,7 @@ def load_weights(path: str | Path, *, ask_family: bool = True, **told: Unpack[To
 
 def load_adapted(base: LoadedWeights, adapter: Adapter) -> LoadedWeights:
     """A base and what was trained on it, as one. Raises CheckpointError as `adapted`;"""
-    weights = {f"{base.sha256_12}.{name}": tensor for name, tensor in adapter.tensors.items()}
+    weights = {f"{base.card.origin}.{name}": tensor for name, tensor in adapter.tensors.items()}
     return replace(
         base,
         card=replace(
@@ -113,6 +94,54 @@ def read_adapter(path: str | Path) -> Adapter:
         return Adapter.of_file({} if file.is_pickle else file.metadata, file.tensors)
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NetworkReport:
+    """One network of a checkpoint. dtypes: as stored, for example ("float16",). size: bytes as stored."""
+
+    name: str
+    parameters: int
+    tensors: int
+    dtypes: tuple[str, ...]
+    size: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Leftover:
+    """Weights that are recognised and not used. size: bytes as stored."""
+
+    kind: str
+    tensors: int
+    size: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WeightsReport(Card):
+    """What `gcd-node weights inspect` shows: what the checkpoint says of itself, or what was worked out, and the rest.
+
+    optimizer_size: bytes of optimizer state, which is never read; 0 without. other_entries: further top-level names.
+    size: bytes on disk, all files together. digest: see `digest`.
+    """
+
+    path: str
+    layout: Layout
+    networks: tuple[NetworkReport, ...]
+    leftovers: tuple[Leftover, ...]
+    optimizer_size: int
+    other_entries: tuple[str, ...]
+    size: int
+    digest: str
+
+    @property
+    def sha256_12(self) -> str:
+        """First 12 digits of the digest: what views carry."""
+        return self.digest[:12]
+
+    @property
+    def parameters(self) -> int:
+        """All parameters that are used."""
+        return sum(network.parameters for network in self.networks)
+
+
 def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpack[Told]) -> WeightsReport:
     """Say what a checkpoint holds; checks names and shapes as `load_weights` does, reads no weights.
 
@@ -122,24 +151,22 @@ def inspect_weights(path: str | Path, *, full_digest: bool = False, **told: Unpa
     """
     with _about(path):
         examined = _examined(Path(path), told)
-        file, networks = examined.file, dict[str, list[tuple[int, torch.dtype]]]()
+        file, used = examined.file, dict[str, list[tuple[Tensor, torch.dtype]]]()
         for name, tensor in examined.networks.state_dict().items():
-            stored = file.tensors[examined.sources[name][0]].dtype
-            networks.setdefault(name.partition(".")[0], []).append((tensor.numel(), stored))
+            used.setdefault(name.partition(".")[0], []).append((tensor, file.tensors[examined.sources[name][0]].dtype))
         return WeightsReport(
             **{each.name: getattr(examined.card, each.name) for each in fields(examined.card)},
             path=str(path),
             layout=file.layout,
-            told_by=examined.told_by,
             networks=tuple(
                 NetworkReport(
                     name=network,
-                    parameters=sum(count for count, _ in tensors),
+                    parameters=sum(tensor.numel() for tensor, _ in tensors),
                     tensors=len(tensors),
                     dtypes=tuple(sorted({str(dtype).removeprefix("torch.") for _, dtype in tensors})),
-                    size=sum(count * dtype.itemsize for count, dtype in tensors),
+                    size=sum(tensor.numel() * dtype.itemsize for tensor, dtype in tensors),
                 )
-                for network, tensors in networks.items()
+                for network, tensors in used.items()
             ),
             leftovers=tuple(
                 Leftover(kind=kind, tensors=len(names), size=sum(file.tensors[name].nbytes for name in names))
@@ -243,13 +270,12 @@ def _about(path: str | Path) -> Generator[None]:
 class _Examined:
     """A checkpoint whose every weight has its place; `networks` is still empty.
 
-    card: what it says of itself, or what was worked out. told_by: who named the family. sources: for each of our
-    names, the file's. leftovers: by kind.
+    card: what it says of itself, or what was worked out. sources: for each of our names, the file's. leftovers: names,
+    by kind.
     """
 
     file: WeightsFile
     card: Card
-    told_by: str | None
     networks: Networks | LiveNetworks
     sources: dict[str, tuple[str, ...]]
     leftovers: dict[str, list[str]]
@@ -267,19 +293,19 @@ class _Examined:
 
 def _examined(path: Path, told: Told) -> _Examined:
     """Raises CheckpointError: the file does not fit, name by name. OptionError: what is told is impossible."""
-    options = Hints(**told, told_by=None if told.get("family") is None else "option")
+    named = told.get("family")
+    options = Hints(**told | {"family": None if named is None else family_named(named)})  # pyright: ignore
     file = read_weights(path)
     naming, shapes = _NAMINGS.get(file.layout, "gcd"), shapes_of(file.tensors)
     stated = Card.from_metadata(file.metadata) if CONFIG_KEY in file.metadata else None
     if stated is None:
         known = options.over(file.hints)
-        config = at_trained_size(infer_config(shapes, naming, known), known)
+        config = infer_config(shapes, naming, known)
     else:
-        own = Hints(move_time=stated.move_time)
-        if stated.family is not None:
-            own = replace(own, family=stated.family.name, told_by="metadata")
-        known, config = options.over(own, file.hints), _with_frames(stated.config, options)
-    require_family(known, config)
+        known = options.over(Hints(move_time=stated.move_time, family=stated.family), file.hints)
+        config = _with_frames(stated.config, options)
+    if known.family is not None:
+        require_family(known.family, config)
     try:
         networks = empty_networks(config)
     except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
@@ -299,14 +325,12 @@ def _examined(path: Path, told: Told) -> _Examined:
     card = Card(
         name=file.name if stated is None or not stated.name else stated.name,
         config=config,
-        family=None if known.family is None else family_named(known.family),
+        family=known.family,
         move_time=last if known.move_time is None else min(known.move_time, last),
         trained=stated is None or stated.trained,
         uncertainty_scale=None if stated is None else stated.uncertainty_scale,
     )
-    return _Examined(
-        file=file, card=card, told_by=known.told_by, networks=networks, sources=sources, leftovers=leftovers
-    )
+    return _Examined(file=file, card=card, networks=networks, sources=sources, leftovers=leftovers)
 
 
 def _with_frames(config: ModelConfig | LiveConfig, hints: Hints) -> ModelConfig | LiveConfig:

@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import msgspec
 from safetensors import SafetensorError, safe_open
@@ -16,8 +16,7 @@ from torch.utils import _pytree as pytree
 
 from gcd_model.errors import CheckpointError, FileError
 from gcd_model.small_files import decode_json, read_small
-from gcd_model.weights.card import ADAPTER_KEY, CONFIG_KEY, NOTES, Layout, unpacked
-from gcd_model.weights.families import Hints, told_by_name, told_by_yaml
+from gcd_model.weights.card import ADAPTER_KEY, CONFIG_KEY, NOTES, Hints, Layout, told_by_name, told_by_yaml, unpacked
 from gcd_model.weights.names import GCD_UNET
 from gcd_model.weights.pickle import SAVE_AGAIN, Placeholder, read_pickle
 
@@ -198,9 +197,7 @@ def _what(value: object) -> str:
 # --- a diffusers folder ----------------------------------------------------------------------------------------------
 
 
-Facts = TypeVar("Facts", bound=msgspec.Struct)
-
-_PARTS = ("unet", "vae", "image_encoder")
+_STEMS, _PARTS = ("diffusion_pytorch_model", "model"), ("unet", "vae", "image_encoder")
 """The folders that hold weights; the others are not needed."""
 
 
@@ -213,24 +210,18 @@ class _Config(msgspec.Struct, frozen=True, kw_only=True):
     hidden_act: str = "gelu"
 
 
-class _Index(msgspec.Struct, frozen=True, kw_only=True):
-    weight_map: dict[str, str]
-
-
 def _read_folder(path: Path) -> WeightsFile:
     absent = [part for part in _PARTS if not (path / part).is_dir()]
     if absent:
         raise CheckpointError(f"is a folder without {', '.join(absent)}; a diffusers folder has {', '.join(_PARTS)}")
     tensors: dict[str, Tensor] = {}
-    files: list[Path] = []
-    for part in _PARTS:
-        for file in _part_files(path / part):
-            files.append(file)
-            try:
-                tensors |= {f"{part}/{name}": tensor for name, tensor in read_file(file).tensors.items()}
-            except CheckpointError as error:
-                raise CheckpointError(f"its file {part}/{file.name} {error}") from error
-    unet, vae, tower = (_facts(path / part / "config.json", _Config) for part in _PARTS)
+    files = [_part_file(path / part) for part in _PARTS]
+    for part, file in zip(_PARTS, files, strict=True):
+        try:
+            tensors |= {f"{part}/{name}": tensor for name, tensor in read_file(file).tensors.items()}
+        except CheckpointError as error:
+            raise CheckpointError(f"its file {part}/{file.name} {error}") from error
+    unet, vae, tower = (_facts(path / part / "config.json") for part in _PARTS)
     if tower.hidden_act != "gelu":
         raise CheckpointError(f"its image tower has activation {tower.hidden_act!r}; supported is 'gelu'")
     if not isinstance(tower.num_attention_heads, int | None):
@@ -245,43 +236,22 @@ def _read_folder(path: Path) -> WeightsFile:
     return WeightsFile(name=name, files=tuple(files), tensors=tensors, hints=hints.over(told_by_name(name)))
 
 
-def _part_files(folder: Path) -> list[Path]:
-    """The weights files of one part: full precision before float16, safetensors before pickles, whole before shards."""
-    names = sorted(entry.name for entry in folder.iterdir())
-    stems = ("diffusion_pytorch_model", "model", "pytorch_model")
-    chosen = next(
-        (
-            name
-            for ending in (".safetensors", ".bin")
-            for variant in ("", ".fp16")
-            for stem in stems
-            for name in (f"{stem}{variant}{ending}", f"{stem}{ending}.index{variant}.json")
-            if name in names
-        ),
-        None,
+def _part_file(folder: Path) -> Path:
+    """The weights file of one part, whole, as safetensors: full precision before float16."""
+    names = (f"{stem}{variant}.safetensors" for variant in ("", ".fp16") for stem in _STEMS)
+    for file in map(folder.joinpath, names):
+        if file.exists():
+            return file
+    there = ", ".join(sorted(entry.name for entry in folder.iterdir())[:5])
+    raise CheckpointError(
+        f"its folder {folder.name} holds no weights (found: {there or 'nothing'}); wanted is "
+        "diffusion_pytorch_model.safetensors or model.safetensors, whole, or with .fp16, as diffusers writes them"
     )
-    if chosen is None:
-        raise CheckpointError(
-            f"its folder {folder.name} holds no weights (found: {', '.join(names[:5]) or 'nothing'}); wanted is "
-            "diffusion_pytorch_model.safetensors or model.safetensors, with .fp16 or an index as diffusers writes them"
-        )
-    if not chosen.endswith(".json"):
-        return [folder / chosen]
-    shards = sorted(set(_facts(folder / chosen, _Index).weight_map.values()))
-    for shard in shards:
-        if "/" in shard or "\\" in shard or shard in ("", ".", ".."):
-            raise CheckpointError(f"its index {chosen} names the shard {shard!r}; wanted are plain file names")
-    absent = [shard for shard in shards if not (folder / shard).exists()]
-    if absent:
-        raise CheckpointError(
-            f"its folder {folder.name} lacks {len(absent)} shards, first: {absent[0]}; {_FETCH_AGAIN}"
-        )
-    return [folder / shard for shard in shards]
 
 
-def _facts(file: Path, kind: type[Facts]) -> Facts:
+def _facts(file: Path) -> _Config:
     """What a small file tells; nothing where it is absent."""
     try:
-        return decode_json(read_small(file), kind) if file.exists() or file.is_symlink() else kind()
+        return decode_json(read_small(file), _Config) if file.exists() or file.is_symlink() else _Config()
     except FileError as error:
         raise CheckpointError(f"its file {file.parent.name}/{file.name} {error}") from error

@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import Family
 from gcd_train.data.cache import CachedLatents, ClipPlace, EncodedRows, FrozenEncoders, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips
 from gcd_train.data.sample import Sample, SampleBatch, Samples, collate, to_network

@@ -24,7 +24,7 @@ from torch import Tensor
 from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
 from gcd_model.vae import Posterior
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import Family
 from gcd_train.data.cache import (
     EncodedRows,
     FrozenEncoders,

@@ -8,7 +8,7 @@ import msgspec
 import torch
 
 from gcd_model.config import ModelConfig
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import Family
 from gcd_train.data import kubric4d, parallel_domain4d
 from gcd_train.data.cache import CachedLatents
 from gcd_train.data.dataset4d import Dataset4D, Ontology

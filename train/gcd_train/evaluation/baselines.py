@@ -13,7 +13,7 @@ from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures
 from gcd_model.clip import nearest_classes, palette
 from gcd_model.config import SemanticClass
 from gcd_model.diffusion import unit_noise
-from gcd_model.geometry.trajectory import pose_trajectory
+from gcd_model.geometry import pose_trajectory
 from gcd_train.data.sample import Bytes, SceneView, to_network
 from gcd_train.data.visibility import NARROW, published_tensor
 from gcd_train.errors import DataError

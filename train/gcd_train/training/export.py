@@ -13,8 +13,7 @@ from gcd_model.clip import palette
 from gcd_model.networks import Networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.adapter import Adapter
-from gcd_model.weights.card import Card, precision
-from gcd_model.weights.families import Family
+from gcd_model.weights.card import Card, Family, precision
 from gcd_model.weights.load import load_weights, save_weights
 from gcd_model.weights.save import write_adapter, write_published
 from gcd_train.data.sample import Clips, to_network
@@ -126,6 +125,6 @@ def export(
     except ModelError as error:
         raise RunError(f"cannot export to {path}: {error}") from error
     values = validation.measure(loaded.diffusion.float(), folder.stage("export") / "samples.png")
-    size = {"bytes": path.stat().st_size, "sha256_12": loaded.sha256_12}
+    size = {"bytes": path.stat().st_size, "sha256_12": loaded.card.origin}
     folder.record("export", "measured", {**size, **values})
     _log.info("wrote %s", ", ".join(map(str, written)))

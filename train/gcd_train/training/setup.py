@@ -18,7 +18,7 @@ from gcd_model.geometry import Trajectory, motion_bucket
 from gcd_model.layers import sinusoid
 from gcd_model.networks import LoadedWeights, Networks, empty_networks
 from gcd_model.weights.adapter import DIFFUSION, carried_over
-from gcd_model.weights.families import FAMILIES, Family
+from gcd_model.weights.card import FAMILIES, Family
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state
 from gcd_train.errors import DataError, RecipeError, RunError
@@ -89,8 +89,8 @@ def run_config(recipe: Recipe) -> ModelConfig:
         return model_config(recipe.model)
     teacher = loaded_base(weights)
     config, family = teacher.diffusion.config, family_of(recipe.model)
-    if teacher.family not in (None, family):
-        raise RecipeError(f"{weights} is of the family {teacher.family.name}; set model.family to it")
+    if teacher.card.family not in (None, family):
+        raise RecipeError(f"{weights} is of the family {teacher.card.family.name}; set model.family to it")
     goal = recipe.data.goal_frame(config.frames)
     if teacher.card.move_time != goal:
         raise RecipeError(
@@ -298,7 +298,7 @@ def loaded_base(path: str, config: ModelConfig | None = None) -> LoadedWeights:
     """A weight file of any layout, or `package:NAME`, with the config's heads if it has none. See `load_weights`."""
     tower, width = (None, None) if config is None else (config.image_encoder, config.unet.head_width)
     heads = None if tower is None else tower.heads
-    return load_weights(weights_path(path), ask_family=False, head_width=width, image_heads=heads)
+    return load_weights(weights_path(path), head_width=width, image_heads=heads)
 
 
 class Conditioner:
@@ -355,6 +355,5 @@ def mirrored_path(path: Trajectory) -> Trajectory:
     return Trajectory(
         source_from_target=path.source_from_target * sideways[:, None] * sideways,
         delta=None if delta is None else delta * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64),
-        at_goal=path.at_goal,
         source=path.source,
     )
