@@ -168,14 +168,11 @@ class ClipTable:
             true=true,
         )
 
-    def clip_sums(
-        self, frames: Span | int = "2-last", region: Region = "all", rows: Sequence[int] | None = None
-    ) -> Sums:
-        """Sums of each clip. frames: a span, or one frame counted from 1. rows: only these clips; None for all."""
-        chosen = slice(frames - 1, frames) if isinstance(frames, int) else FRAMES_OF[frames]
+    def clip_sums(self, frames: Span = "2-last", region: Region = "all", rows: Sequence[int] | None = None) -> Sums:
+        """Sums of each clip. rows: only these clips; None for all."""
         rows = range(len(self.scenes)) if rows is None else rows
         each = [table[region][rows] for table in (self.above, self.below)]
-        above, below = (table[:, chosen].sum(axis=1) for table in each)
+        above, below = (table[:, FRAMES_OF[frames]].sum(axis=1) for table in each)
         if frames == "2-last":  # the change into the first of these frames is none between them
             above[:, _FLICKER], below[:, _FLICKER] = (
                 table[:, FIRST_MEASURED + 1 :, _FLICKER].sum(axis=1) for table in each
@@ -186,9 +183,7 @@ class ClipTable:
         commonest = np.argsort(-true, kind="stable")[:COMMON_CLASSES].tolist()
         return Sums(above=above, below=below, common=tuple(sorted(label for label in commonest if true[label] > 0)))
 
-    def scene_sums(
-        self, frames: Span | int = "2-last", region: Region = "all", rows: Sequence[int] | None = None
-    ) -> Sums:
+    def scene_sums(self, frames: Span = "2-last", region: Region = "all", rows: Sequence[int] | None = None) -> Sums:
         """`clip_sums` added up over each scene, in the order of their first clips, ready to be drawn from."""
         sums = self.clip_sums(frames, region, rows)
         scenes = self.scenes if rows is None else [self.scenes[row] for row in rows]

@@ -204,19 +204,29 @@ class RunKeeper:
         return self.folder / "records" / folder_name(method) / f"{folder_name(key)}.json"
 
 
-def read_run(folder: Path | str) -> tuple[RunNote, tuple[ClipRecord, ...]]:
-    """What a run says of itself, and its records: method by method in the note's order, clips by name.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """One run as it lies on the disk. folder: where its `run.json`, records and views are.
 
-    Raises:
-        RunError: there is no run, or a file of it is damaged.
+    records: method by method in the note's order, clips by name.
     """
-    folder = Path(folder)
-    if not (folder / RUN_FILE).exists():
-        raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
-    note = _read(folder / RUN_FILE, RunNote, "delete the run, or choose another folder")
-    places = [folder / "records" / folder_name(method) for method in note.methods]
-    files = [path for place in places for path in sorted(place.glob("*.json"))]
-    return note, tuple(_read(path, ClipRecord, "delete it and evaluate again, the others are kept") for path in files)
+
+    folder: Path
+    note: RunNote
+    records: tuple[ClipRecord, ...]
+
+    @classmethod
+    def read(cls, folder: Path) -> "Run":
+        """Raises RunError where there is none, none of its clips is measured yet, or a file of it is damaged."""
+        if not (folder / RUN_FILE).exists():
+            raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
+        note = _read(folder / RUN_FILE, RunNote, "delete the run, or choose another folder")
+        places = [folder / "records" / folder_name(method) for method in note.methods]
+        cure = "delete it and evaluate again, the others are kept"
+        records = [_read(path, ClipRecord, cure) for place in places for path in sorted(place.glob("*.json"))]
+        if not records:
+            raise RunError(f"{folder} holds no record yet; run `gcd-train evaluate --out {folder}` to its end")
+        return cls(folder=folder, note=note, records=tuple(records))
 
 
 def _read(path: Path, kind: type[Stored], cure: str) -> Stored:

@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from typer import Option
 
-from gcd_model.errors import FileError
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics, from_pose, spherical_trajectory
-from gcd_model.small_files import decode_json, read_json
+from gcd_model.small_files import decode_json
 from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.data.dataset4d import Dataset4D, OntologyItem, layout_of, read_ontology
-from gcd_train.data.files import GEOMETRY, MOST_TEXT, ZIP_FAULTS, read_manifest, read_member
+from gcd_train.data.dataset4d import Dataset4D, Ontology, OntologyItem, layout_of, read_ontology
+from gcd_train.data.files import GEOMETRY, ZIP_FAULTS, read_manifest, read_member
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
@@ -104,26 +102,20 @@ def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     still, poses, path = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
     draw = Draw(frame_numbers=numbers, fps=data.fps / stride, world_from_source=still, world_from_target=poses)
     sample, target_is = _sample(data, scene, draw, (lens.width, lens.height), exact=not options.points)
-    classed = data.ontology is not None and all(view.classes is not None for view in views)
+    layout = "Kubric-4D layout" if on_sphere else "ParallelDomain-4D layout"
+    with suppress(DataError):  # of our own scenes, the world
+        layout = f"{_world_name(read_manifest(folder).world)}, {layout}"
     return Footage(
-        title=_title(folder, "Kubric-4D" if on_sphere else "ParallelDomain-4D"),
-        folder=str(folder),
+        title=f"{folder.name}, {layout}",
         path=path,
         scene=f"{every} frames at {data.fps:g} fps, {len(data.cameras)} cameras",
-        frame_numbers=numbers,
-        fps=sample.fps,
         source_camera=data.source_camera,
         lens=lens,
         views=views,
         poses=poses,
-        target=sample.target,
+        sample=sample,
         target_is=target_is,
-        target_depth=sample.target_depth,
-        visible=np.ones(sample.target.shape[:3], np.bool_) if sample.visible is None else sample.visible,
-        classes=data.ontology.items if classed and data.ontology is not None else (),
-        instances={} if classed else _asset_names(data, folder),
-        world_from_source=np.repeat(still[None], len(numbers), axis=0),
-        world_from_target=poses,
+        ontology=data.ontology if all(view.classes is not None for view in views) else None,
         look_at=LOOK_AT if on_sphere else DRIVING_GOAL_TARGET,
         world=_STAGE if on_sphere else _VEHICLE,
     )
@@ -180,49 +172,35 @@ def _sample(data: Dataset4D, scene: str, draw: Draw, size: tuple[int, int], *, e
     return pictures_of(data, options).sample(scene, draw), f"points of all {len(data.cameras)} cameras"
 
 
-def _title(folder: Path, layout: str) -> str:
-    """Scene, layout and, of our own scenes, the world it was made in."""
-    try:
-        return f"{folder.name}, {_world_name(read_manifest(folder).world)}, {layout} layout"
-    except DataError:
-        return f"{folder.name}, {layout} layout"
-
-
 def _world_name(world: str) -> str:
     return f"{world} world" + (" (1 m here is 1 dm)" if world.startswith("tabletop") else "")
 
 
-class _Asset(msgspec.Struct, frozen=True):
-    asset_id: str = ""
-
-
-class _Assets(msgspec.Struct, frozen=True):
-    instances: tuple[_Asset, ...] = ()
-
-
-def _asset_names(data: Dataset4D, folder: Path) -> dict[int, str]:
-    """What a Kubric scene calls its instances."""
-    path = kubric4d.metadata_path(folder, data.source_camera)
-    try:
-        assets = read_json(path, _Assets, MOST_TEXT).instances
-    except FileError:
-        return {}  # names are decoration; the reader has checked what matters in this file
-    return {i: f"{asset.asset_id} ({i})" for i, asset in enumerate(assets, 1) if asset.asset_id}
-
-
 def _pair_clip(path: Path, seed: int | None) -> Footage:
-    """The clip of a seed, by default the first of the shard or folder.
+    """A finished clip as it was rendered, in its world or, in driving, in the vehicle's frame.
 
-    Raises: DataError naming the shard, RecipeError for an unknown seed.
+    seed: by default of the first clip of the shard or folder. Raises: DataError naming the shard, RecipeError for an
+    unknown seed.
     """
     folder = path.parent if path.suffix == ".zip" else path
     if seed is None and path.suffix == ".zip" and (number := path.stem.split("-")[1:2]) and number[0].isdecimal():
         seed = int(number[0])
     clips = PairedClips.open(folder)
-    index = _clip_number(folder, clips, seed)
-    clip, (shard, name), numbers = clips[index], clips.places[index], tuple(range(clips.frames))
-    sources, targets = _pair_poses(shard, name)
+    if seed is not None and seed not in clips.seeds:
+        low, high = clips.seeds[0], clips.seeds[-1]
+        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(clips)}, {low} to {high}")
+    index = 0 if seed is None else clips.seeds.index(seed)
+    clip, sample = clips[index], clips.sample(index)
+    sources, targets = _pair_poses(*clips.places[index])
     lens = Intrinsics.from_hfov(clips.world.hfov_deg, clips.width, clips.height)
+    if clips.mount is None:
+        orbit = clips.orbit(index)
+        path = "{:+.1f}° azimuth, {:+.1f}° elevation, {:+.1f} m radius, gradual".format(*orbit.change)
+        sample = replace(sample, frame_numbers=orbit.frame_numbers)
+    else:
+        path, still = "the driving path, up and back at a sine pace", clips.mount.vehicle_from_camera.numpy()
+        targets = still @ np.linalg.inv(sources) @ targets
+        sources = np.broadcast_to(still, targets.shape)
     views = [
         SceneView(
             rgb=clip.source[t],
@@ -232,49 +210,24 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
             world_from_camera=sources[t],
             lens=lens,
         )
-        for t in numbers
+        for t in range(clips.frames)
     ]
-    world_from_source, world_from_target = sources, targets
-    if clips.mount is None:
-        orbit = clips.orbit(index)
-        azimuth_deg, elevation_deg, radius_m = orbit.change
-        words = f"{azimuth_deg:+.1f}° azimuth, {elevation_deg:+.1f}° elevation, {radius_m:+.1f} m radius, gradual"
-        numbers = orbit.frame_numbers
-    else:
-        words = "the driving path, up and back at a sine pace"
-        world_from_source = np.tile(clips.mount.vehicle_from_camera.numpy(), (clips.frames, 1, 1))
-        world_from_target = world_from_source @ np.linalg.inv(sources) @ targets
+    seen = [depth_visibility(view, clip.target_depth[t], targets[t], lens) for t, view in enumerate(views)]
+    kinds = tuple(OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes))
     return Footage(
         title=f"pair shard, {_world_name(clips.world.name)}, seed {clip.seed}",
-        folder=str(shard),
-        path=words,
-        scene=f"{numbers[-1] + 1} frames at {clips.fps * clips.world.stride:g} fps, 2 cameras",
-        frame_numbers=numbers,
-        fps=clips.fps,
+        path=path,
+        scene=f"{sample.frame_numbers[-1] + 1} frames at {clips.fps * clips.world.stride:g} fps, 2 cameras",
         source_camera="source",
         lens=lens,
         views=views,
         poses=targets,
-        target=clip.target,
+        sample=replace(sample, visible=np.stack(seen), target_depth=clip.target_depth),
         target_is="rendered exactly",
-        target_depth=clip.target_depth,
-        visible=np.stack(
-            [depth_visibility(view, clip.target_depth[t], targets[t], lens) for t, view in enumerate(views)]
-        ),
-        classes=tuple(OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes)),
-        instances={},
-        world_from_source=world_from_source,
-        world_from_target=world_from_target,
+        ontology=Ontology(kinds) if kinds else None,
         look_at=LOOK_AT if clips.mount is None else DRIVING_GOAL_TARGET,
         world=_STAGE if clips.mount is None else _VEHICLE,
     )
-
-
-def _clip_number(folder: Path, clips: PairedClips, seed: int | None) -> int:
-    if seed is not None and seed not in clips.seeds:
-        low, high = clips.seeds[0], clips.seeds[-1]
-        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(clips)}, {low} to {high}")
-    return 0 if seed is None else clips.seeds.index(seed)
 
 
 def _pair_poses(shard: Path, name: str) -> tuple[Poses, Poses]:
