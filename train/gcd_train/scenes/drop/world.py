@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gcd_model.geometry import sphere_poses
-from gcd_train.errors import DataError, RenderError
+from gcd_train.errors import RenderError
 from gcd_train.scenes.description import (
     ORBIT,
     Colour,
@@ -223,12 +223,8 @@ def drop_scene(seed: int, frames: int = 60) -> Scene:
     Args:
         seed: 0 or more.
         frames: time steps at 24 Hz.
-    Raises:
-        DataError: no frame is asked for.
-        RenderError: MuJoCo is not installed, or no attempt at this seed gave a sound simulation.
+    Raises: RenderError if MuJoCo is not installed, or no attempt at this seed gave a sound simulation.
     """
-    if frames < 1:
-        raise DataError(f"a clip has at least one frame, got {frames}; ask for 1 or more")
     reasons: list[str] = []
     for attempt in range(_ATTEMPTS):
         random = np.random.default_rng([seed, 0xD209, attempt])
