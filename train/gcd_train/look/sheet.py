@@ -17,10 +17,10 @@ from gcd_train.data.pictures import trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
 from gcd_train.data.splat import splat
 from gcd_train.evaluation.clips import nearest_resized
-from gcd_train.evaluation.galleries import HOLD_S, Strip, beside, write_mp4
+from gcd_train.evaluation.galleries import HOLD_S, Strip, beside
 from gcd_train.evaluation.galleries import write_sheet as write_rows
 from gcd_train.evaluation.predictors import pixel_rays
-from gcd_train.pictures import new_figure, save
+from gcd_train.pictures import new_figure, save, write_mp4
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
