@@ -18,14 +18,14 @@ from gcd_train.errors import DataError
 from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.pair_writer import generate, shard_path, write_shard
 from gcd_train.scenes.renderer import Renderer
-from gcd_train.scenes.worlds import World, read_world
+from gcd_train.scenes.worlds import World
 
 TINY = World(name="driving", width=48, height=32, frames=2, fps=10.0, hfov_deg=85.0, oversample=1, clips_per_shard=2)
 
 
 @needs_egl
 def test_clips_are_read_as_they_were_drawn(tmp_path: Path) -> None:
-    list(generate(tmp_path, TINY, range(3), workers=2))
+    list(generate(tmp_path, TINY, range(3), workers=1))
     clips = PairedClips.open(tmp_path)
     assert (len(clips), clips.frames, clips.height, clips.width, clips.fps) == (3, 2, 32, 48, 10.0)
     clip = clips[2]
@@ -51,14 +51,6 @@ def test_generation_goes_on_where_it_stopped_and_makes_every_scene_once(tmp_path
     assert first.stat().st_mtime_ns == written
     assert list(PairedClips.open(tmp_path).seeds) == [0, 1, 2, 3]
     assert not abandoned.exists()
-
-
-@needs_egl
-def test_a_folder_of_another_world_is_refused(tmp_path: Path) -> None:
-    list(generate(tmp_path, TINY, range(1), workers=1))
-    with pytest.raises(DataError, match="choose another folder"):
-        list(generate(tmp_path, msgspec.structs.replace(TINY, width=96), range(1), workers=1))
-    assert read_world(tmp_path) == TINY
 
 
 @needs_egl
@@ -107,6 +99,7 @@ def test_a_scene_in_two_shards_counts_once(tmp_path: Path) -> None:
     assert list(clips.seeds) == [0, 1, 2]
 
 
+@pytest.mark.slow
 @needs_egl
 def test_sigterm_stops_the_workers_and_keeps_whole_shards(tmp_path: Path) -> None:
     size = "--width 48 --height 32 --frames 2 --oversample 1 --clips-per-shard 1"

@@ -50,6 +50,8 @@ def test_every_damaged_file_and_a_scene_without_a_manifest_are_named(scenes: Pat
         "1 of 2 scenes are as they were written; delete the others and run the line that made them again"
     ]
     assert verified(scenes / "scn00000").exit_code == 0
+    (scenes / "scn00000" / MANIFEST).write_text("{")
+    assert verified(scenes / "scn00000").exit_code == DataError.exit_code
     (scenes / "scn00000" / MANIFEST).unlink()
     told = verified(scenes)
     assert (told.exit_code, f"{scenes / 'scn00000'} has no {MANIFEST}" in told.stdout) == (DataError.exit_code, True)
