@@ -99,18 +99,6 @@ def test_only_surfaces_that_were_not_seen_turn_orange(pairs: Path) -> None:
     assert footage.seen_shares[0] == pytest.approx(40 / 44)
 
 
-# which clip
-
-
-def test_frames_are_those_asked_for(tmp_path: Path) -> None:
-    scene = write_kubric(tmp_path, 0, views=5, frames=16)
-    assert opened(scene, start=1, stride=1).sample.frame_numbers == tuple(range(1, 15))
-    with pytest.raises(RecipeError, match=r"may start at 0 to 2, got 3"):
-        opened(scene, start=3)
-    with pytest.raises(RecipeError, match=r"with stride 2 .* got 0"):
-        opened(scene, start=0, stride=2)
-
-
 def test_a_scene_that_is_too_short_is_shown_whole(drive: Path) -> None:
     footage = opened(drive)
     assert footage.sample.frame_numbers == tuple(range(FRAMES))
@@ -149,9 +137,8 @@ def test_what_is_no_scene_is_refused_with_what_to_give_instead(orbit: Path, tmp_
 
 
 def test_pair_shards_name_an_unknown_clip_and_a_damaged_shard(pairs: Path, tmp_path: Path) -> None:
-    code, told = shown(pairs, "--clip", 9)
+    code, told = shown(pairs, "--seed", 9)
     assert (code, "no clip of seed 9" in told) == (RecipeError.exit_code, True)
-    assert "leave out --start" in shown(pairs, "--start", 0)[1]
     write_pairs(tmp_path)
     shard = tmp_path / "shard-00000005-1.zip"
     shard.write_bytes(shard.read_bytes()[:-40])

@@ -18,7 +18,7 @@ from typer import Option
 from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, weights_path
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.diffusion import Quality, Sampler, SolverName
+from gcd_model.diffusion import Sampler, SolverName
 from gcd_train.data.files import package_version
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
@@ -47,6 +47,7 @@ from gcd_train.evaluation.predictors import (
     open_weights,
 )
 from gcd_train.evaluation.store import LPIPS, RunNote
+from gcd_train.evaluation.tables import counted
 
 _SAME_PATH_M = 1e-3
 """Largest difference between the entries of two poses that count as one; more is another path."""
@@ -90,19 +91,15 @@ class SynthesizedViews:
     def name(self) -> str:
         """The weights' name, with what is not as shipped of how they are sampled."""
         options = self.options
-        told = [] if options.quality == "exact" else [options.quality]
-        told += [] if options.steps is None else [f"{options.steps} step{'' if options.steps == 1 else 's'}"]
+        told = [] if options.steps is None else [counted(options.steps, "step")]
         told += [] if options.solver is None else [options.solver]
         told += [] if options.guidance is None else ["guidance {:g} to {:g}".format(*options.guidance)]
-        if options.guidance_interval is not None:
-            told.append("guided from {:g} to {:g}".format(*options.guidance_interval))
         return self.weights().traits.name + (f" ({', '.join(told)})" if told else "")
 
     @property
     def details(self) -> dict[str, str]:
         traits, options = self.weights().traits, self.options
         used = Sampler.of(traits.config.sampling, options)
-        interval = used.guidance_interval
         return {
             "weights": traits.sha256_12,
             "family": "unknown" if traits.family is None else traits.family.name,
@@ -112,7 +109,6 @@ class SynthesizedViews:
             "samples": str(options.samples),
             "seed": str(options.seed),
             "precision": traits.precision,
-            **({} if interval is None else {"guided from": "{:g} to {:g}".format(*interval)}),
         }
 
     @property
@@ -196,11 +192,7 @@ class EvaluateOptions(ClipOptions):
     guidance: Annotated[
         tuple[float, float] | None, Option(help="Of the first and the last frame; by default as shipped.")
     ] = None
-    quality: Annotated[Quality, Option(help="As the weights ship, or in fewer steps where they take many.")] = "exact"
     solver: Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")] = None
-    guidance_interval: Annotated[
-        tuple[float, float] | None, Option(help="Noise levels guidance applies at; by default all.")
-    ] = None
     baselines: Annotated[bool, Option(help="Also measure what has to be beaten.")] = True
     methods: Annotated[
         list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")
@@ -244,10 +236,8 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
     options, methods = replace(options, samples=samples), list[Predictor]()
     if weights is not None:
         sampling = RenderOptions(
-            quality=options.quality,
             solver=options.solver,
             guidance=options.guidance,
-            guidance_interval=options.guidance_interval,
             samples=samples,
             seed=options.seed,
         )

@@ -36,11 +36,9 @@ _STAGE, _VEHICLE = "world: z up, ground at z = 0", "vehicle: x ahead, y left, z 
 class ShowOptions:
     """Which clip is shown: options of `gcd-train show`."""
 
-    start: Annotated[int | None, Option(min=0, help="First frame of the clip; drawn by --seed if left out.")] = None
-    stride: Annotated[int | None, Option(min=1, help="Every how many frames; drawn by --seed if left out.")] = None
-    seed: Annotated[int, Option(min=0, help="Draws the clip and the camera path.")] = 0
-    clip: Annotated[
-        int | None, Option(min=0, help="In pair shards: seed of the clip to show; the first if left out.")
+    seed: Annotated[
+        int | None,
+        Option(min=0, help="Draws clip and camera path; of pair shards the clip's own."),
     ] = None
     points: Annotated[
         bool, Option("--points", help="Draw the target from the cameras' points, not from geometry.npz.")
@@ -51,17 +49,11 @@ def open_scene(path: Path, options: ShowOptions) -> Footage:
     """The clip of a scene folder, or of a folder of pair shards.
 
     Raises: DataError if there is no such folder or it is of no known layout, FileFault (a DataError) naming the file
-    that cannot be read, RecipeError for options that do not fit.
+    that cannot be read, RecipeError for a seed of no clip.
     """
     path = path.resolve()
     if path.suffix == ".zip" or (path / "world.json").exists():
-        if options.start is not None or options.stride is not None:
-            raise RecipeError(
-                "pair shards hold finished clips: leave out --start and --stride, or name one with --clip"
-            )
-        return _pair_clip(path, options.clip)
-    if options.clip is not None:
-        raise RecipeError("--clip names a clip of pair shards; choose one of a scene with --start, --stride and --seed")
+        return _pair_clip(path, options.seed)
     if not path.is_dir():
         raise DataError(f"{path} is no folder; give a scene such as scn00000 or scene_000000, or pair shards")
     return _scene_clip(_data_set(path), path.name, options)
@@ -93,13 +85,14 @@ def _data_set(path: Path) -> Dataset4D:
 
 
 def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
-    """A clip of a scene. Raises: FileFault naming the file that cannot be read, RecipeError for frames that are not."""
+    """A clip of a scene. Raises FileFault naming the file that cannot be read."""
     on_sphere, folder, every = isinstance(data, Kubric4D), data.folder(scene), data.frames(scene)
-    numbers, stride = _frame_numbers(every, KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, options)
+    seed = options.seed or 0
+    numbers, stride = _frame_numbers(every, KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, seed)
     views = [data.views(scene, number, [data.source_camera])[0] for number in numbers]
     width = min(_WIDTH, views[0].lens.width)
     lens, pose = render_lens(views[0].lens, width, round(width / _SHAPE)), views[0].world_from_camera
-    still, poses, path = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
+    still, poses, path = _orbit(pose, len(numbers), seed) if on_sphere else _drive(len(numbers))
     draw = Draw(frame_numbers=numbers, fps=data.fps / stride, world_from_source=still, world_from_target=poses)
     sample, target_is = _sample(data, scene, draw, (lens.width, lens.height), exact=not options.points)
     layout = "Kubric-4D layout" if on_sphere else "ParallelDomain-4D layout"
@@ -121,23 +114,11 @@ def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     )
 
 
-def _frame_numbers(frames: int, sampling: FrameSampling, options: ShowOptions) -> tuple[tuple[int, ...], int]:
+def _frame_numbers(frames: int, sampling: FrameSampling, seed: int) -> tuple[tuple[int, ...], int]:
     """The clip's frames and stride; of a scene that is too short all of its frames."""
-    clip = sampling.clip
-    strides = sampling.strides if options.stride is None else (options.stride,)
-    if options.stride is None and options.start is None and sampling.last_start(frames, 1) < 0:
-        return tuple(range(min(frames, clip))), 1
-    reaching = replace(sampling, strides=strides, reach_last=True, reverse=0.0, latest_start=None)
-    if options.start is None:
-        return reaching.draw(generator(options.seed, 0), frames)
-    stride = options.stride or 1
-    last = reaching.last_start(frames, stride)
-    if not 0 <= options.start <= last:
-        raise RecipeError(
-            f"the scene has {frames} frames: with stride {stride} a clip of {clip} may start at 0 to {last}, got "
-            f"{options.start}; change --start or --stride"
-        )
-    return tuple(range(options.start, options.start + clip * stride, stride)), stride
+    if sampling.last_start(frames, 1) < 0:
+        return tuple(range(min(frames, sampling.clip))), 1
+    return replace(sampling, reach_last=True, reverse=0.0, latest_start=None).draw(generator(seed, 0), frames)
 
 
 def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> tuple[Poses, Poses, str]:
