@@ -84,12 +84,6 @@ def test_the_command_makes_clips(tmp_path: Path) -> None:
     assert "choose another folder" in again.output
 
 
-def test_a_mount_that_is_no_number_is_refused(tmp_path: Path) -> None:
-    made = CliRunner().invoke(app, ["generate", "driving", "--out", str(tmp_path), "--mount-height", "nan"])
-    assert made.exit_code == 78
-    assert "mount" in made.output
-
-
 @needs_egl
 def test_a_scene_in_two_shards_counts_once(tmp_path: Path) -> None:
     write_shard(tmp_path, TINY, range(2))

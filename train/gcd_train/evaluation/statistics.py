@@ -78,9 +78,14 @@ class Sums:
     below: Array
     common: tuple[int, ...]
 
-    def figure(self, name: FigureName, weights: Array | None = None) -> Array:
-        """One figure of each row, or of the rows as often as each weighting [..., n] says; NaN for nothing."""
-        if name == "miou_common":
+    def figure(self, name: FigureName | int, weights: Array | None = None) -> Array:
+        """One figure of each row, or of the rows as often as each weighting [..., n] says; NaN for nothing.
+
+        name: of the figure, or the id of a class for its intersection over union.
+        """
+        if isinstance(name, int):
+            columns = [_CLASSES + name]
+        elif name == "miou_common":
             columns = [_CLASSES + label for label in self.common]
         elif name == "miou_full":
             columns = list(range(_CLASSES, self.above.shape[1]))
@@ -93,20 +98,16 @@ class Sums:
         there = ~np.isnan(ratio)
         return _divided(np.where(there, ratio, 0.0).sum(-1), there.sum(-1))
 
-    def class_iou(self) -> Array:
-        """Intersection over union of each class over all rows, [K]; NaN for one that is nowhere."""
-        return _divided(self.above[:, _CLASSES:].sum(0), self.below[:, _CLASSES:].sum(0))
-
-    def value(self, name: FigureName) -> float:
+    def value(self, name: FigureName | int) -> float:
         """One figure of all rows."""
         return float(self.figure(name, np.ones(len(self.above))))
 
-    def again(self, name: FigureName) -> Array:
+    def again(self, name: FigureName | int) -> Array:
         """The figure of rows drawn with repetition, [DRAWS]; NaN for a single row."""
         rows = len(self.above)
         return np.full(DRAWS, np.nan) if rows < 2 else self.figure(name, scene_weights(rows))
 
-    def interval(self, name: FigureName) -> Interval:
+    def interval(self, name: FigureName | int) -> Interval:
         """One figure with its bounds."""
         return _interval(self.value(name), lambda: self.again(name))
 

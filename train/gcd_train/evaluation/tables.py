@@ -176,22 +176,10 @@ def region_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
 
 def class_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
     """Intersection over union of each class at picture size; what occurs nowhere is left out."""
-    methods = [method for method in of.methods if method.makes_classes]
-    iou = [each.sums(frames).class_iou() for each in methods]
-    there = [place for place in range(len(of.note.classes)) if any(np.isfinite(each[place]) for each in iou)]
-    rows = [
-        Row(
-            method=method.starred,
-            clips=f"{len(method.records)} of {len(of.clips)}",
-            cells=tuple(
-                Cell(figure=Interval(value=float(each[place])), starred=method.copies_classes) for place in there
-            ),
-        )
-        for method, each in zip(methods, iou, strict=True)
-    ]
-    names = tuple(of.note.classes[place] for place in there)
+    columns = [Column(heading=name, figure=label) for label, name in enumerate(of.note.classes)]
+    methods = tuple(method for method in of.methods if method.makes_classes)
     title = f"IoU of each class: {frames_told(of, frames)}"
-    return Table(name="classes", title=title, headings=names, rows=tuple(rows))
+    return _own_table(replace(of, methods=methods), columns, frames, "classes", title)
 
 
 def _own_table(of: EvaluatedSet, columns: Sequence[Column], frames: Span, name: str, title: str) -> Table:
