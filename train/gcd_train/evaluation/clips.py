@@ -321,19 +321,20 @@ class SceneSet(EvaluationSet):
             order.append(int(np.linalg.norm(at[:, None] - at[order], axis=-1).min(axis=1).argmax()))
         chosen = [names[place - 1] for place in order[1:]]
         each = [self.dataset.views(scene, time, chosen) for time in times] if chosen else []
-        return [[self._other(views[place]) for views in each] for place in range(count)]
+        size = self.width, self.height
 
-    def _other(self, view: SceneView) -> SceneView:
-        """At the clips' size."""
-        classes = self._places_of(view.classes)
-        return SceneView(
-            rgb=trained_picture(view.rgb, self.width, self.height),
-            depth=nearest_resized(view.depth, self.width, self.height),
-            classes=None if classes is None else nearest_resized(classes, self.width, self.height),
-            instances=None,
-            world_from_camera=view.world_from_camera,
-            lens=trained_lens(view.lens, self.width, self.height),
-        )
+        def resized(view: SceneView) -> SceneView:
+            classes = self._places_of(view.classes)
+            return replace(
+                view,
+                rgb=trained_picture(view.rgb, *size),
+                depth=nearest_resized(view.depth, *size),
+                classes=None if classes is None else nearest_resized(classes, *size),
+                instances=None,
+                lens=trained_lens(view.lens, *size),
+            )
+
+        return [[resized(views[place]) for views in each] for place in range(count)]
 
 
 def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:

@@ -386,9 +386,9 @@ def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> 
 METHODS: dict[str, MethodKind] = {
     "copy_source": MethodKind(make=lambda *_: CopySource(), makes="both", usual=True),
     "ground_homography": MethodKind(make=lambda *_: GroundHomography(), makes="both", usual=True),
-    REPROJECT_RGBD: MethodKind(make=lambda _, asked, __: ReprojectRgbd(published=_released(asked)), usual=True),
+    REPROJECT_RGBD: MethodKind(make=lambda *given: ReprojectRgbd(published=_released(given[1])), usual=True),
     REPROJECT_SEMD: MethodKind(
-        make=lambda clips, asked, _: ReprojectSemd(classes=clips.classes, published=_released(asked)),
+        make=lambda *given: ReprojectSemd(classes=given[0].classes, published=_released(given[1])),
         makes="classes",
         usual=True,
     ),

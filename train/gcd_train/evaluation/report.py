@@ -174,7 +174,10 @@ class _Writer:
 
     def plots(self, drawn: bool) -> Iterator[str]:
         for plot in all_plots(self.of):
-            by_point = self._written(f"plots/{plot.name}.csv", curves_csv(plot))
+            points = [(name, point) for name, curve in plot.curves.items() for point in curve]
+            lines = [[name, "" if isnan(p.x) else f"{p.x:g}", *numbers(p.y), str(p.clips)] for name, p in points]
+            heads = ["method", plot.across, plot.up, "low", "high", "clips"]  # levels have no x
+            by_point = self._written(f"plots/{plot.name}.csv", csv_text(heads, lines))
             if drawn:
                 shown, picture = f"{plot.up} by {plot.across}", self.place / f"plots/{plot.name}.png"
                 draw(plot, self.out / picture)
@@ -239,10 +242,11 @@ def error_by_angle(of: EvaluatedSet) -> Plot:
     """
     curves: dict[str, list[Point]] = {}
     for method in of.methods:
-        turned = {record.key: abs(record.change[0]) for record in method.records if record.change is not None}
-        groups: dict[float, list[str]] = {}
-        for key, place in zip(turned, angle_bins(list(turned.values())), strict=True):
-            groups.setdefault(place, []).append(key)
+        turned = {each.key: abs(each.change[0]) for each in method.records if each.change is not None}
+        many, groups = len({round(angle, 1) for angle in turned.values()}) > _MOST_ANGLES, dict[float, list[str]]()
+        for key, angle in turned.items():  # as it is or, where many differ, in the middle of its step
+            middle = (min(angle, 179.999) // ANGLE_STEP_DEG + 0.5) * ANGLE_STEP_DEG
+            groups.setdefault(middle if many else round(angle, 1), []).append(key)
         points = [
             Point(x=x, y=method.sums("last", keys=keys).interval("psnr_db"), clips=len(keys))
             for x, keys in sorted(groups.items())
@@ -269,21 +273,6 @@ def ssim_by_views(of: EvaluatedSet) -> Plot:
             curves.setdefault(f"{name}, {region}", []).append(point)
     title = "HexPlane, frames 2 to the last"
     return Plot(name="ssim_by_views", title=title, across="views given", up="SSIM", curves=curves)
-
-
-def curves_csv(plot: Plot) -> str:
-    """One point a line; levels have no x."""
-    points = [(name, point) for name, curve in plot.curves.items() for point in curve]
-    lines = [[name, "" if isnan(p.x) else f"{p.x:g}", *numbers(p.y), str(p.clips)] for name, p in points]
-    return csv_text(["method", plot.across, plot.up, "low", "high", "clips"], lines)
-
-
-def angle_bins(angles: Sequence[float]) -> list[float]:
-    """Where each angle, in degrees, stands on the axis: as it is, or, where many differ, in the middle of its step."""
-    rounded = [round(angle, 1) for angle in angles]
-    if len(set(rounded)) <= _MOST_ANGLES:
-        return rounded
-    return [(np.floor(min(angle, 179.999) / ANGLE_STEP_DEG) + 0.5) * ANGLE_STEP_DEG for angle in angles]
 
 
 _SIZE_IN = (7.2, 4.4)

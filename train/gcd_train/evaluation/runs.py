@@ -1,6 +1,6 @@
 """Runs of evaluations put together: what was measured on the same clips stands in the same tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -143,19 +143,15 @@ def _set(runs: Sequence[Run]) -> EvaluatedSet:
                 classes=len(run.note.classes),
             )
             other = found.setdefault(name, method)
-            if not _same_method(other.details, method.details):
+            # frames from elsewhere are known by their content, and LPIPS may have been left out of one of the two
+            left_out = {FRAMES_IN} if LPIPS in other.details and LPIPS in method.details else {FRAMES_IN, LPIPS}
+            keys = (other.details.keys() | method.details.keys()) - left_out
+            if any(other.details.get(key) != method.details.get(key) for key in keys):
                 raise RunError(
                     f"{name} is another method in {other.folder} than in {run.folder}: {other.details} and "
                     f"{method.details}; measure it alike in both, give one another name, or report the runs apart"
                 )
     return EvaluatedSet(note=first.note, methods=tuple(found.values()))
-
-
-def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
-    """Whether two notes are of one method: frames from elsewhere are known by their content, wherever they lie, and
-    LPIPS may have been left out of one of the two runs."""
-    left_out = {FRAMES_IN} if LPIPS in first and LPIPS in other else {FRAMES_IN, LPIPS}
-    return all(first.get(name) == other.get(name) for name in (first.keys() | other.keys()) - left_out)
 
 
 _SAME_CHANGE = 0.01  # degrees and metres

@@ -119,7 +119,7 @@ def scene_weights(count: int) -> Array:
     return random.multinomial(count, np.full(count, 1.0 / count), size=DRAWS).astype(np.float64)
 
 
-def difference(first: Sums, other: Sums, name: FigureName) -> Interval:
+def difference(first: Sums, other: Sums, name: FigureName | int) -> Interval:
     """How far `first` lies above `other`, both on the same clips: in each draw the same scenes of both."""
     return _interval(first.value(name) - other.value(name), lambda: first.again(name) - other.again(name))
 

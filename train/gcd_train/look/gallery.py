@@ -14,7 +14,6 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from typer import Option
 
 from gcd_model import (
@@ -304,8 +303,10 @@ def view_window(synthesizer: ViewSynthesizer, window: Windowed, options: Gallery
         for number, sample in enumerate(view.samples):
             strips.append(Strip.of(name if number == 0 else f"{name} sample {number + 1}", to_bytes(sample)))
         deviation, word = (view.uncertainty, "uncertainty") if view.uncertainty is not None else (view.std, "deviation")
-        if deviation is not None:
-            strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", _heat(deviation.numpy())))
+        if deviation is not None:  # black is 0, the brightest its largest
+            grey = np.rint(deviation.numpy() / max(float(deviation.max()), 1e-6) * 255).clip(0, 255).astype(np.uint8)
+            heat = [cv2.applyColorMap(each, cv2.COLORMAP_INFERNO)[..., ::-1].astype(np.uint8) for each in grey]
+            strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", np.stack(heat)))
         if view.classes is not None:
             strips.append(Strip.of("classes", painted(view.classes[0], traits.classes)))
     return strips
@@ -315,12 +316,6 @@ def write_views(window: Windowed, strips: Sequence[Strip], folder: Path) -> None
     """`NAME.png`, the sheet, and `NAME.mp4`, all rows side by side. Raises RunError if they cannot be written."""
     write_sheet([(f"{window.video} from {window.start_s:.1f} s", strips)], folder / f"{window.name}.png")
     write_video(strips, window.fps, folder / f"{window.name}.mp4")
-
-
-def _heat(values: NDArray[np.float32]) -> Bytes:
-    """Numbers [T, H, W] as pictures [T, H, W, 3]: black is 0, the brightest is their largest."""
-    grey = np.rint(values / max(float(values.max()), 1e-6) * 255).clip(0, 255).astype(np.uint8)
-    return np.stack([np.asarray(cv2.applyColorMap(each, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8) for each in grey])
 
 
 _STYLE = (

@@ -1,7 +1,6 @@
 """A clip as it is shown: what is known of it, its contact sheet, the camera path in space, the side-by-side video."""
 
 import colorsys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -92,11 +91,6 @@ class Footage:
         return np.stack(known).astype(np.int32) if len(known) == len(ids) else None
 
     @property
-    def labelled_by(self) -> str:
-        """The labels in words: classes, instances."""
-        return "instances" if self.ontology is None else "classes"
-
-    @property
     def visible(self) -> NDArray[np.bool_]:
         """Target pixels that the source camera saw, bool [T, H, W]; all where that is unknown."""
         seen = self.sample.visible
@@ -177,18 +171,14 @@ def _rows(footage: Footage) -> list[tuple[str, Strip]]:
     ]
     painted = footage.painted()
     if painted is not None:
-        rows.append(("of the input", Strip.of(footage.labelled_by, painted)))
-    depth = _depth_colours(footage.depth, *footage.depth_range_m)
-    return [*rows, ("near is red", Strip.of("depth", depth))]
-
-
-def _depth_colours(depth: NDArray[np.float32], near_m: float, far_m: float) -> Bytes:
-    """Depth in metres [...] as RGB u8 [..., 3]: near is red, far is dark blue, in equal steps of the logarithm."""
-    known = (depth > 0) & (depth < SKY_M)
-    span = max(np.log(max(far_m, 1e-6) / max(near_m, 1e-6)), 1e-6)
-    share = np.log(np.maximum(depth, 1e-6) / max(near_m, 1e-6)) / span
+        rows.append(("of the input", Strip.of("instances" if footage.ontology is None else "classes", painted)))
+    near_m, far_m = (max(each, 1e-6) for each in footage.depth_range_m)
+    span = max(np.log(far_m / near_m), 1e-6)  # far is dark blue, in equal steps of the logarithm
+    share = np.log(np.maximum(footage.depth, 1e-6) / near_m) / span
     coloured = _TURBO[(255 * (1 - share.clip(0, 1))).round().astype(np.uint8)]
-    return np.where(known[..., None], coloured, np.array(_UNKNOWN, np.uint8))
+    known = ((footage.depth > 0) & (footage.depth < SKY_M))[..., None]
+    depth = np.where(known, coloured, np.array(_UNKNOWN, np.uint8))
+    return [*rows, ("near is red", Strip.of("depth", depth))]
 
 
 def write_sheet(footage: Footage, out: Path) -> None:
@@ -199,19 +189,19 @@ def write_sheet(footage: Footage, out: Path) -> None:
 def write_video(footage: Footage, out: Path) -> None:
     """The clip at its own speed, twice over, as MP4 (MPEG-4 part 2). Raises RunError if it cannot be written."""
     strips, fps, frames = [strip for _, strip in _rows(footage)], footage.sample.fps, len(footage.views)
+
+    def shown(moment: int) -> Bytes:
+        """Two lines of pictures with their names; below them the time, and how much the input camera saw."""
+        upper, lower = beside(strips[:3], moment), beside(strips[3:], moment)
+        missing = upper.shape[1] - lower.shape[1]
+        page = np.concatenate([upper, np.pad(lower, ((0, 24), (0, missing), (0, 0)), constant_values=255)])
+        seen = f"{100 * footage.seen_shares[moment]:.0f} % seen"
+        words = f"t = {moment / fps:.2f} s, frame {footage.sample.frame_numbers[moment]}, {seen}"
+        cv2.putText(page, words, (2, len(page) - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+        return page
+
     moments = [*range(frames), *[frames - 1] * round(HOLD_S * fps)] * 2
-    write_mp4((_video_frame(footage, strips, moment) for moment in moments), fps, out)
-
-
-def _video_frame(footage: Footage, strips: Sequence[Strip], moment: int) -> Bytes:
-    """Two lines of pictures with their names; below them the time, and how much the input camera saw."""
-    upper, lower = beside(strips[:3], moment), beside(strips[3:], moment)
-    missing = upper.shape[1] - lower.shape[1]
-    page = np.concatenate([upper, np.pad(lower, ((0, 24), (0, missing), (0, 0)), constant_values=255)])
-    seen, at = f"{100 * footage.seen_shares[moment]:.0f} % seen", (2, len(page) - 8)
-    words = f"t = {moment / footage.sample.fps:.2f} s, frame {footage.sample.frame_numbers[moment]}, {seen}"
-    cv2.putText(page, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
-    return page
+    write_mp4(map(shown, moments), fps, out)
 
 
 def write_trajectory(footage: Footage, out: Path) -> None:

@@ -176,10 +176,10 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
     lens = Intrinsics.from_hfov(clips.world.hfov_deg, clips.width, clips.height)
     if clips.mount is None:
         orbit = clips.orbit(index)
-        path = "{:+.1f}° azimuth, {:+.1f}° elevation, {:+.1f} m radius, gradual".format(*orbit.change)
+        words = "{:+.1f}° azimuth, {:+.1f}° elevation, {:+.1f} m radius, gradual".format(*orbit.change)
         sample = replace(sample, frame_numbers=orbit.frame_numbers)
     else:
-        path, still = "the driving path, up and back at a sine pace", clips.mount.vehicle_from_camera.numpy()
+        words, still = "the driving path, up and back at a sine pace", clips.mount.vehicle_from_camera.numpy()
         targets = still @ np.linalg.inv(sources) @ targets
         sources = np.broadcast_to(still, targets.shape)
     views = [
@@ -197,7 +197,7 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
     kinds = tuple(OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes))
     return Footage(
         title=f"pair shard, {_world_name(clips.world.name)}, seed {clip.seed}",
-        path=path,
+        path=words,
         scene=f"{sample.frame_numbers[-1] + 1} frames at {clips.fps * clips.world.stride:g} fps, 2 cameras",
         source_camera="source",
         lens=lens,

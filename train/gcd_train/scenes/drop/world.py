@@ -233,7 +233,12 @@ def drop_scene(seed: int, frames: int = 60) -> Scene:
         try:
             tracks, deepest_m = simulate(things, random, frames=frames)
             require_sound(tracks, deepest_m, settled)
-            _require_free_cameras(things, tracks)
+            # nothing may come so near to a camera that it could stand inside or fill the view
+            eyes = np.stack([poses[0, :3, 3] for poses in orbit_cameras(1).values()])
+            reach = np.array([np.linalg.norm(thing.size) / 2 for thing in things]) + ORBIT.near_m
+            away = np.linalg.norm(tracks.positions[:, :, None] - eyes, axis=-1).min((0, 2))  # [N]
+            if (away < reach).any():
+                raise UnsoundSceneError(f"a {things[int((away - reach).argmin())].name} reaches a camera")
         except UnsoundSceneError as error:
             reasons.append(str(error))
             continue
@@ -270,15 +275,6 @@ def _random_things(random: np.random.Generator) -> list[Thing]:
     settled, thrown = int(random.integers(6, 17)), int(random.integers(1, 7))
     sides = random.uniform(*_SIDES_M, size=settled + thrown)
     return [random_thing(random, side_m=float(side), dynamic=i >= settled) for i, side in enumerate(sides)]
-
-
-def _require_free_cameras(things: list[Thing], tracks: Tracks) -> None:
-    """Raises UnsoundSceneError if something comes so near to a camera that it could stand inside or fill the view."""
-    cameras = np.stack([poses[0, :3, 3] for poses in orbit_cameras(1).values()])
-    reach = np.array([np.linalg.norm(thing.size) / 2 for thing in things]) + ORBIT.near_m
-    away = np.linalg.norm(tracks.positions[:, :, None] - cameras, axis=-1).min((0, 2))  # [N]
-    if (away < reach).any():
-        raise UnsoundSceneError(f"a {things[int((away - reach).argmin())].name} reaches a camera")
 
 
 DOME_M = 40.0
