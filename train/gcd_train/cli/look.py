@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from typer import Argument, Option
 
-from gcd_model import Trajectory, ViewSynthesizer, load_synthesizer
+from gcd_model import ViewSynthesizer, load_synthesizer
 from gcd_model.errors import NonFiniteError
 from gcd_train.cli.common import (
     Device,
@@ -82,23 +82,18 @@ def gallery_command(
     with errors_shown():
         found, options = find_videos(videos), GalleryOptions(**given)
         model = load_synthesizer(weights, family=family, device=device, dtype=dtype)
-        assumed = _assumed(paths(model.traits, options), options)  # refused before any video is read
+        start, facts = paths(model.traits, options)[0][1].source, _facts(model, options)  # refused before any is read
+        if start and options.source is None and (options.mount_height, options.mount_tilt) == (None, None):
+            stands = (
+                f"taken to stand at an elevation of {start.elevation_deg:g} degrees and a radius of {start.radius_m:g}"
+            )
+            facts.append(("source camera", f"{stands}; say where with --source-elevation-deg and --source-radius"))
+            say(": ".join(facts[-1]))
         viewed, faults = _viewed(found, model, options, out)
-        write_page(viewed, faults, [*_facts(model, options), *assumed], out / "index.html")
-        for _, told in assumed:
-            say(f"source camera: {told}")
+        write_page(viewed, faults, facts, out / "index.html")
         if not viewed:
             raise DataError(f"none of {len(found)} videos can be shown; {faults[0]}")
     say(f"wrote {out}/index.html: {len(viewed)} windows")
-
-
-def _assumed(paths: Sequence[tuple[str, Trajectory]], options: GalleryOptions) -> list[tuple[str, str]]:
-    """Where a steered model's source camera is taken to stand, if nobody said it."""
-    start = paths[0][1].source
-    if start is None or options.source is not None or (options.mount_height, options.mount_tilt) != (None, None):
-        return []
-    stands = f"taken to stand at an elevation of {start.elevation_deg:g} degrees and a radius of {start.radius_m:g}"
-    return [("source camera", f"{stands}; say where with --source-elevation-deg and --source-radius")]
 
 
 def _viewed(

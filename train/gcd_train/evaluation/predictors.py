@@ -238,23 +238,6 @@ def _pictures(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.suffix in _PICTURES and path.stem.isdecimal()]
 
 
-def read_draw(path: Path) -> list[Bytes]:
-    """RGB pictures, uint8 [H, W, 3] each, of a folder of numbered pictures, or of a video.
-
-    Raises: DataError, naming it, for a damaged file, or a folder whose pictures do not count up one by one.
-    """
-    if path.is_dir():
-        found = sorted(_pictures(path), key=lambda each: int(each.stem))
-        numbers = [int(each.stem) for each in found]
-        if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
-            raise DataError(f"{path} holds frames {numbers}, one is missing or there twice; number them from 0 on")
-        return [read_colour(each) for each in found]
-    frames = list(video_frames(path))
-    if not frames:
-        raise DataError(f"{path} holds no frame that can be decoded; save the frames as PNG")
-    return frames
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SavedFrames:
     """The frames that a folder holds for each clip; see `find_draws` for how they may lie there.
@@ -295,7 +278,14 @@ class SavedFrames:
         """
         made, lens = list[Prediction](), clip.cameras.target
         for draw in find_draws(self.folder, clip.key):
-            frames = read_draw(draw)
+            if draw.is_dir():
+                found = sorted(_pictures(draw), key=lambda each: int(each.stem))
+                numbers = [int(each.stem) for each in found]
+                if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
+                    raise DataError(f"{draw} holds frames {numbers}, one is missing or twice there; number them from 0")
+                frames = [read_colour(each) for each in found]
+            else:
+                frames = list(video_frames(draw))
             if len(frames) != len(clip.source):
                 raise DataError(f"{draw} holds {len(frames)} frames, clip {clip.key} has {len(clip.source)}; save all")
             for number, frame in enumerate(frames):

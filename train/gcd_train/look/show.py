@@ -88,7 +88,11 @@ def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
     """A clip of a scene. Raises FileFault naming the file that cannot be read."""
     on_sphere, folder, every = isinstance(data, Kubric4D), data.folder(scene), data.frames(scene)
     seed = options.seed or 0
-    numbers, stride = _frame_numbers(every, KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, seed)
+    sampling = replace(KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, reach_last=True, reverse=0.0, latest_start=None)
+    if sampling.last_start(every, 1) < 0:  # a scene that is too short is shown whole
+        numbers, stride = tuple(range(min(every, sampling.clip))), 1
+    else:
+        numbers, stride = sampling.draw(generator(seed, 0), every)
     views = [data.views(scene, number, [data.source_camera])[0] for number in numbers]
     width = min(_WIDTH, views[0].lens.width)
     lens, pose = render_lens(views[0].lens, width, round(width / _SHAPE)), views[0].world_from_camera
@@ -112,13 +116,6 @@ def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
         look_at=LOOK_AT if on_sphere else DRIVING_GOAL_TARGET,
         world=_STAGE if on_sphere else _VEHICLE,
     )
-
-
-def _frame_numbers(frames: int, sampling: FrameSampling, seed: int) -> tuple[tuple[int, ...], int]:
-    """The clip's frames and stride; of a scene that is too short all of its frames."""
-    if sampling.last_start(frames, 1) < 0:
-        return tuple(range(min(frames, sampling.clip))), 1
-    return replace(sampling, reach_last=True, reverse=0.0, latest_start=None).draw(generator(seed, 0), frames)
 
 
 def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> tuple[Poses, Poses, str]:
