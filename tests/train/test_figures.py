@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_records import record, region
 
-from gcd_train.evaluation.statistics import ClipTable, FigureName, Span, Sums, difference
+from gcd_train.evaluation.statistics import ClipTable, FigureName, Span, Sums
 from gcd_train.evaluation.store import ClipRecord, Region
 
 
@@ -43,10 +43,10 @@ def test_the_interval_of_a_mean_is_that_of_a_plain_bootstrap_over_scenes() -> No
 
 def test_a_difference_is_paired_so_a_constant_lead_has_no_error() -> None:
     first, other = (summed(scenes(name, shift)) for name, shift in (("a", 1.5), ("b", 0.0)))
-    apart = difference(first, other, "psnr_db")
+    apart = first.interval("psnr_db", other)
     assert (apart.value, apart.low, apart.high) == pytest.approx((1.5,) * 3)
     assert apart.off_zero
-    back = difference(other, first, "psnr_db")
+    back = other.interval("psnr_db", first)
     assert (back.low, back.high) == pytest.approx((-apart.high, -apart.low))
 
 

@@ -5,7 +5,7 @@ clips is one product. Intervals are the bootstrap over scenes, Efron 1979: scene
 scene are alike; the same seed draws the same scenes of every method, so that differences are paired.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, Self, TypeAlias, get_args
@@ -102,14 +102,19 @@ class Sums:
         """One figure of all rows."""
         return float(self.figure(name, np.ones(len(self.above))))
 
-    def again(self, name: FigureName | int) -> Array:
-        """The figure of rows drawn with repetition, [DRAWS]; NaN for a single row."""
-        rows = len(self.above)
-        return np.full(DRAWS, np.nan) if rows < 2 else self.figure(name, scene_weights(rows))
-
-    def interval(self, name: FigureName | int) -> Interval:
-        """One figure with its bounds."""
-        return _interval(self.value(name), lambda: self.again(name))
+    def interval(self, name: FigureName | int, other: "Sums | None" = None) -> Interval:
+        """One figure with the middle 95 % of its draws; or how far it lies above that of others of the same clips, in
+        each draw of the same scenes."""
+        rows, both = len(self.above), (self, *(() if other is None else (other,)))
+        value = float(np.subtract.reduce([each.value(name) for each in both]))
+        if np.isnan(value) or rows < 2:
+            return Interval(value=value)
+        drawn = np.subtract.reduce([each.figure(name, scene_weights(rows)) for each in both])
+        known = drawn[~np.isnan(drawn)]
+        if not known.size:
+            return Interval(value=value)
+        low, high = np.quantile(known, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
+        return Interval(value=value, low=float(low), high=float(high))
 
 
 @lru_cache(maxsize=4)
@@ -117,21 +122,6 @@ def scene_weights(count: int) -> Array:
     """How often each of so many scenes is drawn: [DRAWS, count], each row's sum is `count`."""
     random = np.random.default_rng(SEED)
     return random.multinomial(count, np.full(count, 1.0 / count), size=DRAWS).astype(np.float64)
-
-
-def difference(first: Sums, other: Sums, name: FigureName | int) -> Interval:
-    """How far `first` lies above `other`, both on the same clips: in each draw the same scenes of both."""
-    return _interval(first.value(name) - other.value(name), lambda: first.again(name) - other.again(name))
-
-
-def _interval(value: float, again: Callable[[], Array]) -> Interval:
-    """The middle 95 % of what is not NaN; `again` is called only for a figure that there is."""
-    drawn = np.empty(0) if np.isnan(value) else again()
-    known = drawn[~np.isnan(drawn)]
-    if not known.size:
-        return Interval(value=value)
-    low, high = np.quantile(known, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
-    return Interval(value=value, low=float(low), high=float(high))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from gcd_train.evaluation.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, row_label, tables_for
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
-from gcd_train.evaluation.statistics import FIGURE_NAMES, SPANS, FigureName, Interval, Span, difference
+from gcd_train.evaluation.statistics import FIGURE_NAMES, SPANS, FigureName, Interval, Span
 from gcd_train.evaluation.store import REGIONS, Region
 
 NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
@@ -335,7 +335,7 @@ def differences(
     keys, found = first.common_keys(other) if keys is None else keys, list[Difference]()
     for column in columns if keys else ():
         ours, theirs = (each.sums(frames, column.region, keys) for each in (first, other))
-        apart = difference(ours, theirs, column.figure)
+        apart = ours.interval(column.figure, theirs)
         if apart.known:
             found.append(
                 Difference(
