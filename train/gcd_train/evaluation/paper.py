@@ -21,11 +21,6 @@ class Column:
     region: Region = "all"
     digits: int = 2
 
-    @property
-    def of_classes(self) -> bool:
-        """Whether it tells how good class maps are, not pictures."""
-        return isinstance(self.figure, int) or self.figure == "miou_common"
-
 
 PICTURE_COLUMNS = (
     Column(heading="PSNR all", figure="psnr_db"),

@@ -19,7 +19,6 @@ from gcd_train.evaluation.statistics import FEW_SCENES, SEED, Interval, Span
 from gcd_train.evaluation.store import Region, Run, folder_name
 from gcd_train.evaluation.tables import (
     NOTHING,
-    STAR_OF_FIGURE,
     Difference,
     Table,
     all_figures,
@@ -167,8 +166,6 @@ class _Writer:
                 "How far it lies above the other on the same clips; bold where zero lies outside the 95 % interval, "
                 f"which is paired over scenes. {self._written('tables/differences.csv', differences_csv(every))}"
             )
-        if any(each.starred for each in every):
-            yield STAR_OF_FIGURE
         if every and self.of.scenes < FEW_SCENES:
             yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold."
 

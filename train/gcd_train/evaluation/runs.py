@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 
 from gcd_train.errors import RunError
-from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.statistics import FRAMES_OF, ClipTable, Span, Sums
 from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, ClipRecord, Region, Run, RunNote
 
@@ -31,11 +30,6 @@ class MethodRecords:
     def starred(self) -> str:
         """Its name, with a star where it was given more than the source video: exact depth, or further cameras."""
         return f"{self.name} *" if self.records[0].privileged else self.name
-
-    @property
-    def copies_classes(self) -> bool:
-        """Whether its class maps, and nothing else of it, are made from the source's exact ones."""
-        return not self.records[0].privileged and self.details.get("baseline") in FROM_EXACT_CLASSES
 
     @property
     def makes_pictures(self) -> bool:

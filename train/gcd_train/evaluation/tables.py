@@ -9,6 +9,7 @@ from math import isnan, nan
 
 import numpy as np
 
+from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, row_label, tables_for
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
 from gcd_train.evaluation.statistics import FIGURE_NAMES, SPANS, FigureName, Interval, Span
@@ -18,29 +19,26 @@ NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
 _LINE = "———"
 _OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
 _BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
-STAR_OF_FIGURE = "A * behind a mIoU: these class maps are made from the source's exact ones, which no model is given."
-"""Stands below tables with such a star."""
+_COPIED = "mIoU of {}: these class maps are made from the source's exact ones, which no model is given."
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Cell:
     """One figure of a table, or why there is none.
 
-    digits: behind the point. note: stands in for the figure. starred: the method was given more for this figure than
-    for its others.
+    digits: behind the point. note: stands in for the figure.
     """
 
     figure: Interval = Interval(value=nan)  # noqa: RUF009  it is frozen
     digits: int = 2
     note: str = NOTHING
-    starred: bool = False
 
     def __str__(self) -> str:
         if not self.figure.known:
             return self.note
         values = [f"{number:.{self.digits}f}" for number in (self.figure.value, self.figure.low, self.figure.high)]
         bounds = "" if isnan(self.figure.low) else f" [{values[1]}, {values[2]}]"  # of one scene there are none
-        return values[0] + bounds + (" *" if self.starred else "")
+        return values[0] + bounds
 
 
 def numbers(figure: Interval) -> list[str]:
@@ -214,7 +212,6 @@ def _row(
                 figure=method.sums(frames, column.region).interval(column.figure),
                 digits=column.digits,
                 note=NO_WEIGHTS if column.figure == "lpips" and method.makes_pictures else why_not,
-                starred=method.copies_classes and column.of_classes,
             )
         )
     clips = f"{len(method.records)} of {len(of.clips)}"
@@ -236,8 +233,9 @@ def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[s
     """What stands below a table: its frames and clips, what brackets and stars mean, what is not known."""
     span = frames_told(of, frames)
     notes = [f"{span[0].upper()}{span[1:]} of {len(of.clips)} clips of {of.scenes} scenes. {_BRACKETS}"]
-    if any(column.of_classes for column in columns) and any(each.copies_classes for each in of.methods):
-        notes.append(STAR_OF_FIGURE)
+    copied = [each.name for each in of.methods if each.details.get("baseline") in FROM_EXACT_CLASSES]
+    if copied and any(isinstance(column.figure, int) or column.figure == "miou_common" for column in columns):
+        notes.append(_COPIED.format(" and ".join(copied)))
     if any(column.region not in of.regions for column in columns):
         notes.append("Unknown: nobody knows which pixels of these clips the source camera saw.")
     if any(column.figure == "lpips" for column in columns) and len(of.regions) > 1:
@@ -289,10 +287,7 @@ def clips_csv(of: EvaluatedSet) -> str:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Difference:
-    """How far one method lies above another in one figure. clips: that both have.
-
-    starred: one of them was given more for this figure than for its others, see `MethodRecords.copies_classes`.
-    """
+    """How far one method lies above another in one figure. clips: that both have."""
 
     first: str
     other: str
@@ -300,7 +295,6 @@ class Difference:
     frames: Span
     clips: int
     apart: Interval
-    starred: bool = False
 
     @property
     def verdict(self) -> str:
@@ -312,11 +306,10 @@ class Difference:
     def __str__(self) -> str:
         each = (self.apart.value, self.apart.low, self.apart.high)
         value, low, high = (f"{number:+.{self.column.digits}f}" for number in each)
-        star = " *" if self.starred else ""
         if isnan(self.apart.low):  # one scene tells nothing of it
-            return value + star
+            return value
         text = f"{value} [{low}, {high}]"
-        return (text if self.verdict == "open" else f"**{text}** {self.verdict}") + star
+        return text if self.verdict == "open" else f"**{text}** {self.verdict}"
 
 
 def differences(
@@ -345,7 +338,6 @@ def differences(
                     frames=frames,
                     clips=len(keys),
                     apart=apart,
-                    starred=(first.copies_classes or other.copies_classes) and column.of_classes,
                 )
             )
     return tuple(found)
