@@ -248,12 +248,6 @@ def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay
         both({"lpips": "vgg"}, {"lpips": "alex"})
 
 
-def test_the_same_clips_measured_in_another_way_are_refused() -> None:
-    one, two = (run(note(protocol=name), records("a"), folder=name) for name in ("paper", "release"))
-    with pytest.raises(RunError, match="release has protocol release, paper has paper"):
-        gather([one, two])
-
-
 # --- sets that end at the same goals --------------------------------------------------------------------------------
 
 Change = tuple[float, float, float]

@@ -111,23 +111,12 @@ _PROTOCOLS = {"paper": "the paper's protocol", "release": "the released script's
 def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
     """Sets of clips, in the order of the runs; runs on the same clips make one set.
 
-    Raises RunError where two runs on the same clips were made in other ways, or name two different methods alike.
+    Raises RunError where two runs name two different methods alike.
     """
-    groups: dict[str, list[Run]] = {}
+    notes, sets = dict[str, RunNote](), dict[str, dict[str, MethodRecords]]()
     for run in runs:
-        groups.setdefault(run.note.data_identity, []).append(run)
-    return tuple(map(_set, groups.values()))
-
-
-def _set(runs: Sequence[Run]) -> EvaluatedSet:
-    first, found = runs[0], dict[str, MethodRecords]()
-    for run, name in ((run, name) for run in runs[1:] for name in COMPARABLE):
-        was, now = getattr(first.note, name), getattr(run.note, name)
-        if was != now:
-            raise RunError(
-                f"{run.folder} has {name} {now}, {first.folder} has {was}, on the same clips; report them apart"
-            )
-    for run in runs:
+        notes.setdefault(run.note.data_identity, run.note)
+        found = sets.setdefault(run.note.data_identity, {})
         for name in dict.fromkeys(record.method for record in run.records):
             method = MethodRecords(
                 name=name,
@@ -145,7 +134,7 @@ def _set(runs: Sequence[Run]) -> EvaluatedSet:
                     f"{name} is another method in {other.folder} than in {run.folder}: {other.details} and "
                     f"{method.details}; measure it alike in both, give one another name, or report the runs apart"
                 )
-    return EvaluatedSet(note=first.note, methods=tuple(found.values()))
+    return tuple(EvaluatedSet(note=note, methods=tuple(sets[key].values())) for key, note in notes.items())
 
 
 _SAME_CHANGE = 0.01  # degrees and metres
