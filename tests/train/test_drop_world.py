@@ -23,7 +23,7 @@ from gcd_train.scenes.drop.world import (
     orbit_cameras,
     require_sound,
 )
-from gcd_train.scenes.primitives import CONVEX
+from gcd_train.scenes.triangles import CONVEX
 
 FRAMES = 18
 SEEDS = (2, 7)

@@ -25,9 +25,9 @@ from gcd_train.errors import DataError, RecipeError, RenderError, RunError
 from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.scenes import scene_writer
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.frozen import FrozenScene
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.scene_writer import GIVE_UP_AFTER, generate_scenes, write_scene
+from gcd_train.scenes.triangles import FrozenScene
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)

@@ -19,8 +19,8 @@ from gcd_train.data.files import GEOMETRY, FileFault
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.look.sheet import SKY_M, UNSEEN, Footage
 from gcd_train.look.show import ShowOptions, open_scene
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.triangles import freeze
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, SceneFormat, World
 
 FRAMES = 4

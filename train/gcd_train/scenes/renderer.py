@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Doubles, Extent, Floats
-from gcd_train.scenes.frozen import FrozenScene, Run, indexed, runs_of
 from gcd_train.scenes.shaders import SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
+from gcd_train.scenes.triangles import FrozenScene, Run, indexed, runs_of
 
 
 def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> Doubles:

@@ -39,7 +39,7 @@ from gcd_train.scenes.description import (
     yawed,
 )
 from gcd_train.scenes.drop.things import DropLabel, random_thing
-from gcd_train.scenes.primitives import shape
+from gcd_train.scenes.triangles import shape
 
 FPS = 24.0
 HFOV_DEG = math.degrees(2 * math.atan(0.5))
