@@ -26,8 +26,8 @@ MOST = [
     ("tests/model", 33, 6_561),
     ("gcd_node", 59, 13_502),
     ("tests/node", 37, 10_716),
-    ("train/gcd_train", 110, 25_433),
-    ("tests/train", 75, 13_626),
+    ("train/gcd_train", 109, 24_993),
+    ("tests/train", 75, 13_488),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 MOST_DOCS, MOST_README = (14, 1_900), 90
