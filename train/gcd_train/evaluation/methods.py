@@ -352,8 +352,12 @@ def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: Evalua
     return tuple(found)
 
 
-def _released(options: EvaluateOptions) -> bool:
-    return options.protocol == "release"
+def _reproject_rgbd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> ReprojectRgbd:
+    return ReprojectRgbd(published=options.protocol == "release")
+
+
+def _reproject_semd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> ReprojectSemd:
+    return ReprojectSemd(classes=clips.classes, published=options.protocol == "release")
 
 
 def _hexplane(clips: EvaluationSet, options: EvaluateOptions, views: int) -> HexPlane:
@@ -386,12 +390,8 @@ def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> 
 METHODS: dict[str, MethodKind] = {
     "copy_source": MethodKind(make=lambda *_: CopySource(), makes="both", usual=True),
     "ground_homography": MethodKind(make=lambda *_: GroundHomography(), makes="both", usual=True),
-    REPROJECT_RGBD: MethodKind(make=lambda *given: ReprojectRgbd(published=_released(given[1])), usual=True),
-    REPROJECT_SEMD: MethodKind(
-        make=lambda *given: ReprojectSemd(classes=given[0].classes, published=_released(given[1])),
-        makes="classes",
-        usual=True,
-    ),
+    REPROJECT_RGBD: MethodKind(make=_reproject_rgbd, usual=True),
+    REPROJECT_SEMD: MethodKind(make=_reproject_semd, makes="classes", usual=True),
     VANILLA_SVD: MethodKind(make=_vanilla_svd),
     "hexplane": MethodKind(make=_hexplane, views=True),
 }
