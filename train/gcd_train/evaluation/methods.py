@@ -388,8 +388,8 @@ def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> 
 
 
 METHODS: dict[str, MethodKind] = {
-    "copy_source": MethodKind(make=lambda *_: CopySource(), makes="both", usual=True),
-    "ground_homography": MethodKind(make=lambda *_: GroundHomography(), makes="both", usual=True),
+    "copy_source": MethodKind(make=lambda clips, options, views: CopySource(), makes="both", usual=True),
+    "ground_homography": MethodKind(make=lambda clips, options, views: GroundHomography(), makes="both", usual=True),
     REPROJECT_RGBD: MethodKind(make=_reproject_rgbd, usual=True),
     REPROJECT_SEMD: MethodKind(make=_reproject_semd, makes="classes", usual=True),
     VANILLA_SVD: MethodKind(make=_vanilla_svd),
