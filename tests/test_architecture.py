@@ -25,9 +25,9 @@ MOST = [
     ("model/gcd_model", 41, 9_308),
     ("tests/model", 26, 6_040),
     ("gcd_node", 59, 13_502),
-    ("tests/node", 37, 10_716),
-    ("train/gcd_train", 108, 25_026),
-    ("tests/train", 68, 13_407),
+    ("tests/node", 37, 10_711),
+    ("train/gcd_train", 107, 24_596),
+    ("tests/train", 68, 13_288),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen; they never rise."""
 MOST_DOCS, MOST_README = (14, 1_900), 90

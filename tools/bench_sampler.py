@@ -19,7 +19,7 @@ from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
 from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.predictors import Prediction
-from gcd_train.evaluation.statistics import ClipTable, difference
+from gcd_train.evaluation.statistics import ClipTable
 
 UNGUIDED = (1.0, 1.0)
 HEADS = ["steps", "solver", "guidance", "runs", "latents from Euler", "dB to Euler", "latents from fine", "dB to fine"]
@@ -118,7 +118,7 @@ def show(found, diffusion):
         guidance = "no" if way.guidance == UNGUIDED else "{:g} to {:g}".format(*way.guidance)
         if way.guidance_interval is not None:
             guidance += ", noise {:g} to {:g}".format(*way.guidance_interval)
-        ahead_db, ahead_miou = (difference(truth, own, name) for name in ("psnr_db", "miou_full"))
+        ahead_db, ahead_miou = (truth.interval(name, own) for name in ("psnr_db", "miou_full"))
         row = [way.steps, way.solver, guidance, Schedule.of(diffusion, options_of(way)).evaluations]
         row += [f"{number:.{digits}f}" for number, digits in zip(apart, (4, 1, 4, 1), strict=True)]
         row += [f"{truth.value('psnr_db'):.2f}", f"{ahead_db.value:.2f} [{ahead_db.low:.2f}, {ahead_db.high:.2f}]"]

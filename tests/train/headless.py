@@ -4,8 +4,8 @@ import pytest
 
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.triangles import freeze
 
 
 def _can_draw() -> bool:

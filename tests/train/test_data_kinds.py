@@ -238,9 +238,6 @@ def test_clips_and_methods_follow_the_path_that_the_world_tells(path: CameraWay,
     for trajectory in (clips.trajectory(0), cameras_of(clips, 0).trajectory):
         np.testing.assert_allclose(trajectory.source_from_target.numpy(), wanted.numpy(), atol=1e-9)
         assert trajectory.at_goal.index(True) == goal
-    lower = CameraMount(height_m=1.2)
-    declared = cameras_of(clips, 0, lower).trajectory.source_from_target
-    np.testing.assert_allclose(declared, driving_trajectory(frames=3, move_time=goal, mount=lower).source_from_target)
 
 
 def test_clips_of_both_paths_do_not_go_together(tmp_path: Path) -> None:

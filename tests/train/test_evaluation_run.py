@@ -18,7 +18,7 @@ from gcd_train.evaluation.clips import HeldOutClip, PairedSet, chosen, identity_
 from gcd_train.evaluation.galleries import KeptViews, has_views, write_views
 from gcd_train.evaluation.measure import GIVE_UP_AFTER, Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.predictors import Prediction, Predictor, SourceClip, to_pictures
-from gcd_train.evaluation.store import RunKeeper, folder_name, read_run
+from gcd_train.evaluation.store import Run, RunKeeper, folder_name
 from gcd_train.pictures import png
 
 
@@ -76,7 +76,7 @@ def test_a_run_is_read_back_as_it_was_kept(tmp_path: Path) -> None:
     keeper.begin(told)
     for each in kept:
         keeper.keep(each)
-    assert read_run(tmp_path) == (told, (kept[1], kept[0], kept[2]))
+    assert Run.read(tmp_path) == Run(folder=tmp_path, note=told, records=(kept[1], kept[0], kept[2]))
 
 
 def test_names_become_file_names_and_two_methods_never_share_a_folder(tmp_path: Path) -> None:
@@ -100,17 +100,14 @@ def test_what_never_measured_anything_binds_nobody(tmp_path: Path) -> None:
         keeper.begin(note(methods={"b": {"digest": "3"}}))
 
 
-def test_lines_beside_each_other_keep_each_others_methods_before_there_is_a_record(tmp_path: Path) -> None:
+def test_of_two_lines_the_second_is_refused_while_the_first_measures(tmp_path: Path) -> None:
     first, second = RunKeeper(tmp_path), RunKeeper(tmp_path)
     with first.in_use(note(methods={"a": {}})):
-        with second.in_use(note(methods={"b": {}})), pytest.raises(RunError, match="data_identity"):
-            first.in_use(note(methods={"c": {}}, data_identity="another")).__enter__()
+        with pytest.raises(RunError, match="another line measures in"):
+            second.in_use(note(methods={"b": {}})).__enter__()
         first.keep(record("a", "k"))
-        with pytest.raises(RunError, match="another line measures a in"):
-            second.in_use(note(methods={"b": {}, "a": {}})).__enter__()
-    second.keep(record("b", "k"))
-    with second.in_use(note(methods={"a": {}})):
-        assert list(read_run(tmp_path)[0].methods) == ["a", "b"]
+    with second.in_use(note(methods={"b": {}})):
+        assert list(Run.read(tmp_path).note.methods) == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -128,18 +125,18 @@ def test_another_evaluation_is_refused_with_what_differs(tmp_path: Path, other: 
     RunKeeper(tmp_path).keep(record("a", "k"))
     with pytest.raises(RunError, match=said):
         RunKeeper(tmp_path).begin(msgspec.structs.replace(first, **other))
-    assert read_run(tmp_path)[0] == first
+    assert Run.read(tmp_path).note == first
 
 
 def test_a_damaged_record_is_named_and_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"holds no run\.json"):
-        read_run(tmp_path)
+        Run.read(tmp_path)
     keeper = RunKeeper(tmp_path)
     keeper.begin(note(methods={"a": {}}))
     keeper.keep(record("a", "k"))
     (tmp_path / "records" / "a" / "k.json").write_bytes(b'{"method": "a"')
     with pytest.raises(RunError, match=r"k\.json cannot be used"):
-        read_run(tmp_path)
+        Run.read(tmp_path)
 
 
 # --- measuring -----------------------------------------------------------------------------------------------------
@@ -263,13 +260,15 @@ def test_the_command_measures_and_goes_on(tmp_path: Path) -> None:
     assert "has 2 of its 40 scenes" in said
     for file in ("run.json", "report.md", "tables/figures.csv", "gallery/sheet.png"):
         assert (tmp_path / "run" / file).is_file()
-    told, records = read_run(tmp_path / "run")
+    run = Run.read(tmp_path / "run")
+    told, records = run.note, run.records
     assert (told.protocol, told.kind, told.frames) == ("pairs", "driving", 4)
     assert [each.key for each in records] == ["driving-01000000", "driving-01000001"]
     frames = tmp_path / "run" / "views" / "copy_source"
     code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"saved={frames}", "--split", "driving-test")
     assert code == 0, said
-    told, records = read_run(tmp_path / "run")
+    run = Run.read(tmp_path / "run")
+    told, records = run.note, run.records
     assert list(told.methods) == ["copy_source", "saved"]
     scores = {each.method: each.regions["all"].psnr_db for each in records if each.key == "driving-01000001"}
     assert scores["saved"] == scores["copy_source"]
@@ -290,7 +289,7 @@ def test_a_line_that_measured_nothing_is_told_and_can_be_corrected(
     for folder in (str(frames), "./copy_source"):
         code, said = evaluated(tmp_path, "--no-baselines", "--predictions", f"none={folder}")
         assert code == 0, said
-    assert list(read_run(tmp_path / "run")[0].methods) == ["copy_source", "saved", "none"]
+    assert list(Run.read(tmp_path / "run").note.methods) == ["copy_source", "saved", "none"]
 
 
 def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> None:
@@ -305,7 +304,7 @@ def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> N
     code, said = evaluated(tmp_path, "--no-baselines", *frames, "--privileged", "b")
     assert code == 0, said
     assert ("| a |" in said, "| b * |" in said) == (True, True), said
-    assert [(each.method, each.privileged) for each in read_run(tmp_path / "run")[1]] == [("a", False), ("b", True)]
+    assert {each.method: each.privileged for each in Run.read(tmp_path / "run").records} == {"a": False, "b": True}
     code, said = evaluated(tmp_path, "--no-baselines", *frames)
     assert (code != 0, "privileged of b was yes, is not told" in said) == (True, True), said
 

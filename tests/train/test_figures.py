@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_records import record, region
 
-from gcd_train.evaluation.statistics import ClipTable, FigureName, Span, Sums, difference
+from gcd_train.evaluation.statistics import ClipTable, FigureName, Span, Sums
 from gcd_train.evaluation.store import ClipRecord, Region
 
 
@@ -25,7 +25,7 @@ def summed(records: Sequence[ClipRecord], *, classes: int = 0) -> Sums:
     return ClipTable.of(records, classes).scene_sums()
 
 
-def figure(record: ClipRecord, name: FigureName, frames: Span | int = "2-last", region: Region = "all") -> float:
+def figure(record: ClipRecord, name: FigureName, frames: Span = "2-last", region: Region = "all") -> float:
     return ClipTable.of([record]).scene_sums(frames, region).value(name)
 
 
@@ -43,10 +43,10 @@ def test_the_interval_of_a_mean_is_that_of_a_plain_bootstrap_over_scenes() -> No
 
 def test_a_difference_is_paired_so_a_constant_lead_has_no_error() -> None:
     first, other = (summed(scenes(name, shift)) for name, shift in (("a", 1.5), ("b", 0.0)))
-    apart = difference(first, other, "psnr_db")
+    apart = first.interval("psnr_db", other)
     assert (apart.value, apart.low, apart.high) == pytest.approx((1.5,) * 3)
     assert apart.off_zero
-    back = difference(other, first, "psnr_db")
+    back = other.interval("psnr_db", first)
     assert (back.low, back.high) == pytest.approx((-apart.high, -apart.low))
 
 
@@ -75,29 +75,24 @@ def test_intervals_of_pooled_classes_lie_around_the_figure_of_all() -> None:
         ("2-last", "all", 20.0),
         ("all", "all", 40.0),
         ("last", "all", 30.0),
-        (2, "all", 10.0),
         ("2-last", "occluded", 12.0),  # of frames 3 and 4, frame 2 has no such pixel
-        (2, "occluded", math.nan),
         ("2-last", "visible", math.nan),
     ],
 )
-def test_figures_are_of_the_frames_and_pixels_asked_for(frames: Span | int, pixels: Region, expected: float) -> None:
+def test_figures_are_of_the_frames_and_pixels_asked_for(frames: Span, pixels: Region, expected: float) -> None:
     regions = {"all": region((100.0, 10.0, 20.0, 30.0)), "occluded": region((None, None, 11.0, 13.0))}
     assert figure(record(regions=regions), "psnr_db", frames, pixels) == pytest.approx(expected, nan_ok=True)
 
 
 def test_sharpness_and_flicker_are_ratios_of_sums_without_the_first_frame() -> None:
     clip = record(gradient=(9.0, 1.0, 2.0, 3.0), step=(9.0, 1.0, 3.0))
-    expected: dict[Span | int, tuple[float, float]] = {
+    expected: dict[Span, tuple[float, float]] = {
         "2-last": (1.0, 1.0),
         "last": (1.5, 1.5),
         "all": (15 / 8, 13 / 6),
-        3: (1.0, 0.5),
-        2: (0.5, 4.5),
     }
     found = {frames: (figure(clip, "gradient_energy", frames), figure(clip, "flicker", frames)) for frames in expected}
     assert found == {frames: pytest.approx(each) for frames, each in expected.items()}
-    assert math.isnan(figure(clip, "flicker", 1))
 
 
 # --- classes ------------------------------------------------------------------------------------------------------
@@ -107,14 +102,14 @@ def test_iou_is_pooled_over_clips_not_averaged() -> None:
     one = record(key="a", regions={"all": region(counts=[(0, 0, 90), (1, 0, 10)])}, gradient=None, step=None)
     two = record(key="b", regions={"all": region(counts=[(0, 1, 10), (1, 1, 10)])}, gradient=None, step=None)
     found = summed([one, two])
-    assert found.class_iou() == pytest.approx((90 / 110, 10 / 30))
+    assert (found.value(0), found.value(1)) == pytest.approx((90 / 110, 10 / 30))
     assert found.value("miou_full") == pytest.approx((90 / 110 + 10 / 30) / 2)
     assert math.isnan(found.value("psnr_db"))
 
 
 def test_what_is_said_to_be_of_no_class_is_wrong_and_makes_no_class() -> None:
     found = summed([record(regions={"all": region(counts=[(0, 0, 6), (0, 255, 2), (1, 1, 4)])})], classes=3)
-    assert found.class_iou() == pytest.approx((6 / 8, 1.0, math.nan), nan_ok=True)
+    assert [found.value(label) for label in range(3)] == pytest.approx([6 / 8, 1.0, math.nan], nan_ok=True)
     assert found.common == (0, 1)
 
 

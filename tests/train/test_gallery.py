@@ -1,6 +1,5 @@
 """Real videos: which frames become windows, what is shown of them, and what is said of bad ones."""
 
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +38,6 @@ from gcd_train.look.gallery import (
 )
 
 T, H, W = 4, 32, 64
-REAL = Path(os.environ.get("GCD_REAL_VIDEOS", "no folder of videos"))
 
 
 def traits(family: FamilyName = "kubric90") -> Traits:
@@ -234,12 +232,3 @@ def test_what_cannot_be_shown_is_one_line(tmp_path: Path, weights: Path, more: l
     found, shown = run(tmp_path / "bad.mp4", "--weights", weights, "--out", tmp_path / "out", *more)
     assert found == code
     assert said in shown
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not REAL.is_dir(), reason="needs a folder of real videos, named in GCD_REAL_VIDEOS")
-def test_real_videos_are_shown_by_the_packaged_model(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    code, said = run(REAL, "--weights", "package:live-small", "--windows", 1, "--out", out)
-    assert code == 0, said
-    assert len(list(out.glob("*.png"))) == len(list(REAL.glob("*.mp4"))) == len(list(out.glob("*.mp4")))

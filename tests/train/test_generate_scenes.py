@@ -7,10 +7,8 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
@@ -27,9 +25,9 @@ from gcd_train.errors import DataError, RecipeError, RenderError, RunError
 from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.scenes import scene_writer
 from gcd_train.scenes.description import Scene
-from gcd_train.scenes.frozen import FrozenScene
-from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.scene_writer import GIVE_UP_AFTER, generate_scenes, write_scene
+from gcd_train.scenes.triangles import FrozenScene
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 FORM = SceneFormat(width=48, height=32, frames=2, oversample=1)
@@ -196,63 +194,17 @@ class TestRuns:
         assert (last.done, last.gave_up) == (GIVE_UP_AFTER, True)
         assert "gave up" in last.lines()[-1]
 
-    @pytest.mark.slow
-    def test_two_workers_make_what_one_makes(self, tmp_path: Path) -> None:
-        for name, workers in (("one", 1), ("two", 2)):
-            list(generate_scenes(tmp_path / name, box_world(), FORM, range(3), workers=workers))
-        for scene in ("scn00000", "scn00001", "scn00002"):
-            one, two = (checked(tmp_path / name / scene) for name in ("one", "two"))
-            assert one == two
-
-    def test_a_killed_run_leaves_no_half_scene_and_goes_on(self, tmp_path: Path) -> None:
-        """The process is killed while it is between the first and the last file of its second scene."""
-        child = os.fork()  # a new interpreter would take seconds to import everything
-        if child == 0:
-            try:
-                _killed_in_its_second_scene(tmp_path)
-            finally:
-                os._exit(1)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
-        assert [name for name in inside(tmp_path) if not name.startswith(".")] == ["scn00000"]
-        assert len(inside(tmp_path)) == 2
+    def test_what_a_killed_run_left_is_removed_and_the_run_goes_on(self, tmp_path: Path) -> None:
+        """What a kill leaves, and that it is not what another process is making: see TestNewFolder."""
+        write_scene(tmp_path, box_world(), FORM, 0)
+        half = tmp_path / ".scn00001.0123456789ab.partial"
+        (half / "scn00001").mkdir(parents=True)
+        (half / "lock").touch()
         *_, last = generate_scenes(tmp_path, box_world(), FORM, range(3))
         assert (last.written, last.there) == (2, 1)
         assert inside(tmp_path) == ["scn00000", "scn00001", "scn00002"]
         for name in inside(tmp_path):
             checked(tmp_path / name)
-
-
-def _killed_in_its_second_scene(root: Path) -> None:
-    """What is drawn does not matter, and OpenGL does not outlive a fork: the pictures are grey."""
-    whole = SceneFiles.write
-
-    def write(self: SceneFiles, path: Path, data: bytes) -> None:
-        whole(self, path, data)
-        if self.folder.name == "scn00001" and len(self.checksums) == 7:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    scene_writer.Renderer = GreyRenderer  # pyright: ignore[reportAttributeAccessIssue]
-    SceneFiles.write = write
-    list(generate_scenes(root, box_world(), FORM, range(3)))
-
-
-class GreyRenderer:
-    """As much of a renderer as a scene's writer uses."""
-
-    def __init__(self, width: int, height: int, *, oversample: int) -> None:
-        labels = np.ones((height, width), np.uint8)
-        depth = np.ones((height, width), np.float32)
-        rgb = labels[..., None].repeat(3, -1)
-        self.drawn = Rendering(rgb=rgb, depth=depth, classes=labels, instances=labels, bodies=labels)
-
-    def __enter__(self) -> "GreyRenderer":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
-
-    def views(self, frozen: FrozenScene, cameras: dict[str, Any]) -> Iterator[tuple[int, str, Rendering]]:
-        return ((time, name, self.drawn) for name, poses in cameras.items() for time in range(len(poses)))
 
 
 SMALL = ["--width", "48", "--height", "32", "--frames", "2", "--oversample", "1", "--workers", "1"]

@@ -11,7 +11,6 @@ from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
 from gcd_train.data.sample import SceneView
-from gcd_train.errors import DataError
 from gcd_train.evaluation.baselines import HexPlane
 from gcd_train.evaluation.hexplane import (
     SPACE,
@@ -140,9 +139,3 @@ def test_the_same_seed_learns_the_same_and_another_seed_something_else() -> None
     first, again, other = (made(settings=replace(TINY, updates=3), seed=seed) for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
-
-
-def test_a_clip_with_one_camera_is_refused_by_name() -> None:
-    clip = replace(source_clip(), others=None)
-    with pytest.raises(DataError, match=r"hexplane_2 wants 2 cameras of a scene, but clip scn1\.sample_00 has one"):
-        HexPlane(views=2, settings=TINY).predict(clip)

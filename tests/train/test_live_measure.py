@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -136,6 +137,27 @@ def test_a_shimmering_view_flickers_more_than_its_truth() -> None:
     still = replace(of, video=of.video[:1].repeat(FRAMES, 1, 1, 1) + torch.rand(FRAMES, 1, 1, 1) * 0.01)
     made = figures(MethodViews(video=of.video), still)
     assert made["flicker"] > 10
+
+
+def test_the_homography_is_exact_for_a_plane() -> None:
+    normal, away_m = torch.tensor([0.1, -0.9, 0.3], dtype=torch.float64), -1.6  # n . x = away in the target's axes
+    metres = away_m / (measure.pixel_rays(LENS) @ normal)
+    move = torch.eye(4, dtype=torch.float64)
+    move[:3, :3] = torch.from_numpy(cv2.Rodrigues(np.array([0.05, -0.2, 0.02]))[0])
+    move[:3, 3] = torch.tensor([0.4, -0.1, 0.7])
+    here, there = measure._correspondences(metres, metres > 0, move, LENS, LENS)
+    picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for found in measure._candidates(here, there, picture, picture):
+        mapped = cv2.perspectiveTransform(here[:, None], found)[:, 0]
+        np.testing.assert_allclose(mapped, there, atol=1e-4)
+
+
+def test_an_interval_of_the_report_holds_its_mean() -> None:
+    psnr = {"live": (20.0, 24.0, 21.0, 30.0), "splat": (18.0, 23.0, 22.0, 19.0)}
+    tallies = {name: SimpleNamespace(psnr={str(k): [db] for k, db in enumerate(of)}) for name, of in psnr.items()}
+    (apart,) = measure.differences(SimpleNamespace(tallies=tallies)).values()
+    assert apart["psnr"] == pytest.approx(3.25)
+    assert apart["low"] < apart["psnr"] < apart["high"]
 
 
 def test_frechet_distance_is_that_of_the_means_where_the_spread_is_the_same() -> None:

@@ -20,7 +20,6 @@ from gcd_train.evaluation.metrics import (
     ssim_map,
     void_ids,
     window_mask,
-    without_classes,
 )
 
 
@@ -127,11 +126,3 @@ def test_void_is_known_by_its_name_whatever_the_case() -> None:
     assert void_ids(["Road", "Void", "Car", "unlabelled", "UNLABELED "]) == (1, 3, 4)
     assert void_ids(["Road", "Avoided"]) == ()
     assert void_ids(["Void"] * 256) == ()
-
-
-def test_a_map_without_void_has_no_class_there_and_the_others_stay() -> None:
-    assert without_classes(labels(0), ()).equal(labels(0))
-    made = without_classes(labels(0), (1, 3))
-    assert made.dtype == torch.uint8
-    assert ((made == NO_CLASS) == (labels(0) % 2 == 1)).all()
-    assert made[labels(0) % 2 == 0].equal(labels(0)[labels(0) % 2 == 0])

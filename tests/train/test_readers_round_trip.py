@@ -18,9 +18,9 @@ from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.scenes.driving.classes import class_ids
 from gcd_train.scenes.driving.world import driving_drive
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.triangles import freeze
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
 
 SEED, FRAMES, WIDTH, HEIGHT = 3, 2, 48, 36

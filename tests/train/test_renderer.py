@@ -13,9 +13,8 @@ from headless import drawn, needs_egl
 from gcd_model.geometry import Intrinsics
 from gcd_train.errors import DataError, RenderError
 from gcd_train.scenes.description import DOMES, ORBIT, STREET, Extent, Paint, Part, Pattern, Scene, Sheet, upright
-from gcd_train.scenes.frozen import FrozenScene, freeze, indexed, runs_of, vertices_of
-from gcd_train.scenes.primitives import CONVEX, SHAPES, shape
 from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.triangles import CONVEX, SHAPES, FrozenScene, freeze, indexed, runs_of, shape, vertices_of
 
 FORWARD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
 """world_from_camera of a level camera 1.5 m above the origin that looks along x."""
@@ -233,7 +232,7 @@ def test_a_scene_file_of_another_version_or_a_torn_one_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "geometry.npz"
-    monkeypatch.setattr("gcd_train.scenes.frozen._FORMAT", 1)
+    monkeypatch.setattr("gcd_train.scenes.triangles._FORMAT", 1)
     with path.open("wb") as file:
         freeze(scene([box(10.0, 0.0, 0.0)])).save(file)
     monkeypatch.undo()

@@ -105,7 +105,7 @@ def test_a_damaged_picture_or_video_is_named(tmp_path: Path) -> None:
         predicted(tmp_path / "a")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / f"{KEY}.mp4").write_bytes(b"none")
-    with pytest.raises(FileFault, match="holds no frame that can be decoded"):
+    with pytest.raises(DataError, match=f"{KEY}.mp4 is no whole video file"):
         predicted(tmp_path / "b")
 
 

@@ -23,7 +23,7 @@ from gcd_train.data.splits import RELEASED_SOURCE, SceneControls, public_split, 
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, SceneSet
 from gcd_train.evaluation.opening import ClipOptions, open_clips
-from gcd_train.evaluation.store import read_run
+from gcd_train.evaluation.store import Run
 
 SCENES = ("scn02900", "scene_000005")
 VIEWS = tuple(f"view{number}" for number in range(4))
@@ -267,6 +267,7 @@ def test_the_command_measures_whole_scenes(tmp_path: Path) -> None:
     cameras = [word for view in VIEWS for word in ("--camera", view)]
     result = CliRunner().invoke(app, ["evaluate", *folders, *cut, *cameras, "--methods", "copy_source"])
     assert result.exit_code == 0, result.output
-    told, (record,) = read_run(tmp_path / "run")
+    run = Run.read(tmp_path / "run")
+    told, (record,) = run.note, run.records
     assert (told.kind, told.protocol, told.frames, told.width) == ("kubric", "paper", 14, 384)
     assert (record.key, record.scene, len(record.regions)) == ("scn02900.sample_00", "scn02900", 3)

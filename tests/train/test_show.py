@@ -19,8 +19,8 @@ from gcd_train.data.files import GEOMETRY, FileFault
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.look.sheet import SKY_M, UNSEEN, Footage
 from gcd_train.look.show import ShowOptions, open_scene
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.scene_writer import write_scene
+from gcd_train.scenes.triangles import freeze
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, SceneFormat, World
 
 FRAMES = 4
@@ -75,48 +75,35 @@ def shown(*arguments: object) -> tuple[int, str]:
 def test_every_layout_gives_a_clip_whose_path_begins_at_the_source(layout: str, request: pytest.FixtureRequest) -> None:
     footage = opened(request.getfixturevalue(layout))
     t, h, w = footage.depth.shape
-    assert footage.source.shape == footage.target.shape == footage.splat.shape == (t, h, w, 3)
+    assert footage.source.shape == footage.sample.target.shape == footage.splat.shape == (t, h, w, 3)
     assert footage.visible.shape == footage.surface.shape == (t, h, w)
     assert footage.labels is not None
     assert footage.labels.shape == (t, h, w)
-    assert len(footage.frame_numbers) == t
-    np.testing.assert_allclose(footage.world_from_target[0], footage.world_from_source[0], atol=1e-3)
+    assert len(footage.sample.frame_numbers) == t
+    np.testing.assert_allclose(footage.poses[0], footage.views[0].world_from_camera, atol=1e-3)
     assert footage.seen_shares[0] > 0.97  # from where the source stands, everything was seen by it
     assert np.abs(footage.splat[0].astype(int) - footage.source[0])[footage.depth[0] < SKY_M].mean() < 12
 
 
 def test_only_surfaces_that_were_not_seen_turn_orange(pairs: Path) -> None:
     footage = opened(pairs)
-    assert footage.target_depth is not None
-    visible, depth = footage.visible.copy(), footage.target_depth.copy()
+    assert footage.sample.target_depth is not None
+    visible, depth = footage.visible.copy(), footage.sample.target_depth.copy()
     visible[:, :, :8] = False
     depth[:, :, :4] = 0.0  # sky
-    footage = replace(footage, visible=visible, target_depth=depth)
+    footage = replace(footage, sample=replace(footage.sample, visible=visible, target_depth=depth))
     painted = footage.seen()
-    assert np.array_equal(painted[:, :, 8:], footage.target[:, :, 8:])
-    assert np.array_equal(painted[:, :, :4], footage.target[:, :, :4])
+    assert np.array_equal(painted[:, :, 8:], footage.sample.target[:, :, 8:])
+    assert np.array_equal(painted[:, :, :4], footage.sample.target[:, :, :4])
     assert np.abs(painted[:, :, 4:8].astype(int) - UNSEEN).max() < 100
     assert footage.seen_shares[0] == pytest.approx(40 / 44)
 
 
-# which clip
-
-
-def test_frames_are_those_asked_for(tmp_path: Path) -> None:
-    scene = write_kubric(tmp_path, 0, views=5, frames=16)
-    assert opened(scene, start=1, stride=1).frame_numbers == tuple(range(1, 15))
-    with pytest.raises(RecipeError, match=r"may start at 0 to 2, got 3"):
-        opened(scene, start=3)
-    with pytest.raises(RecipeError, match=r"with stride 2 .* got 0"):
-        opened(scene, start=0, stride=2)
-
-
 def test_a_scene_that_is_too_short_is_shown_whole(drive: Path) -> None:
     footage = opened(drive)
-    assert footage.frame_numbers == tuple(range(FRAMES))
+    assert footage.sample.frame_numbers == tuple(range(FRAMES))
     assert footage.scene == "4 frames at 10 fps, 3 cameras"
-    assert next(iter(footage.names.values())).name == "Car"
-    assert footage.kind_plural == "classes"
+    assert footage.ontology is not None
 
 
 # what goes wrong
@@ -150,9 +137,8 @@ def test_what_is_no_scene_is_refused_with_what_to_give_instead(orbit: Path, tmp_
 
 
 def test_pair_shards_name_an_unknown_clip_and_a_damaged_shard(pairs: Path, tmp_path: Path) -> None:
-    code, told = shown(pairs, "--clip", 9)
+    code, told = shown(pairs, "--seed", 9)
     assert (code, "no clip of seed 9" in told) == (RecipeError.exit_code, True)
-    assert "leave out --start" in shown(pairs, "--start", 0)[1]
     write_pairs(tmp_path)
     shard = tmp_path / "shard-00000005-1.zip"
     shard.write_bytes(shard.read_bytes()[:-40])
@@ -189,8 +175,8 @@ def test_a_scene_of_ours_is_wholly_seen_from_where_its_source_stands(compact: bo
     assert footage.target_is.startswith("rendered")
     assert footage.seen_shares[0] > 0.9
     points = opened(tmp_path / "scn00000", points=True)
-    assert points.target_depth is None
-    assert np.abs(points.target[0].astype(int) - footage.target[0]).mean() < 8
+    assert points.sample.target_depth is None
+    assert np.abs(points.sample.target[0].astype(int) - footage.sample.target[0]).mean() < 8
 
 
 def test_geometry_of_too_few_frames_is_named(tmp_path: Path) -> None:

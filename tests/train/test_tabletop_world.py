@@ -10,11 +10,11 @@ import pytest
 from headless import drawn, needs_egl
 
 from gcd_train.errors import RenderError
-from gcd_train.scenes.frozen import vertices_of
 from gcd_train.scenes.tabletop.arm import FINGERS, build_model, random_setting
 from gcd_train.scenes.tabletop.scene import Episode, tabletop_episode, tabletop_scene
 from gcd_train.scenes.tabletop.simulation import Simulation
 from gcd_train.scenes.tabletop.things import TabletopClass
+from gcd_train.scenes.triangles import vertices_of
 
 pytest.importorskip("mujoco", reason="needs the extra `scenes`: pip install 'gcd-node[scenes]'")
 

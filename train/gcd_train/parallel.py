@@ -167,7 +167,7 @@ _FUNCTION: list[Callable[[Any], Any]] = []
 
 
 def _settle(function: bytes, environment: Mapping[str, str]) -> None:
-    """At the start of a worker, which ends with its parent. function: pickled, as its libraries read the environment."""
+    """At the start of a worker, which ends with its parent. function: pickled, as libraries read the environment."""
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal: the parent decides
     signal.signal(signal.SIGTERM, _leave)

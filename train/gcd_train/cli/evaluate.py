@@ -1,6 +1,5 @@
 """`gcd-train evaluate`, `report` and `calibrate`: weights and what they have to beat, on held-out clips."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -89,27 +88,13 @@ def report_command(
     lead: Annotated[
         list[str] | None, typer.Option(help="Method to compare with all others; by default every model.")
     ] = None,
-    row: Annotated[
-        list[str] | None, typer.Option(help="METHOD=ROW: where a method stands in the paper's tables.")
-    ] = None,
     clips: Annotated[int, typer.Option(min=0, help="Clips in the gallery.")] = 4,
     plots: Annotated[bool, typer.Option(help="Draw plots; needs matplotlib.")] = True,
 ) -> None:
     """Write the paper's tables, or the same for our own clips, from what was measured; nothing is measured again."""
     with errors_shown():
-        path = make_report(
-            runs, out, leads=lead or (), rows=_rows(row or ()), clips=clips, drawn=plots, command=command_line()
-        )
+        path = make_report(runs, out, leads=lead or (), clips=clips, drawn=plots, command=command_line())
     typer.echo(f"wrote {path}")
-
-
-def _rows(given: Sequence[str]) -> dict[str, str]:
-    """METHOD=ROW, several times."""
-    pairs = [text.partition("=") for text in given]
-    for text, (method, _, label) in zip(given, pairs, strict=True):
-        if not method or not label:
-            raise RecipeError(f"--row wants METHOD=ROW, got {text!r}; write --row 'my-model=GCD (gradual, finetuned)'")
-    return {method: label for method, _, label in pairs}
 
 
 def calibrate_command(

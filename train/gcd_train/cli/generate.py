@@ -16,7 +16,6 @@ from gcd_train.scenes.worlds import (
     CameraWay,
     SceneFormat,
     SceneWorld,
-    WorldOptions,
     pair_world,
 )
 
@@ -37,9 +36,6 @@ Clips = Annotated[int | None, typer.Option(min=1, help="How many pairs: implies 
 ClipsPerScene = Annotated[int, typer.Option(min=1, help="Pairs: how many are cut from one simulation.")]
 ClipsPerShard = Annotated[int, typer.Option(min=1, help="Pairs a file.")]
 Way = Annotated[CameraWay, typer.Option(help="Driving, pairs: the target camera moves all the clip, or stands there.")]
-MountHeight = Annotated[float, typer.Option(help="Driving, pairs: true height of the source camera, metres.")]
-MountTilt = Annotated[float, typer.Option(help="Driving, pairs: true tilt of the source camera, degrees down.")]
-_MOUNT = WorldOptions()
 
 
 @app.callback()
@@ -68,33 +64,30 @@ def _add(world: SceneWorld, about: str, *, clips_a_scene: int, clips_a_shard: in
         clips_per_scene: ClipsPerScene = clips_a_scene,
         clips_per_shard: ClipsPerShard = clips_a_shard,
         path: Way = "gradual",
-        mount_height: MountHeight = _MOUNT.height_m,
-        mount_tilt: MountTilt = _MOUNT.tilt_deg,
     ) -> None:
         with errors_shown():
             if (folder is None) == (out is None):
                 raise RecipeError("give one folder for the data, OUT or --out OUT")
             place, processes = folder or out or Path(), workers or os.cpu_count() or 1
-            mount = WorldOptions(height_m=mount_height, tilt_deg=mount_tilt)
-            mounted, on_road = (mount, path) != (_MOUNT, "gradual"), world.name == "driving"
-            if mounted and not on_road:
-                raise RecipeError(f"a mount and a path are for pairs of driving; {world.name} draws its cameras")
+            on_road = world.name == "driving"
+            if path != "gradual" and not on_road:
+                raise RecipeError(f"a path is for pairs of driving; {world.name} draws its cameras")
             if on_road and clips_per_scene != clips_a_scene:
                 raise RecipeError("a pair of driving has a simulation of its own; leave out --clips-per-scene")
             stop_as_by_ctrl_c()
             size = {"width": width, "height": height, "frames": frames, "oversample": oversample}
             given: dict[str, Any] = {name: number for name, number in size.items() if number is not None}
-            if not (pairs or mounted or clips is not None):
+            if not (pairs or path != "gradual" or clips is not None):
                 published = {"width": world.width, "height": world.height, "frames": world.frames}
                 form = SceneFormat(compact=compact, **{**published, **given})
                 _make_scenes(world, place, form, range(first_seed, first_seed + (scenes or 1)), processes, ray)
                 return
             if scenes is not None or compact:
                 raise RecipeError(
-                    "--scenes and --compact make whole scenes; --clips, --pairs, a mount and a path pairs; give one"
+                    "--scenes and --compact make whole scenes; --clips, --pairs and a path pairs; give one"
                 )
             shards = {"clips_per_scene": clips_per_scene, "clips_per_shard": clips_per_shard}
-            made = pair_world(world, SceneFormat(**given), mount=mount, path=path, **shards)
+            made = pair_world(world, SceneFormat(**given), path=path, **shards)
             first = first_seed * made.clips_per_scene
             seeds = range(first, first + (clips or 100))
             with progress_bar("clips", len(seeds), keep=True) as show:

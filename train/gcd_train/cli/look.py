@@ -5,12 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.box import SIMPLE
-from rich.console import Console
-from rich.table import Table
 from typer import Argument, Option
 
-from gcd_model import Trajectory, ViewSynthesizer, load_synthesizer
+from gcd_model import ViewSynthesizer, load_synthesizer
 from gcd_model.errors import NonFiniteError
 from gcd_train.cli.common import (
     Device,
@@ -55,12 +52,8 @@ def show(
         if not place.is_dir() or not os.access(place, os.W_OK):  # before minutes are spent on what would go there
             raise RunError(f"{out} cannot be written to; give a folder that takes files with --out")
         footage = open_scene(scene, ShowOptions(**options))
-        table = Table(title=footage.title, box=SIMPLE, show_header=False, title_justify="left")
-        table.add_column(no_wrap=True)
-        table.add_column()
-        for fact in footage.facts():
-            table.add_row(*fact)
-        Console(highlight=False).print(table)
+        for name, fact in (("title", footage.title), *footage.facts()):
+            say(f"{name + ':':10}{fact}", stderr=False)
         write_sheet(footage, out / "sheet.png")
         write_trajectory(footage, out / "trajectory.png")
         if video:
@@ -82,23 +75,16 @@ def gallery_command(
     with errors_shown():
         found, options = find_videos(videos), GalleryOptions(**given)
         model = load_synthesizer(weights, family=family, device=device, dtype=dtype)
-        assumed = _assumed(paths(model.traits, options), options)  # refused before any video is read
+        start, facts = paths(model.traits, options)[0][1].source, _facts(model, options)  # refused before any is read
+        if start and options.source is None and (options.mount_height, options.mount_tilt) == (None, None):
+            stands = f"taken to stand {start.elevation_deg:g} degrees up and {start.radius_m:g} away"
+            facts.append(("source camera", f"{stands}; say where with --source-elevation-deg and --source-radius"))
+            say(": ".join(facts[-1]))
         viewed, faults = _viewed(found, model, options, out)
-        write_page(viewed, faults, [*_facts(model, options), *assumed], out / "index.html")
-        for _, told in assumed:
-            say(f"source camera: {told}")
+        write_page(viewed, faults, facts, out / "index.html")
         if not viewed:
             raise DataError(f"none of {len(found)} videos can be shown; {faults[0]}")
     say(f"wrote {out}/index.html: {len(viewed)} windows")
-
-
-def _assumed(paths: Sequence[tuple[str, Trajectory]], options: GalleryOptions) -> list[tuple[str, str]]:
-    """Where a steered model's source camera is taken to stand, if nobody said it."""
-    start = paths[0][1].source
-    if start is None or options.source is not None or (options.mount_height, options.mount_tilt) != (None, None):
-        return []
-    stands = f"taken to stand at an elevation of {start.elevation_deg:g} degrees and a radius of {start.radius_m:g}"
-    return [("source camera", f"{stands}; say where with --source-elevation-deg and --source-radius")]
 
 
 def _viewed(

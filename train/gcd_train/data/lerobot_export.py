@@ -23,10 +23,10 @@ from gcd_train.data.videos import FileLens
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.files import new_folder
 from gcd_train.scenes.drop.world import HFOV_DEG, orbit_cameras
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer
 from gcd_train.scenes.tabletop.scene import UNITS_A_METRE, Episode, tabletop_episode, upright_base
 from gcd_train.scenes.tabletop.simulation import FPS
+from gcd_train.scenes.triangles import freeze
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]

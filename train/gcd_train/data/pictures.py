@@ -28,8 +28,8 @@ from gcd_train.data.visibility import depth_visibility, published_picture, rende
 from gcd_train.errors import DataError, RenderError
 
 if TYPE_CHECKING:
-    from gcd_train.scenes.frozen import FrozenScene
     from gcd_train.scenes.renderer import Renderer, Rendering
+    from gcd_train.scenes.triangles import FrozenScene
 
 Doubles = NDArray[np.float64]
 Modality = Literal["rgb", "classes"]
@@ -274,7 +274,7 @@ def _view(rgb: Bytes, depth: NDArray[np.float32], world_from_camera: Doubles, le
 
 def frames_of(folder: Path, numbers: Sequence[int], lens: Intrinsics) -> "FrozenScene":
     """A scene's kept geometry at these times only, for a camera with this lens. Raises DataError if it is damaged."""
-    from gcd_train.scenes.frozen import FrozenScene
+    from gcd_train.scenes.triangles import FrozenScene
 
     frozen = FrozenScene.load(folder / GEOMETRY)
     if max(numbers) >= frozen.frames:

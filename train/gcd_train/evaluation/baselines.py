@@ -223,11 +223,6 @@ class HexPlane:
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. Raises DataError where the clip's scene has fewer cameras."""
-        if self.views > 1 and clip.others is None:
-            raise DataError(
-                f"{self.name} wants {self.views} cameras of a scene, but clip {clip.key or 'without a key'} has one; "
-                "give a 4D data set, or ask for hexplane_1"
-            )
         own, frames = clip.cameras, len(clip.source)
         times = [2.0 * number / max(frames - 1, 1) - 1.0 for number in range(frames)]
         pictures = [

@@ -41,7 +41,6 @@ Counts = NDArray[np.int64]
 
 _LOWEST, _HIGHEST, _PER_OCTAVE = -20, 40, 48  # powers of two; what lies beyond stands in the first and the last bin
 _BINS = (_HIGHEST - _LOWEST) * _PER_OCTAVE + 2
-_HALVINGS = 60
 _COLOURS: dict[Region, str] = {"all": "#1f4e9c", "visible": "#2c8a4b", "occluded": "#c0392b"}
 
 
@@ -100,9 +99,10 @@ class CalibrationNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     @property
     def warning(self) -> str:
         """What the scale should not be trusted for; empty for nothing."""
+        if self.scenes >= FEW_SCENES:
+            return ""
         scenes = counted(self.scenes, "scene")
-        few = f"Measured on {scenes}: of fewer than {FEW_SCENES} no claim can rest on this scale."
-        return few if self.scenes < FEW_SCENES else ""
+        return f"Measured on {scenes}: of fewer than {FEW_SCENES} no claim can rest on this scale."
 
 
 Distances: TypeAlias = Mapping[Region, Counts]
@@ -114,12 +114,8 @@ def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
 
     A target level stands for all colours that are rounded to it, so it is spread over them, always in the same way;
     else flat pixels would be hit exactly, or not at all.
-
-    Raises: DataError for fewer than two draws, or draws without pictures.
     """
-    videos = [draw.video for draw in prediction.draws if draw.video is not None]
-    if len(videos) < 2:
-        raise DataError(f"intervals want 2 or more draws of a picture, got {len(videos)}; give more --samples")
+    videos = [draw.video for draw in prediction.draws if draw.video is not None]  # two or more
     drawn = torch.stack(videos).float().cpu()[:, FIRST_MEASURED:]
     truth = to_pictures(clip.target)[FIRST_MEASURED:]
     spread = np.random.default_rng(zlib.crc32(clip.key.encode())).random(truth.shape, np.float32)
@@ -134,38 +130,36 @@ def distances(clip: HeldOutClip, prediction: Prediction) -> Distances:
     return {name: np.bincount(part.flatten().numpy(), minlength=_BINS).astype(np.int64) for name, part in parts.items()}
 
 
-def coverage(counts: Counts, level: float, scale: float = 1.0) -> float:
-    """Share of colours that lie within their interval. level: between 0 and 1. NaN where there is no pixel."""
-    total = int(counts.sum())
-    if not total:
-        return float("nan")
-    reach = NormalDist().inv_cdf((1 + level) / 2) * scale
-    place = (np.log2(reach) - _LOWEST) * _PER_OCTAVE + 1  # of the interval's end among the edges of bins
+def coverage(counts: Counts, scale: float = 1.0) -> NDArray[np.float64]:
+    """Share of colours that lie within the interval of each of LEVELS; NaN where there is no pixel."""
+    reach = scale * np.array([NormalDist().inv_cdf((1 + level) / 2) for level in LEVELS])
+    places = (np.log2(reach) - _LOWEST) * _PER_OCTAVE + 1  # of the intervals' ends among the edges of bins
     within = np.concatenate([[0], np.cumsum(counts)])
-    return float(np.interp(place, np.arange(len(counts)), within[:-1])) / total
+    with np.errstate(invalid="ignore"):
+        return np.interp(places, np.arange(len(counts)), within[:-1]) / within[-1]
 
 
 def miscoverage(counts: Counts, scale: float = 1.0) -> float:
     """Mean over LEVELS of how far the share that is held is from the level; 0 is ideal, 0.5 the worst."""
-    return float(np.mean([abs(coverage(counts, level, scale) - level) for level in LEVELS]))
+    return float(np.abs(coverage(counts, scale) - LEVELS).mean())
 
 
 def best_scale(counts: Counts) -> float:
-    """The scale at which intervals hold neither too much nor too little, on the mean over LEVELS; by bisection.
+    """The scale at which intervals hold neither too much nor too little, on the mean over LEVELS.
 
     Raises: DataError where no scale does, because most samples do not differ at all.
     """
 
     def lacking(power: float) -> float:
-        return float(np.mean([level - coverage(counts, level, 2.0**power) for level in LEVELS]))
+        return float((LEVELS - coverage(counts, 2.0**power)).mean())
 
-    low, high = float(_LOWEST), float(_HIGHEST)
-    if not lacking(low) > 0 > lacking(high):
+    if not lacking(_LOWEST) > 0 > lacking(_HIGHEST):
         raise DataError(
             "no scale makes intervals of this deviation hold what they should: the samples are all the same; "
             "check that the model draws, and that --samples is 2 or more"
         )
-    for _ in range(_HALVINGS):
+    low, high = float(_LOWEST), float(_HIGHEST)
+    for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if lacking(middle) > 0 else (low, middle)
     return float(2.0 ** ((low + high) / 2))
@@ -184,7 +178,7 @@ def calibrate(clips: Sequence[tuple[str, Distances]]) -> Calibration:
 
     def summed(chosen: Sequence[str], region: Region) -> Counts:
         each = [counts[region] for scene, counts in clips if scene in chosen and region in counts]
-        return np.sum(each, axis=0) if each else np.zeros(_BINS, np.int64)
+        return np.sum([np.zeros(_BINS, np.int64), *each], axis=0)
 
     fitted, reported = tuple(scenes[::2]), tuple(scenes[1::2])
     scale, regions = best_scale(summed(fitted, "all")), dict[Region, Reliability]()
@@ -193,8 +187,8 @@ def calibrate(clips: Sequence[tuple[str, Distances]]) -> Calibration:
         if counts.any():
             regions[region] = Reliability(
                 colours=int(counts.sum()),
-                held=tuple(coverage(counts, level) for level in LEVELS),
-                held_scaled=tuple(coverage(counts, level, scale) for level in LEVELS),
+                held=tuple(coverage(counts).tolist()),
+                held_scaled=tuple(coverage(counts, scale).tolist()),
                 miscoverage=miscoverage(counts),
                 miscoverage_scaled=miscoverage(counts, scale),
             )
@@ -239,10 +233,10 @@ def _write_plot(found: Calibration, out: Path) -> None:
     axes.plot([0, 100], [0, 100], color="#999999", linewidth=1)
     levels = [100 * level for level in found.levels]
     for region, of in found.regions.items():
-        colour, scaled = _COLOURS[region], [100 * held for held in of.held_scaled]
-        held = [100 * held for held in of.held]
-        axes.plot(levels, held, "--", color=colour, linewidth=1, label=f"{region}, as drawn")
-        axes.plot(levels, scaled, "o-", color=colour, markersize=3.5, label=f"{region}, times {found.scale:.3g}")
+        held, scaled = (100 * np.array(shares) for shares in (of.held, of.held_scaled))
+        axes.plot(levels, held, "--", color=_COLOURS[region], linewidth=1, label=f"{region}, as drawn")
+        label = f"{region}, times {found.scale:.3g}"
+        axes.plot(levels, scaled, "o-", color=_COLOURS[region], markersize=3.5, label=label)
     axes.set(xlim=(0, 100), ylim=(0, 100), xlabel="interval is meant to hold, %", ylabel="held, % of colours")
     axes.set_title("How often the truth lies within the interval", fontsize=10.5)
     axes.grid(color="#eeeeee")

@@ -86,13 +86,12 @@ class EvaluationSet(ABC):
         """Raises DataError, naming the file, where it cannot be read; nothing stands in for it."""
 
 
-def cameras_of(clips: PairedClips, number: int, declared: CameraMount | None = None) -> CameraPair:
-    """Both cameras of a clip. declared: mount of the source camera of driving clips; None for the true one."""
-    if clips.camera == "none":
-        mount = declared or clips.mount or CameraMount()
-        reached = clips.trajectory(number).at_goal.index(True)
-        return CameraPair.driving(mount, frames=clips.frames, height=clips.height, width=clips.width, move_time=reached)
-    return CameraPair.orbit(clips.trajectory(number), hfov_deg=clips.hfov_deg, height=clips.height, width=clips.width)
+def cameras_of(clips: PairedClips, number: int) -> CameraPair:
+    """Both cameras of a clip."""
+    path, size = clips.trajectory(number), {"height": clips.height, "width": clips.width}
+    if clips.mount is None:
+        return CameraPair.orbit(path, hfov_deg=clips.hfov_deg, **size)
+    return CameraPair.driving(clips.mount, frames=clips.frames, move_time=path.at_goal.index(True), **size)
 
 
 def names_of(classes: Sequence[SemanticClass]) -> str:
@@ -140,9 +139,9 @@ class PairedSet(EvaluationSet):
         return tuple(self.numbers)
 
     def clip(self, key: str, /) -> HeldOutClip:
-        """See EvaluationSet. In driving, methods are told the usual mount, wherever the camera really sits."""
+        """See EvaluationSet."""
         number = self.numbers[key]
-        clip, classes = self.clips[number], bool(self.classes)
+        clip, classes, cameras = self.clips[number], bool(self.classes), cameras_of(self.clips, number)
         goal = self.clips.trajectory(number).goal_delta
         world, scene = self.clips.scene(number)
         return HeldOutClip(
@@ -152,13 +151,13 @@ class PairedSet(EvaluationSet):
                 source=clip.source,
                 source_depth=clip.source_depth,
                 source_classes=clip.source_classes if classes else None,
-                cameras=cameras_of(self.clips, number, CameraMount()),
+                cameras=cameras,
                 fps=self.clips.fps,
                 key=key,
             ),
             target=clip.target,
             target_classes=clip.target_classes if classes else None,
-            visible=seen_too(clip, cameras_of(self.clips, number), picked=self.picked),
+            visible=seen_too(clip, cameras, picked=self.picked),
             change=None if goal is None else (goal.azimuth_deg, goal.elevation_deg, goal.radius_m),
         )
 
@@ -322,19 +321,20 @@ class SceneSet(EvaluationSet):
             order.append(int(np.linalg.norm(at[:, None] - at[order], axis=-1).min(axis=1).argmax()))
         chosen = [names[place - 1] for place in order[1:]]
         each = [self.dataset.views(scene, time, chosen) for time in times] if chosen else []
-        return [[self._other(views[place]) for views in each] for place in range(count)]
+        size = self.width, self.height
 
-    def _other(self, view: SceneView) -> SceneView:
-        """At the clips' size."""
-        classes = self._places_of(view.classes)
-        return SceneView(
-            rgb=trained_picture(view.rgb, self.width, self.height),
-            depth=nearest_resized(view.depth, self.width, self.height),
-            classes=None if classes is None else nearest_resized(classes, self.width, self.height),
-            instances=None,
-            world_from_camera=view.world_from_camera,
-            lens=trained_lens(view.lens, self.width, self.height),
-        )
+        def resized(view: SceneView) -> SceneView:
+            classes = self._places_of(view.classes)
+            return replace(
+                view,
+                rgb=trained_picture(view.rgb, *size),
+                depth=nearest_resized(view.depth, *size),
+                classes=None if classes is None else nearest_resized(classes, *size),
+                instances=None,
+                lens=trained_lens(view.lens, *size),
+            )
+
+        return [[resized(views[place]) for views in each] for place in range(count)]
 
 
 def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:

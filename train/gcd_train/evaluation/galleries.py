@@ -1,9 +1,8 @@
 """Clips as pictures and videos: frames that a run keeps, contact sheets, galleries."""
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 from typing import Literal, TypeAlias
@@ -22,7 +21,7 @@ from gcd_train.evaluation.predictors import Prediction, to_labels
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
 from gcd_train.evaluation.store import RunKeeper
 from gcd_train.files import write_whole
-from gcd_train.pictures import png
+from gcd_train.pictures import png, write_mp4
 
 Pictures = NDArray[np.uint8]
 
@@ -125,17 +124,12 @@ def strips(methods: Sequence[MethodRecords], key: str) -> tuple[Strip, ...]:
     Raises DataError for a damaged picture.
     """
     folders = [_folder(method, key) for method in methods]
-    made: list[Strip] = []
+    rows = [("source", "source", folders)]
     for method, at in zip(methods, folders, strict=True):
-        made.append(Strip(name=method.name, frames=_read(at / "sample_0")))
-        made.append(Strip(name=f"{method.name}: classes", frames=_read(at / "classes_0")))
-
-    def shared(name: str) -> Strip:
-        frames = next(filter(None, (_read(at / name) for at in folders)), {})
-        return Strip(name=name.replace("target_classes", "true classes"), frames=frames)
-
-    every = [shared("source"), *made, shared("target_classes"), shared("target")]
-    return tuple(strip for strip in every if strip.frames)
+        rows += [(method.name, "sample_0", [at]), (f"{method.name}: classes", "classes_0", [at])]
+    rows += [("true classes", "target_classes", folders), ("target", "target", folders)]
+    every = [(name, next(filter(None, (_read(at / kind) for at in places)), {})) for name, kind, places in rows]
+    return tuple(Strip(name=name, frames=frames) for name, frames in every if frames)
 
 
 def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None:
@@ -144,21 +138,7 @@ def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None
     if not blocks:
         raise RunError(f"there is nothing to show in {out}; evaluate with --views all")
     width = max(block.shape[1] for block in blocks)
-    sheet = [np.pad(block, ((0, 0), (0, width - block.shape[1]), (0, 0)), constant_values=255) for block in blocks]
-    write_whole(out, png(np.concatenate(sheet)))
-
-
-def write_mp4(frames: Iterable[Pictures], fps: float, out: Path) -> None:
-    """One picture or more of one even size, as MPEG-4 part 2. Raises RunError if it cannot be written."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    each = iter(frames)
-    first = next(each)
-    video = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), fps, (first.shape[1], first.shape[0]))
-    if not video.isOpened():
-        raise RunError(f"{out} cannot be written; give a folder that takes files with --out")
-    for frame in chain([first], each):
-        video.write(frame[..., ::-1])
-    video.release()
+    write_whole(out, png(np.concatenate([_padded(block, len(block), width) for block in blocks])))
 
 
 def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:
@@ -193,30 +173,37 @@ def _row(label: str, strip: Strip) -> Pictures:
     numbers = sorted(strip.frames)
     places = np.linspace(0, len(numbers) - 1, min(SHOWN_FRAMES, len(numbers))).round().astype(int)  # evenly
     pictures = [strip.frames[numbers[place]] for place in places]
-    lines = (*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS))
-    height = max(pictures[0].shape[0], max(3, len(lines)) * _LINE)
-    margin = np.full((height + _GAP, _MARGIN, 3), 255, np.uint8)
-    for line, text in enumerate(lines):
-        cv2.putText(margin, text, (4, _LINE * (1 + line)), _FONT, _SCALE, _INK, 1, cv2.LINE_AA)
-    framed = [
-        cv2.copyMakeBorder(p, 0, height + _GAP - p.shape[0], 0, _GAP, cv2.BORDER_CONSTANT, value=(255,) * 3)
-        for p in pictures
-    ]
-    return np.concatenate([margin, *(each.astype(np.uint8) for each in framed)], axis=1)
+    lines = [*wrap(strip.name, _LETTERS), *wrap(label, _LETTERS)]
+    height = max(pictures[0].shape[0], max(3, len(lines)) * _LINE) + _GAP
+    margin = _words(lines, height, _MARGIN, (4, _LINE))
+    return np.concatenate([margin, *(_padded(each, height, each.shape[1] + _GAP) for each in pictures)], axis=1)
+
+
+def _words(lines: Sequence[str], height: int, width: int, at: tuple[int, int]) -> Pictures:
+    """Lines of text on white; at: left end and foot of the first, pixels."""
+    page = np.full((height, width, 3), 255, np.uint8)
+    for number, text in enumerate(lines):
+        cv2.putText(page, text, (at[0], at[1] + _LINE * number), _FONT, _SCALE, _INK, 1, cv2.LINE_AA)
+    return page
+
+
+def _padded(picture: Pictures, height: int, width: int) -> Pictures:
+    """With white below and to the right."""
+    rows, columns = picture.shape[:2]
+    return np.pad(picture, ((0, height - rows), (0, width - columns), (0, 0)), constant_values=255)
 
 
 def beside(rows: Sequence[Strip], moment: int) -> Pictures:
     """All rows' pictures of one moment with their names above, of even size as codecs want it."""
     pictures = [row.frames[moment] for row in rows]
     captions = [wrap(row.name, max(each.shape[1] // _LETTER, 1)) for row, each in zip(rows, pictures, strict=True)]
-    most, named = max(map(len, captions)), list[Pictures]()
-    for lines, picture in zip(captions, pictures, strict=True):
-        above = np.full((_LINE * most + _GAP, picture.shape[1], 3), 255, np.uint8)
-        for line, words in enumerate(lines, start=1 + most - len(lines)):
-            cv2.putText(above, words, (2, _LINE * line - 1), _FONT, _SCALE, _INK, 1, cv2.LINE_AA)
-        named.append(np.concatenate([above, picture]))
+    most = max(map(len, captions))
+    named = [
+        np.concatenate(
+            [_words(lines, _LINE * most + _GAP, each.shape[1], (2, _LINE * (1 + most - len(lines)) - 1)), each]
+        )
+        for lines, each in zip(captions, pictures, strict=True)
+    ]
     height = max(each.shape[0] for each in named)
-    panels = [np.pad(each, ((0, height - each.shape[0]), (0, _GAP), (0, 0)), constant_values=255) for each in named]
-    whole = np.concatenate(panels, axis=1)
-    odd = whole.shape[0] % 2, whole.shape[1] % 2
-    return np.pad(whole, ((0, odd[0]), (0, odd[1]), (0, 0)), constant_values=255)
+    whole = np.concatenate([_padded(each, height, each.shape[1] + _GAP) for each in named], axis=1)
+    return _padded(whole, height + height % 2, whole.shape[1] + whole.shape[1] % 2)

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from typer import Option
 from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, weights_path
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.diffusion import Quality, Sampler, SolverName
+from gcd_model.diffusion import Sampler, SolverName
 from gcd_train.data.files import package_version
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
@@ -47,7 +47,9 @@ from gcd_train.evaluation.predictors import (
     open_weights,
 )
 from gcd_train.evaluation.store import LPIPS, RunNote
+from gcd_train.evaluation.tables import counted
 
+_AS_SHIPPED = RenderOptions()
 _SAME_PATH_M = 1e-3
 """Largest difference between the entries of two poses that count as one; more is another path."""
 
@@ -63,20 +65,16 @@ class SynthesizedViews:
     """
 
     weights: OpenedWeights
-    options: RenderOptions = RenderOptions()  # noqa: RUF009  it is frozen
+    options: RenderOptions = _AS_SHIPPED
     painted: tuple[SemanticClass, ...] = ()
     classes: int | None = None
     privileged: bool = False
 
     @classmethod
-    def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions | None = None) -> Self:
-        """A model that is measured on these clips.
-
-        Raises DataError where model and clips do not fit together.
-        """
+    def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions = _AS_SHIPPED) -> Self:
+        """A model that is measured on these clips. Raises DataError where they do not fit together."""
         _require_fit(weights(), clips)
-        made, traits = cls(weights=weights, classes=len(clips.classes) or None), weights().traits
-        made = made if options is None else replace(made, options=options)
+        made, traits = cls(weights=weights, options=options, classes=len(clips.classes) or None), weights().traits
         if not made.paints_classes or traits.classes:
             return made
         if not clips.classes:
@@ -90,19 +88,15 @@ class SynthesizedViews:
     def name(self) -> str:
         """The weights' name, with what is not as shipped of how they are sampled."""
         options = self.options
-        told = [] if options.quality == "exact" else [options.quality]
-        told += [] if options.steps is None else [f"{options.steps} step{'' if options.steps == 1 else 's'}"]
+        told = [] if options.steps is None else [counted(options.steps, "step")]
         told += [] if options.solver is None else [options.solver]
         told += [] if options.guidance is None else ["guidance {:g} to {:g}".format(*options.guidance)]
-        if options.guidance_interval is not None:
-            told.append("guided from {:g} to {:g}".format(*options.guidance_interval))
         return self.weights().traits.name + (f" ({', '.join(told)})" if told else "")
 
     @property
     def details(self) -> dict[str, str]:
         traits, options = self.weights().traits, self.options
         used = Sampler.of(traits.config.sampling, options)
-        interval = used.guidance_interval
         return {
             "weights": traits.sha256_12,
             "family": "unknown" if traits.family is None else traits.family.name,
@@ -112,7 +106,6 @@ class SynthesizedViews:
             "samples": str(options.samples),
             "seed": str(options.seed),
             "precision": traits.precision,
-            **({} if interval is None else {"guided from": "{:g} to {:g}".format(*interval)}),
         }
 
     @property
@@ -196,11 +189,7 @@ class EvaluateOptions(ClipOptions):
     guidance: Annotated[
         tuple[float, float] | None, Option(help="Of the first and the last frame; by default as shipped.")
     ] = None
-    quality: Annotated[Quality, Option(help="As the weights ship, or in fewer steps where they take many.")] = "exact"
     solver: Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")] = None
-    guidance_interval: Annotated[
-        tuple[float, float] | None, Option(help="Noise levels guidance applies at; by default all.")
-    ] = None
     baselines: Annotated[bool, Option(help="Also measure what has to be beaten.")] = True
     methods: Annotated[
         list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")
@@ -244,10 +233,8 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
     options, methods = replace(options, samples=samples), list[Predictor]()
     if weights is not None:
         sampling = RenderOptions(
-            quality=options.quality,
             solver=options.solver,
             guidance=options.guidance,
-            guidance_interval=options.guidance_interval,
             samples=samples,
             seed=options.seed,
         )
@@ -318,53 +305,67 @@ def run_note(clips: EvaluationSet, methods: Sequence[Predictor], options: Evalua
     )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MethodKind:
+    """What `--methods NAME` measures, or NAME_K, K cameras of a scene.
+
+    make: the method, from the clips, the options and K. makes: pictures, class maps or both. usual: it is measured
+    where none are named. views: whether its name ends in K.
+    """
+
+    make: Callable[[EvaluationSet, EvaluateOptions, int], Predictor]
+    makes: Literal["pictures", "classes", "both"] = "pictures"
+    usual: bool = False
+    views: bool = False
+
+
 def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: EvaluateOptions) -> tuple[Predictor, ...]:
-    """Baselines by name; those that need nothing but the clips where none are named.
+    """Baselines by name; the usual ones that fit the clips where none are named.
 
     Raises:
-        RecipeError: there is none of a name, or it lacks what it needs.
+        RecipeError: there is none of a name, it does not fit the clips, or it lacks what it needs.
         CheckpointError: vanilla SVD's weights cannot be opened.
     """
-    published = options.protocol == "release"
-    makers: dict[str, Callable[[], Predictor]] = {
-        "copy_source": CopySource,
-        "ground_homography": GroundHomography,
-        REPROJECT_RGBD: partial(ReprojectRgbd, published=published),
-        REPROJECT_SEMD: partial(ReprojectSemd, classes=clips.classes, published=published),
-    }
+    unfit = {"pictures"} if clips.painted else set[str]() if clips.classes else {"classes"}
     if names is None:
-        left_out = REPROJECT_RGBD if clips.painted else None if clips.classes else REPROJECT_SEMD
-        names = [name for name in makers if name != left_out]
+        names = [name for name, kind in METHODS.items() if kind.usual and kind.makes not in unfit]
     found: list[Predictor] = []
     for name in names:
-        match = re.fullmatch(r"hexplane_([1-9]\d*)", name)
-        views = int(match[1]) if match else 0
-        if clips.painted and (views or name in (REPROJECT_RGBD, VANILLA_SVD)):
-            raise RecipeError(f"{name} makes no class maps, and these targets are class maps; leave it out")
-        if views > clips.cameras:
-            there = f"{clips.cameras - 1} beside the source" if clips.cameras > 1 else "the source alone"
-            raise RecipeError(
-                f"{name} wants {views} cameras, and these clips have {there}; give hexplane_{clips.cameras} or less"
-            )
-        if name == REPROJECT_SEMD and not clips.classes:
-            raise RecipeError(f"{name} wants clips with class maps, got some without; leave it out")
-        if views:
-            settings = HexPlaneSettings(updates=options.hexplane_updates, rays=options.hexplane_rays)
-            found.append(HexPlane(views=views, settings=settings, seed=options.seed, device=options.device))
-        elif name == VANILLA_SVD:
-            found.append(_vanilla_svd(options))
-        elif name in makers:
-            found.append(makers[name]())
-        else:
-            some = (f"hexplane_{number}" for number in (1, 2, 4, 8))  # any other number goes too
-            every = (*makers, VANILLA_SVD, *some)
+        stem, _, number = name.rpartition("_")
+        views = int(number) if re.fullmatch(r"[1-9]\d*", number) else 0
+        kind = METHODS.get(stem if views else name)
+        if kind is None or kind.views != bool(views):
+            every = [f"{known}_{k}" for known, each in METHODS.items() for k in ((1, 2, 4, 8) if each.views else ())]
+            every = [*(known for known, each in METHODS.items() if not each.views), *every]  # any other K goes, too
             near = difflib.get_close_matches(name, every, n=1)
             meant = f"did you mean {near[0]}? " if near else ""
             raise RecipeError(f"no baseline is called {name!r}; {meant}there are {', '.join(every)}")
+        if kind.makes in unfit:
+            targets = "class maps" if clips.painted else "pictures without class maps"
+            raise RecipeError(f"{name} makes {kind.makes} alone, and these targets are {targets}; leave it out")
+        if views > clips.cameras:
+            there = f"{clips.cameras - 1} beside the source" if clips.cameras > 1 else "the source alone"
+            raise RecipeError(
+                f"{name} wants {views} cameras, and these clips have {there}; give {stem}_{clips.cameras} or less"
+            )
+        found.append(kind.make(clips, options, views))
     return tuple(found)
 
 
-def _vanilla_svd(options: EvaluateOptions) -> VanillaSVD:
+def _reproject_rgbd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> ReprojectRgbd:
+    return ReprojectRgbd(published=options.protocol == "release")
+
+
+def _reproject_semd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> ReprojectSemd:
+    return ReprojectSemd(classes=clips.classes, published=options.protocol == "release")
+
+
+def _hexplane(clips: EvaluationSet, options: EvaluateOptions, views: int) -> HexPlane:
+    settings = HexPlaneSettings(updates=options.hexplane_updates, rays=options.hexplane_rays)
+    return HexPlane(views=views, settings=settings, seed=options.seed, device=options.device)
+
+
+def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> VanillaSVD:
     """With weights that are opened where they are used: the published file `svd.safetensors`, its diffusers folder, or
     our own of the same task. A published file is taken to be SVD, whatever it is called."""
     if options.svd is None:
@@ -384,3 +385,14 @@ def _vanilla_svd(options: EvaluateOptions) -> VanillaSVD:
     details = {"baseline": VANILLA_SVD, "samples": str(samples), "seed": str(seed), "weights": digest}
     weights = partial(open_weights, _resolved(options.svd), options.device, options.dtype, None if family else "svd")
     return VanillaSVD(weights=weights, samples=samples, seed=seed, details=details)
+
+
+METHODS: dict[str, MethodKind] = {
+    "copy_source": MethodKind(make=lambda clips, options, views: CopySource(), makes="both", usual=True),
+    "ground_homography": MethodKind(make=lambda clips, options, views: GroundHomography(), makes="both", usual=True),
+    REPROJECT_RGBD: MethodKind(make=_reproject_rgbd, usual=True),
+    REPROJECT_SEMD: MethodKind(make=_reproject_semd, makes="classes", usual=True),
+    VANILLA_SVD: MethodKind(make=_vanilla_svd),
+    "hexplane": MethodKind(make=_hexplane, views=True),
+}
+"""What can be measured beside weights and saved frames; a new method is one entry, and a `Predictor` of its own."""

@@ -311,20 +311,19 @@ class Lpips:
         least = _KINDS[self.network].least_pixels
         if min(targets.shape[-2:]) < least:
             raise ShapeError(f"LPIPS wants pictures of at least {least} pixels a side, got {list(targets.shape[-2:])}")
-        both = (torch.cat([draws[:, t], targets[t : t + 1]]) for t in range(len(targets)))
-        return torch.stack([self._of_frame(pictures.float()) for pictures in both], dim=1)
-
-    def _of_frame(self, pictures: Tensor) -> Tensor:
-        """Distances of all pictures but the last to the last: [S+1, 3, H, W] -> [S]."""
         mean, deviation = (torch.tensor(values).view(1, 3, 1, 1) for values in (_MEAN, _DEVIATION))
-        x, apart = (pictures - mean) / deviation, list[Tensor]()
-        for place, layer in enumerate(self.features):
-            x = layer(x)
-            if place in _KINDS[self.network].compared:
-                unit = x / (x.square().sum(dim=1, keepdim=True).sqrt() + _LEAST_NORM)
-                squared = (unit[:-1] - unit[-1:]).square()
-                apart.append(F.conv2d(squared, self.heads[len(apart)]).mean(dim=(1, 2, 3)))
-        return torch.stack(apart).sum(dim=0)
+        frames: list[Tensor] = []
+        for t in range(len(targets)):
+            pictures = torch.cat([draws[:, t], targets[t : t + 1]]).float()  # [S+1, 3, H, W], the target last
+            x, apart = (pictures - mean) / deviation, list[Tensor]()
+            for place, layer in enumerate(self.features):
+                x = layer(x)
+                if place in _KINDS[self.network].compared:
+                    unit = x / (x.square().sum(dim=1, keepdim=True).sqrt() + _LEAST_NORM)
+                    squared = (unit[:-1] - unit[-1:]).square()
+                    apart.append(F.conv2d(squared, self.heads[len(apart)]).mean(dim=(1, 2, 3)))
+            frames.append(torch.stack(apart).sum(dim=0))
+        return torch.stack(frames, dim=1)
 
 
 def _files(folder: Path) -> tuple[str, Path, Path]:

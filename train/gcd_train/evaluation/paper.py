@@ -14,17 +14,12 @@ from gcd_train.evaluation.store import Region, RunNote
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Column:
-    """One figure on some pixels. digits: behind the point."""
+    """One figure on some pixels, or of a class by its id. digits: behind the point."""
 
     heading: str
-    figure: FigureName
+    figure: FigureName | int
     region: Region = "all"
     digits: int = 2
-
-    @property
-    def of_classes(self) -> bool:
-        """Whether it tells how good class maps are, not pictures."""
-        return self.figure == "miou_common"
 
 
 PICTURE_COLUMNS = (

@@ -8,7 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, Self, TypeAlias
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,11 +18,11 @@ from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
 from gcd_train.data.encodings import read_colour
-from gcd_train.data.files import FileFault
 from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.data.splat import tangents
 from gcd_train.errors import DataError
 from gcd_train.evaluation.store import FRAMES_IN
+from gcd_train.pictures import video_frames
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -239,28 +238,6 @@ def _pictures(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.suffix in _PICTURES and path.stem.isdecimal()]
 
 
-def read_draw(path: Path) -> list[Bytes]:
-    """RGB pictures, uint8 [H, W, 3] each, of a folder of numbered pictures, or of a video.
-
-    Raises: FileFault for a damaged file; DataError for a folder whose pictures do not count up one by one.
-    """
-    if path.is_dir():
-        found = sorted(_pictures(path), key=lambda each: int(each.stem))
-        numbers = [int(each.stem) for each in found]
-        if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
-            raise DataError(f"{path} holds frames {numbers}, one is missing or there twice; number them from 0 on")
-        return [read_colour(each) for each in found]
-    capture, frames = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG), list[Bytes]()
-    try:
-        while (read := capture.read())[0]:
-            frames.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB).astype("uint8", copy=False))
-    finally:
-        capture.release()
-    if not frames:
-        raise FileFault(path, "holds no frame that can be decoded; save the frames as PNG")
-    return frames
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SavedFrames:
     """The frames that a folder holds for each clip; see `find_draws` for how they may lie there.
@@ -296,12 +273,19 @@ class SavedFrames:
         """See Predictor; each sample that was saved is a draw.
 
         Raises:
-            DataError: there is nothing for this clip, or something of another length or size; nothing is resized.
-            FileFault: a file is damaged.
+            DataError: there is nothing for this clip, or something damaged, or of another length or size, as nothing is
+                resized.
         """
         made, lens = list[Prediction](), clip.cameras.target
         for draw in find_draws(self.folder, clip.key):
-            frames = read_draw(draw)
+            if draw.is_dir():
+                found = sorted(_pictures(draw), key=lambda each: int(each.stem))
+                numbers = [int(each.stem) for each in found]
+                if numbers != list(range(numbers[0], numbers[0] + len(numbers))) or numbers[0] > 1:
+                    raise DataError(f"{draw} holds frames {numbers}, one is missing or twice there; number them from 0")
+                frames = [read_colour(each) for each in found]
+            else:
+                frames = list(video_frames(draw))
             if len(frames) != len(clip.source):
                 raise DataError(f"{draw} holds {len(frames)} frames, clip {clip.key} has {len(clip.source)}; save all")
             for number, frame in enumerate(frames):

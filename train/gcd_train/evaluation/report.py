@@ -1,23 +1,24 @@
 """The report as a folder: `report.md`, its tables as CSV, plots, galleries and videos."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import inf, isnan, nan
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
-from gcd_train.errors import RecipeError, RunError
+from gcd_train.errors import RunError
 from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
-from gcd_train.evaluation.paper import is_model, tables_for
-from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords, Run, gather, on_the_same_goals
-from gcd_train.evaluation.statistics import FEW_SCENES, FIRST_MEASURED, SEED, FigureName, Interval, Span
-from gcd_train.evaluation.store import Region, folder_name
+from gcd_train.evaluation.paper import is_model
+from gcd_train.evaluation.runs import EvaluatedSet, gather, on_the_same_goals
+from gcd_train.evaluation.statistics import FEW_SCENES, SEED, Interval, Span
+from gcd_train.evaluation.store import Region, Run, folder_name
 from gcd_train.evaluation.tables import (
     NOTHING,
-    STAR_OF_FIGURE,
     Difference,
     Table,
     all_figures,
@@ -47,7 +48,6 @@ def make_report(
     out: Path,
     *,
     leads: Sequence[str] = (),
-    rows: Mapping[str, str] | None = None,
     clips: int = 4,
     drawn: bool = True,
     command: str = "",
@@ -56,20 +56,21 @@ def make_report(
 
     Args:
         folders: of runs. leads: methods that are compared with all others; empty for every model, or the first method
-            where there is none. rows: method to its row in the paper's tables, where name and note do not tell. clips:
-            in the gallery. drawn: whether there are plots, which want matplotlib. command: the line that makes this
-            report, for its first page.
+            where there is none. clips: in the gallery. drawn: whether there are plots, which want matplotlib. command:
+            the line that makes this report, for its first page.
     Returns: the path of `report.md`.
     Raises:
-        RunError: a run cannot be read, two do not go together, or a file cannot be written.
-        RecipeError: a row is none of the paper's tables that its method's clips belong in.
+        RunError: a run cannot be read, two do not go together, none has a lead, or a file cannot be written.
         RenderError: plots are wanted and matplotlib is not installed.
     """
     if drawn:
         require_matplotlib()
     runs = tuple(Run.read(folder) for folder in folders)
-    sets = gather(runs, rows)
-    _require_choices(leads, rows or {}, sets)
+    sets = gather(runs)
+    known = dict.fromkeys(method.name for each in sets for method in each.methods)
+    unknown = [name for name in leads if name not in known]
+    if unknown:
+        raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
     pages = ["# Report", *([f"```bash\n{command}\n```"] if command else [])]
     pages.append(f"Intervals: 95 %, 10 000 draws of scenes, seed {SEED}.")
     pages += map(_about, runs)
@@ -93,30 +94,10 @@ def make_report(
     return out / "report.md"
 
 
-def _require_choices(leads: Sequence[str], rows: Mapping[str, str], sets: Sequence[EvaluatedSet]) -> None:
-    """Raises RunError for a method that none of the sets has, RecipeError for a row that it cannot stand in."""
-    known = dict.fromkeys(method.name for each in sets for method in each.methods)
-    unknown = [name for name in (*leads, *rows) if name not in known]
-    if unknown:
-        raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
-    for method, label in rows.items():
-        its = [each for each in sets if any(known.name == method for known in each.methods)]
-        labels = dict.fromkeys(row for each in its for table in tables_for(each.note) for row in table.rows)
-        if not labels:
-            raise RecipeError(
-                f"--row says where {method} stands in the paper's tables, and none of them is for these clips; "
-                "leave it out"
-            )
-        if label not in labels:
-            raise RecipeError(f"--row {method}: no row is called {label!r}; there are {'; '.join(labels)}")
-
-
 def _about(run: Run) -> str:
     """What the figures of a run were made by: command, seeds, digests."""
     note = run.note
-    seconds: dict[str, list[float]] = {name: [] for name in note.methods}
-    for record in run.records:
-        seconds.setdefault(record.method, []).append(record.seconds)
+    seconds = {name: [each.seconds for each in run.records if each.method == name] for name in note.methods}
     rows = [
         [
             name,
@@ -185,14 +166,15 @@ class _Writer:
                 "How far it lies above the other on the same clips; bold where zero lies outside the 95 % interval, "
                 f"which is paired over scenes. {self._written('tables/differences.csv', differences_csv(every))}"
             )
-        if any(each.starred for each in every):
-            yield STAR_OF_FIGURE
         if every and self.of.scenes < FEW_SCENES:
             yield f"Of {self.of.scenes} scenes alone: too few to rest a claim on, whatever is bold."
 
     def plots(self, drawn: bool) -> Iterator[str]:
         for plot in all_plots(self.of):
-            by_point = self._written(f"plots/{plot.name}.csv", curves_csv(plot))
+            points = [(name, point) for name, curve in plot.curves.items() for point in curve]
+            lines = [[name, "" if isnan(p.x) else f"{p.x:g}", *numbers(p.y), str(p.clips)] for name, p in points]
+            heads = ["method", plot.across, plot.up, "low", "high", "clips"]  # levels have no x
+            by_point = self._written(f"plots/{plot.name}.csv", csv_text(heads, lines))
             if drawn:
                 shown, picture = f"{plot.up} by {plot.across}", self.place / f"plots/{plot.name}.png"
                 draw(plot, self.out / picture)
@@ -227,7 +209,7 @@ _HEXPLANE = re.compile(r"hexplane[ _-]?(\d+)", re.IGNORECASE)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Point:
-    """x: where on the axis. y: the figure there. clips: that it is of."""
+    """x: where on the axis, NaN for a level right across. y: the figure there. clips: that it is of."""
 
     x: float
     y: Interval
@@ -236,30 +218,18 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Plot:
-    """name: of its files. title, across, up: what it shows. curves: points by the name of their line.
-
-    levels: lines right across, of what has no x. counted: x are whole numbers, of frames or views.
-    """
+    """name: of its files. title, across, up: what it shows. curves: points by the name of their line."""
 
     name: str
     title: str
     across: str
     up: str
     curves: dict[str, list[Point]]
-    levels: dict[str, Point] = field(default_factory=dict[str, Point])
-    counted: bool = False
 
 
 def all_plots(of: EvaluatedSet) -> tuple[Plot, ...]:
     """All that the records are enough for."""
-    made = (error_by_angle(of), ssim_by_views(of), psnr_by_frame(of))
-    return tuple(plot for plot in made if plot.curves)
-
-
-def _curves(curves: Mapping[str, Iterable[Point]], least: int = 1) -> dict[str, list[Point]]:
-    """Those of so many points or more whose figure is known, and these."""
-    known = {name: [point for point in points if point.y.known] for name, points in curves.items()}
-    return {name: points for name, points in known.items() if len(points) >= least}
+    return tuple(plot for plot in (error_by_angle(of), ssim_by_views(of)) if plot.curves)
 
 
 def error_by_angle(of: EvaluatedSet) -> Plot:
@@ -269,42 +239,19 @@ def error_by_angle(of: EvaluatedSet) -> Plot:
     """
     curves: dict[str, list[Point]] = {}
     for method in of.methods:
-        turned = {record.key: abs(record.change[0]) for record in method.records if record.change is not None}
-        groups: dict[float, list[str]] = {}
-        for key, place in zip(turned, angle_bins(list(turned.values())), strict=True):
-            groups.setdefault(place, []).append(key)
-        curves[method.name] = [
-            Point(x=x, y=method.sums("last", keys=groups[x]).interval("psnr_db"), clips=len(groups[x]))
-            for x in sorted(groups)
+        turned = {each.key: abs(each.change[0]) for each in method.records if each.change is not None}
+        many, groups = len({round(angle, 1) for angle in turned.values()}) > _MOST_ANGLES, dict[float, list[str]]()
+        for key, angle in turned.items():  # as it is or, where many differ, in the middle of its step
+            middle = (min(angle, 179.999) // ANGLE_STEP_DEG + 0.5) * ANGLE_STEP_DEG
+            groups.setdefault(middle if many else round(angle, 1), []).append(key)
+        points = [
+            Point(x=x, y=method.sums("last", keys=keys).interval("psnr_db"), clips=len(keys))
+            for x, keys in sorted(groups.items())
         ]
-    return Plot(
-        name="psnr_by_angle",
-        title="Last frame, all pixels",
-        across="azimuth turned by, degrees",
-        up="PSNR, dB",
-        curves=_curves(curves, least=2),
-    )
-
-
-def psnr_by_frame(of: EvaluatedSet) -> Plot:
-    """PSNR of each frame from the second on, all pixels; mIoU where there are only class maps."""
-    pictures = [method for method in of.methods if method.makes_pictures]
-    figure: FigureName = "psnr_db" if pictures else "miou_common"
-    frames = range(FIRST_MEASURED + 1, of.note.frames + 1)
-    curves = {
-        method.name: [
-            Point(x=frame, y=method.sums(frame).interval(figure), clips=len(method.records)) for frame in frames
-        ]
-        for method in pictures or of.methods
-    }
-    return Plot(
-        name="by_frame",
-        title="Each frame, all pixels",
-        across="frame",
-        up="PSNR, dB" if pictures else "mIoU",
-        curves=_curves(curves, least=2),
-        counted=True,
-    )
+        known = [point for point in points if point.y.known]
+        curves |= {method.name: known} if len(known) > 1 else {}
+    across = "azimuth turned by, degrees"
+    return Plot(name="psnr_by_angle", title="Last frame, all pixels", across=across, up="PSNR, dB", curves=curves)
 
 
 def ssim_by_views(of: EvaluatedSet) -> Plot:
@@ -313,72 +260,38 @@ def ssim_by_views(of: EvaluatedSet) -> Plot:
     Source: GCD, section 5: how many input views a reconstruction needs to come near.
     """
     views = {method.name: int(m[1]) for method in of.methods if (m := _HEXPLANE.search(method.name))}
-    given = sorted((method for method in of.methods if method.name in views), key=lambda m: (views[m.name], m.name))
-
-    def point(method: MethodRecords, region: Region) -> Point:
-        y = method.sums(region=region).interval("ssim")
-        return Point(x=views.get(method.name, 0), y=y, clips=len(method.records))
-
     regions: tuple[Region, ...] = ("all", "occluded")
-    return Plot(
-        name="ssim_by_views",
-        title="HexPlane, frames 2 to the last",
-        across="views given",
-        up="SSIM",
-        curves=_curves({f"HexPlane, {region}": [point(method, region) for method in given] for region in regions}),
-        levels={
-            f"{method.name}, all": point(method, "all")
-            for method in of.methods
-            if method.name not in views and method.makes_pictures
-        },
-        counted=True,
-    )
-
-
-def curves_csv(plot: Plot) -> str:
-    """One point a line; levels have no x."""
-    points = [(name, f"{point.x:g}", point) for name, curve in plot.curves.items() for point in curve]
-    points += [(name, "", point) for name, point in plot.levels.items()]
-    lines = [[name, x, *numbers(point.y), str(point.clips)] for name, x, point in points]
-    return csv_text(["method", plot.across, plot.up, "low", "high", "clips"], lines)
-
-
-def angle_bins(angles: Sequence[float]) -> list[float]:
-    """Where each angle, in degrees, stands on the axis: as it is, or, where many differ, in the middle of its step."""
-    rounded = [round(angle, 1) for angle in angles]
-    if len(set(rounded)) <= _MOST_ANGLES:
-        return rounded
-    return [(np.floor(min(angle, 179.999) / ANGLE_STEP_DEG) + 0.5) * ANGLE_STEP_DEG for angle in angles]
+    curves: dict[str, list[Point]] = {}
+    for region, method in product(regions, sorted(of.methods, key=lambda m: views.get(m.name, inf))):
+        name = "HexPlane" if method.name in views else method.name
+        y = method.sums(region=region).interval("ssim")
+        if y.known and views and (name == "HexPlane" or region == "all"):
+            point = Point(x=views.get(method.name, nan), y=y, clips=len(method.records))
+            curves.setdefault(f"{name}, {region}", []).append(point)
+    title = "HexPlane, frames 2 to the last"
+    return Plot(name="ssim_by_views", title=title, across="views given", up="SSIM", curves=curves)
 
 
 _SIZE_IN = (7.2, 4.4)
-_MOST_TICKS = 16
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def draw(plot: Plot, out: Path) -> None:
     """One PNG: lines with 95 % intervals, levels dashed. Raises RenderError without matplotlib."""
     figure = new_figure(*_SIZE_IN)
-    from matplotlib.ticker import FixedLocator, MaxNLocator
-
     axes = figure.add_subplot()
     for number, (name, curve) in enumerate(plot.curves.items()):
-        x, y = [point.x for point in curve], [point.y.value for point in curve]
+        x, y, colour = [point.x for point in curve], [point.y.value for point in curve], f"C{number % 10}"
+        if isnan(x[0]):
+            axes.axhline(y[0], linestyle="--", linewidth=1.0, color=colour, label=name)
+            continue
         bounds = np.array([(each.value - each.low, each.high - each.value) for each in (point.y for point in curve)])
         yerr, mark = np.nan_to_num(bounds).clip(0.0).T, _MARKS[number % len(_MARKS)]
-        style: dict[str, Any] = {"marker": mark, "color": f"C{number % 10}", "markersize": 4, "linewidth": 1.2}
+        style: dict[str, Any] = {"marker": mark, "color": colour, "markersize": 4, "linewidth": 1.2}
         axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=name, **style)
-    for number, (name, level) in enumerate(plot.levels.items(), start=len(plot.curves)):
-        axes.axhline(level.y.value, linestyle="--", linewidth=1.0, color=f"C{number % 10}", label=name)
     axes.set_title(plot.title, fontsize=10, loc="left")
-    axes.set_xlabel(plot.across)
-    axes.set_ylabel(plot.up)
-    if plot.counted:
-        places = sorted({point.x for curve in plot.curves.values() for point in curve})
-        few = len(places) <= _MOST_TICKS
-        axes.xaxis.set_major_locator(FixedLocator(places) if few else MaxNLocator(integer=True))
-        if len(places) == 1:
-            axes.set_xlim(places[0] - 1, places[0] + 1)
+    places = sorted({point.x for curve in plot.curves.values() for point in curve if not isnan(point.x)})
+    axes.set(xlabel=plot.across, ylabel=plot.up, xticks=places, xlim=(places[0] - 1, places[-1] + 1))
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)

@@ -1,7 +1,7 @@
 """Runs of evaluations put together: what was measured on the same clips stands in the same tables."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -9,26 +9,8 @@ import msgspec
 import numpy as np
 
 from gcd_train.errors import RunError
-from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.statistics import FRAMES_OF, ClipTable, Span, Sums
-from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, ClipRecord, Region, RunNote, read_run
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Run:
-    """One run as it lies on the disk. folder: where its `run.json`, records and views are."""
-
-    folder: Path
-    note: RunNote
-    records: tuple[ClipRecord, ...]
-
-    @classmethod
-    def read(cls, folder: Path) -> "Run":
-        """Raises RunError where there is none, or none of its clips is measured yet."""
-        note, records = read_run(folder)
-        if not records:
-            raise RunError(f"{folder} holds no record yet; run `gcd-train evaluate --out {folder}` to its end")
-        return cls(folder=folder, note=note, records=records)
+from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, ClipRecord, Region, Run, RunNote
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,11 +32,6 @@ class MethodRecords:
         return f"{self.name} *" if self.records[0].privileged else self.name
 
     @property
-    def copies_classes(self) -> bool:
-        """Whether its class maps, and nothing else of it, are made from the source's exact ones."""
-        return not self.records[0].privileged and self.details.get("baseline") in FROM_EXACT_CLASSES
-
-    @property
     def makes_pictures(self) -> bool:
         """Whether it has PSNR, and not class maps alone."""
         return any(record.regions["all"].psnr_db is not None for record in self.records)
@@ -74,7 +51,7 @@ class MethodRecords:
         """All figures of the records."""
         return ClipTable.of(self.records, self.classes)
 
-    def sums(self, frames: Span | int = "2-last", region: Region = "all", keys: Sequence[str] | None = None) -> Sums:
+    def sums(self, frames: Span = "2-last", region: Region = "all", keys: Sequence[str] | None = None) -> Sums:
         """By scene, for some frames and pixels; of the clips of these names, or of all."""
         return self.table.scene_sums(frames, region, None if keys is None else [self.places[key] for key in keys])
 
@@ -87,13 +64,11 @@ class MethodRecords:
 class EvaluatedSet:
     """Methods that were measured on the same clips, by one run or by several.
 
-    note: of the first run. methods: in the order of the runs. rows: method to the row of the paper's tables that a user
-    says it belongs in.
+    note: of the first run. methods: in the order of the runs.
     """
 
     note: RunNote
     methods: tuple[MethodRecords, ...]
-    rows: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def title(self) -> str:
@@ -133,29 +108,15 @@ _KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits"}
 _PROTOCOLS = {"paper": "the paper's protocol", "release": "the released script's protocol", "pairs": "pairs of clips"}
 
 
-def gather(runs: Sequence[Run], rows: Mapping[str, str] | None = None) -> tuple[EvaluatedSet, ...]:
+def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
     """Sets of clips, in the order of the runs; runs on the same clips make one set.
 
-    Args:
-        rows: see EvaluatedSet.
-    Raises:
-        RunError: two runs on the same clips were made in other ways, or name two different methods alike.
+    Raises RunError where two runs name two different methods alike.
     """
-    groups: dict[str, list[Run]] = {}
+    notes, sets = dict[str, RunNote](), dict[str, dict[str, MethodRecords]]()
     for run in runs:
-        groups.setdefault(run.note.data_identity, []).append(run)
-    return tuple(_set(members, rows or {}) for members in groups.values())
-
-
-def _set(runs: Sequence[Run], rows: Mapping[str, str]) -> EvaluatedSet:
-    first, found = runs[0], dict[str, MethodRecords]()
-    for run, name in ((run, name) for run in runs[1:] for name in COMPARABLE):
-        was, now = getattr(first.note, name), getattr(run.note, name)
-        if was != now:
-            raise RunError(
-                f"{run.folder} has {name} {now}, {first.folder} has {was}, on the same clips; report them apart"
-            )
-    for run in runs:
+        notes.setdefault(run.note.data_identity, run.note)
+        found = sets.setdefault(run.note.data_identity, {})
         for name in dict.fromkeys(record.method for record in run.records):
             method = MethodRecords(
                 name=name,
@@ -165,19 +126,15 @@ def _set(runs: Sequence[Run], rows: Mapping[str, str]) -> EvaluatedSet:
                 classes=len(run.note.classes),
             )
             other = found.setdefault(name, method)
-            if not _same_method(other.details, method.details):
+            # frames from elsewhere are known by their content, and LPIPS may have been left out of one of the two
+            left_out = {FRAMES_IN} if LPIPS in other.details and LPIPS in method.details else {FRAMES_IN, LPIPS}
+            keys = (other.details.keys() | method.details.keys()) - left_out
+            if any(other.details.get(key) != method.details.get(key) for key in keys):
                 raise RunError(
                     f"{name} is another method in {other.folder} than in {run.folder}: {other.details} and "
                     f"{method.details}; measure it alike in both, give one another name, or report the runs apart"
                 )
-    return EvaluatedSet(note=first.note, methods=tuple(found.values()), rows=rows)
-
-
-def _same_method(first: Mapping[str, str], other: Mapping[str, str]) -> bool:
-    """Whether two notes are of one method: frames from elsewhere are known by their content, wherever they lie, and
-    LPIPS may have been left out of one of the two runs."""
-    left_out = {FRAMES_IN} if LPIPS in first and LPIPS in other else {FRAMES_IN, LPIPS}
-    return all(first.get(name) == other.get(name) for name in (first.keys() | other.keys()) - left_out)
+    return tuple(EvaluatedSet(note=note, methods=tuple(sets[key].values())) for key, note in notes.items())
 
 
 _SAME_CHANGE = 0.01  # degrees and metres
@@ -213,45 +170,38 @@ def on_the_same_goals(sets: Sequence[EvaluatedSet]) -> tuple[tuple[EvaluatedSet,
 
     Returns: the sets, each put together from several; and what is not compared, and why, line by line.
     """
-    groups: list[list[EvaluatedSet]] = []
-    notes: list[str] = []
+    groups, grown, notes = list[EvaluatedSet](), set[int](), list[str]()
     for each in sets:
-        _place(each, groups, notes)
-    return tuple(_put_together(group, notes) for group in groups if len(group) > 1), tuple(notes)
+        for place, group in enumerate(groups):
+            if any(getattr(group.note, name) != getattr(each.note, name) for name in COMPARABLE):
+                continue
+            shared = group.clips.keys() & each.clips.keys()
+            why = {key: targets_apart(group.clips[key], each.clips[key]) for key in group.clips if key in shared}
+            apart = [key for key, reason in why.items() if reason]
+            if apart:
+                notes.append(
+                    f"{group.folders} and {each.folders}: of {len(why)} clips of the same names {len(apart)} do not "
+                    f"end at the same goal, so they are not compared. In {apart[0]} {why[apart[0]]}."
+                )
+            if len(apart) < len(why):
+                groups[place] = _joined(group, each, shared.difference(apart), notes)
+                grown.add(place)
+                break
+        else:
+            groups.append(each)
+    return tuple(groups[place] for place in sorted(grown)), tuple(notes)
 
 
-def _place(each: EvaluatedSet, groups: list[list[EvaluatedSet]], notes: list[str]) -> None:
-    """Into the first group that it has goals in common with, or into one of its own."""
-    for group in groups:
-        if any(getattr(group[0].note, name) != getattr(each.note, name) for name in COMPARABLE):
-            continue
-        ours, theirs = group[0].clips, each.clips
-        why = {key: targets_apart(record, theirs[key]) for key, record in ours.items() if key in theirs}
-        apart = [key for key, reason in why.items() if reason]
-        if apart:
+def _joined(first: EvaluatedSet, other: EvaluatedSet, keys: set[str], notes: list[str]) -> EvaluatedSet:
+    """The first with the other's methods on these clips; of two methods of one name the first's is kept, and noted."""
+    methods = {method.name: method for method in first.methods}
+    for method in other.methods:
+        records = tuple(record for record in method.records if record.key in keys)
+        known = methods.setdefault(method.name, replace(method, records=records)) if records else method
+        if known.details != method.details:
             notes.append(
-                f"{group[0].folders} and {each.folders}: of {len(why)} clips of the same names {len(apart)} do not end "
-                f"at the same goal, so they are not compared. In {apart[0]} {why[apart[0]]}."
-            )
-        if len(apart) < len(why):
-            kept = [replace(m, records=tuple(r for r in m.records if why.get(r.key) == "")) for m in each.methods]
-            group.append(replace(each, methods=tuple(method for method in kept if method.records)))
-            return
-    groups.append([each])
-
-
-def _put_together(sets: Sequence[EvaluatedSet], notes: list[str]) -> EvaluatedSet:
-    """One set of all; methods that share a name and nothing else are noted, and only the first of each is kept."""
-    methods: dict[str, MethodRecords] = {}
-    for method in (method for each in sets for method in each.methods):
-        other = methods.setdefault(method.name, method)
-        if other.details != method.details:
-            notes.append(
-                f"{method.name} is another method in {method.folder} than in {other.folder}, and only the latter "
+                f"{method.name} is another method in {method.folder} than in {known.folder}, and only the latter "
                 "stands in the table of both; rename one of the two to compare them"
             )
-    return EvaluatedSet(
-        note=msgspec.structs.replace(sets[0].note, data=tuple(folder for each in sets for folder in each.note.data)),
-        methods=tuple(methods.values()),
-        rows=sets[0].rows,
-    )
+    note = msgspec.structs.replace(first.note, data=(*first.note.data, *other.note.data))
+    return replace(first, note=note, methods=tuple(methods.values()))

@@ -5,7 +5,7 @@ clips is one product. Intervals are the bootstrap over scenes, Efron 1979: scene
 scene are alike; the same seed draws the same scenes of every method, so that differences are paired.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, Self, TypeAlias, get_args
@@ -78,9 +78,14 @@ class Sums:
     below: Array
     common: tuple[int, ...]
 
-    def figure(self, name: FigureName, weights: Array | None = None) -> Array:
-        """One figure of each row, or of the rows as often as each weighting [..., n] says; NaN for nothing."""
-        if name == "miou_common":
+    def figure(self, name: FigureName | int, weights: Array | None = None) -> Array:
+        """One figure of each row, or of the rows as often as each weighting [..., n] says; NaN for nothing.
+
+        name: of the figure, or the id of a class for its intersection over union.
+        """
+        if isinstance(name, int):
+            columns = [_CLASSES + name]
+        elif name == "miou_common":
             columns = [_CLASSES + label for label in self.common]
         elif name == "miou_full":
             columns = list(range(_CLASSES, self.above.shape[1]))
@@ -93,22 +98,23 @@ class Sums:
         there = ~np.isnan(ratio)
         return _divided(np.where(there, ratio, 0.0).sum(-1), there.sum(-1))
 
-    def class_iou(self) -> Array:
-        """Intersection over union of each class over all rows, [K]; NaN for one that is nowhere."""
-        return _divided(self.above[:, _CLASSES:].sum(0), self.below[:, _CLASSES:].sum(0))
-
-    def value(self, name: FigureName) -> float:
+    def value(self, name: FigureName | int) -> float:
         """One figure of all rows."""
         return float(self.figure(name, np.ones(len(self.above))))
 
-    def again(self, name: FigureName) -> Array:
-        """The figure of rows drawn with repetition, [DRAWS]; NaN for a single row."""
-        rows = len(self.above)
-        return np.full(DRAWS, np.nan) if rows < 2 else self.figure(name, scene_weights(rows))
-
-    def interval(self, name: FigureName) -> Interval:
-        """One figure with its bounds."""
-        return _interval(self.value(name), lambda: self.again(name))
+    def interval(self, name: FigureName | int, other: "Sums | None" = None) -> Interval:
+        """One figure with the middle 95 % of its draws; or how far it lies above that of others of the same clips, in
+        each draw of the same scenes."""
+        rows, both = len(self.above), (self, *(() if other is None else (other,)))
+        value = float(np.subtract.reduce([each.value(name) for each in both]))
+        if np.isnan(value) or rows < 2:
+            return Interval(value=value)
+        drawn = np.subtract.reduce([each.figure(name, scene_weights(rows)) for each in both])
+        known = drawn[~np.isnan(drawn)]
+        if not known.size:
+            return Interval(value=value)
+        low, high = np.quantile(known, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
+        return Interval(value=value, low=float(low), high=float(high))
 
 
 @lru_cache(maxsize=4)
@@ -116,21 +122,6 @@ def scene_weights(count: int) -> Array:
     """How often each of so many scenes is drawn: [DRAWS, count], each row's sum is `count`."""
     random = np.random.default_rng(SEED)
     return random.multinomial(count, np.full(count, 1.0 / count), size=DRAWS).astype(np.float64)
-
-
-def difference(first: Sums, other: Sums, name: FigureName) -> Interval:
-    """How far `first` lies above `other`, both on the same clips: in each draw the same scenes of both."""
-    return _interval(first.value(name) - other.value(name), lambda: first.again(name) - other.again(name))
-
-
-def _interval(value: float, again: Callable[[], Array]) -> Interval:
-    """The middle 95 % of what is not NaN; `again` is called only for a figure that there is."""
-    drawn = np.empty(0) if np.isnan(value) else again()
-    known = drawn[~np.isnan(drawn)]
-    if not known.size:
-        return Interval(value=value)
-    low, high = np.quantile(known, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
-    return Interval(value=value, low=float(low), high=float(high))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -168,14 +159,11 @@ class ClipTable:
             true=true,
         )
 
-    def clip_sums(
-        self, frames: Span | int = "2-last", region: Region = "all", rows: Sequence[int] | None = None
-    ) -> Sums:
-        """Sums of each clip. frames: a span, or one frame counted from 1. rows: only these clips; None for all."""
-        chosen = slice(frames - 1, frames) if isinstance(frames, int) else FRAMES_OF[frames]
+    def clip_sums(self, frames: Span = "2-last", region: Region = "all", rows: Sequence[int] | None = None) -> Sums:
+        """Sums of each clip. rows: only these clips; None for all."""
         rows = range(len(self.scenes)) if rows is None else rows
         each = [table[region][rows] for table in (self.above, self.below)]
-        above, below = (table[:, chosen].sum(axis=1) for table in each)
+        above, below = (table[:, FRAMES_OF[frames]].sum(axis=1) for table in each)
         if frames == "2-last":  # the change into the first of these frames is none between them
             above[:, _FLICKER], below[:, _FLICKER] = (
                 table[:, FIRST_MEASURED + 1 :, _FLICKER].sum(axis=1) for table in each
@@ -186,9 +174,7 @@ class ClipTable:
         commonest = np.argsort(-true, kind="stable")[:COMMON_CLASSES].tolist()
         return Sums(above=above, below=below, common=tuple(sorted(label for label in commonest if true[label] > 0)))
 
-    def scene_sums(
-        self, frames: Span | int = "2-last", region: Region = "all", rows: Sequence[int] | None = None
-    ) -> Sums:
+    def scene_sums(self, frames: Span = "2-last", region: Region = "all", rows: Sequence[int] | None = None) -> Sums:
         """`clip_sums` added up over each scene, in the order of their first clips, ready to be drawn from."""
         sums = self.clip_sums(frames, region, rows)
         scenes = self.scenes if rows is None else [self.scenes[row] for row in rows]

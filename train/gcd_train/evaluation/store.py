@@ -12,7 +12,7 @@ Files appear whole or not at all, so a run that was killed goes on where it stop
 import fcntl
 import re
 from collections.abc import Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, TypeVar, get_args
@@ -129,27 +129,23 @@ class RunKeeper:
 
     @contextmanager
     def in_use(self, note: RunNote) -> Generator[None]:
-        """`begin`, and its methods are measured by no other line until the block is left.
-
-        Raises: RunError as `begin`, and where another line measures one of the methods now.
-        """
-        (self.folder / ".measuring").mkdir(parents=True, exist_ok=True)
-        with ExitStack() as held:
-            with (self.folder / ".begin").open("a") as turn:
-                fcntl.flock(turn, fcntl.LOCK_EX)
-                for method in note.methods:
-                    if not self._seized(method, held):
-                        raise RunError(
-                            f"another line measures {method} in {self.folder} now; wait for it, or give another --out"
-                        )
-                self.begin(note)
+        """`begin`, and no other line measures in the folder until the block is left. Raises RunError where one does."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / ".lock").open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise RunError(
+                    f"another line measures in {self.folder} now; wait for it, or give another --out and report both"
+                ) from None
+            self.begin(note)
             yield
 
     def begin(self, note: RunNote) -> RunNote:
         """Write `run.json`, or add this note's methods to the one that is there, whose command and time stay.
 
-        A method without a record that no line measures now binds nobody: it is corrected, or dropped where this note
-        does not name it, and a note of which no method is left is written anew.
+        A method without a record binds nobody: it is corrected, or dropped where this note does not name it, and a note
+        of which no method is left is written anew.
 
         Returns: what now stands there.
         Raises:
@@ -159,7 +155,8 @@ class RunKeeper:
         path = self.folder / RUN_FILE
         if path.exists():
             found = _read(path, RunNote, "delete the run, or choose another folder")
-            kept = {name: told for name, told in found.methods.items() if self._binds(name, note)}
+            places = {name: self.folder / "records" / folder_name(name) for name in found.methods}
+            kept = {name: found.methods[name] for name, place in places.items() if any(place.glob("*.json"))}
             note = _joined(self.folder, msgspec.structs.replace(found, methods=kept), note) if kept else note
         owners: dict[str, str] = {}
         for method in note.methods:
@@ -170,23 +167,6 @@ class RunKeeper:
                 )
         write_whole(path, msgspec.json.format(msgspec.json.encode(note), indent=1))
         return note
-
-    def _binds(self, method: str, note: RunNote) -> bool:
-        """Whether a method has a record, or another line measures it now."""
-        if any((self.folder / "records" / folder_name(method)).glob("*.json")):
-            return True
-        with ExitStack() as held:
-            return method not in note.methods and not self._seized(method, held)
-
-    def _seized(self, method: str, held: ExitStack) -> bool:
-        """Whether a method could be locked, until `held` is left."""
-        (self.folder / ".measuring").mkdir(parents=True, exist_ok=True)
-        file = held.enter_context((self.folder / ".measuring" / folder_name(method)).open("a"))
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        return True
 
     def has(self, method: str, key: str) -> bool:
         """Whether there is a record."""
@@ -204,19 +184,29 @@ class RunKeeper:
         return self.folder / "records" / folder_name(method) / f"{folder_name(key)}.json"
 
 
-def read_run(folder: Path | str) -> tuple[RunNote, tuple[ClipRecord, ...]]:
-    """What a run says of itself, and its records: method by method in the note's order, clips by name.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """One run as it lies on the disk. folder: where its `run.json`, records and views are.
 
-    Raises:
-        RunError: there is no run, or a file of it is damaged.
+    records: method by method in the note's order, clips by name.
     """
-    folder = Path(folder)
-    if not (folder / RUN_FILE).exists():
-        raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
-    note = _read(folder / RUN_FILE, RunNote, "delete the run, or choose another folder")
-    places = [folder / "records" / folder_name(method) for method in note.methods]
-    files = [path for place in places for path in sorted(place.glob("*.json"))]
-    return note, tuple(_read(path, ClipRecord, "delete it and evaluate again, the others are kept") for path in files)
+
+    folder: Path
+    note: RunNote
+    records: tuple[ClipRecord, ...]
+
+    @classmethod
+    def read(cls, folder: Path) -> "Run":
+        """Raises RunError where there is none, none of its clips is measured yet, or a file of it is damaged."""
+        if not (folder / RUN_FILE).exists():
+            raise RunError(f"{folder} holds no {RUN_FILE}; make a run with `gcd-train evaluate --out {folder}`")
+        note = _read(folder / RUN_FILE, RunNote, "delete the run, or choose another folder")
+        places = [folder / "records" / folder_name(method) for method in note.methods]
+        cure = "delete it and evaluate again, the others are kept"
+        records = [_read(path, ClipRecord, cure) for place in places for path in sorted(place.glob("*.json"))]
+        if not records:
+            raise RunError(f"{folder} holds no record yet; run `gcd-train evaluate --out {folder}` to its end")
+        return cls(folder=folder, note=note, records=tuple(records))
 
 
 def _read(path: Path, kind: type[Stored], cure: str) -> Stored:

@@ -4,49 +4,41 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import product, zip_longest
 from math import isnan, nan
 
 import numpy as np
 
+from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, row_label, tables_for
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
-from gcd_train.evaluation.statistics import FIGURE_NAMES, SPANS, FigureName, Interval, Span, difference
+from gcd_train.evaluation.statistics import FIGURE_NAMES, SPANS, FigureName, Interval, Span
 from gcd_train.evaluation.store import REGIONS, Region
 
 NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
 _LINE = "———"
 _OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
 _BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
-STAR_OF_FIGURE = "A * behind a mIoU: these class maps are made from the source's exact ones, which no model is given."
-"""Stands below tables with such a star."""
+_COPIED = "mIoU of {}: these class maps are made from the source's exact ones, which no model is given."
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Cell:
     """One figure of a table, or why there is none.
 
-    digits: behind the point. note: stands in for the figure. paper: what the paper prints there, its own data. starred:
-    the method was given more for this figure than for its others.
+    digits: behind the point. note: stands in for the figure.
     """
 
     figure: Interval = Interval(value=nan)  # noqa: RUF009  it is frozen
     digits: int = 2
     note: str = NOTHING
-    paper: float | None = None
-    starred: bool = False
 
     def __str__(self) -> str:
         if not self.figure.known:
             return self.note
         values = [f"{number:.{self.digits}f}" for number in (self.figure.value, self.figure.low, self.figure.high)]
         bounds = "" if isnan(self.figure.low) else f" [{values[1]}, {values[2]}]"  # of one scene there are none
-        return values[0] + bounds + (" *" if self.starred else "")
-
-    @property
-    def printed(self) -> str:
-        """What the paper prints, empty for nothing."""
-        return "" if self.paper is None else f"{self.paper:g}"
+        return values[0] + bounds
 
 
 def numbers(figure: Interval) -> list[str]:
@@ -56,18 +48,15 @@ def numbers(figure: Interval) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Row:
-    """label: of the row. method: whose figures these are, empty for none. clips: how many it was measured on."""
+    """label: of the row. method: whose figures these are, empty for none. clips: how many it was measured on. printed:
+    what the paper prints in it, cell by cell, its own data.
+    """
 
     label: str = ""
     method: str = ""
     clips: str = ""
     cells: tuple[Cell, ...]
-
-    @property
-    def printed(self) -> str:
-        """What the paper prints in it, in one cell."""
-        each = [cell.printed for cell in self.cells]
-        return ", ".join(text or NOTHING for text in each) if any(each) else ""
+    printed: Sequence[float | None] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,12 +73,12 @@ class Table:
 
 def to_markdown(table: Table) -> str:
     """With a heading of the third level."""
-    every = (*table.rows, *table.below)
-    has_paper = any(row.printed for row in every)
-    heads = ["", "method", "clips", *table.headings, *(["paper (its own data)"] if has_paper else [])]
-    rows = [
-        [row.label, row.method, row.clips, *map(str, row.cells), *([row.printed] if has_paper else [])] for row in every
-    ]
+    heads, rows = ["", "method", "clips", *table.headings], list[list[str]]()
+    papers = any(row.printed for row in table.rows)
+    for row in (*table.rows, *table.below):
+        printed = ", ".join(NOTHING if value is None else f"{value:g}" for value in row.printed)
+        rows.append([row.label, row.method, row.clips, *map(str, row.cells), *([printed] if papers else [])])
+    heads += ["paper (its own data)"] if papers else []
     if table.below:
         rows.insert(len(table.rows), [_LINE] * len(heads))
     lines = [f"### {table.title}", "", *markdown_rows(heads, rows)]
@@ -98,12 +87,14 @@ def to_markdown(table: Table) -> str:
 
 def to_csv(table: Table) -> str:
     """For each column its value, the bounds and what the paper prints; what is missing is empty."""
-    parts = [f"{heading}{what}" for heading in table.headings for what in ("", " low", " high", " paper")]
-    rows: list[list[str]] = []
+    heads = [f"{heading}{what}" for heading in table.headings for what in ("", " low", " high", " paper")]
+    lines: list[list[str]] = []
     for row in (*table.rows, *table.below):
-        cells = [part for cell in row.cells for part in (*numbers(cell.figure), cell.printed)]
-        rows.append([row.label, row.method or NOT_RUN, row.clips, *cells])
-    return csv_text(["row", "method", "clips", *parts], rows)
+        line = [row.label, row.method or NOT_RUN, row.clips]
+        for cell, printed in zip_longest(row.cells, row.printed):
+            line += [*numbers(cell.figure), "" if printed is None else f"{printed:g}"]
+        lines.append(line)
+    return csv_text(["row", "method", "clips", *heads], lines)
 
 
 def csv_text(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -144,23 +135,19 @@ def main_tables(of: EvaluatedSet, spans: Sequence[Span] = ("2-last", "last")) ->
         if frames not in papers
     ]
     for paper in (each for frames, each in papers.items() if frames in spans):
-        labels = {m.name: of.rows.get(m.name) or row_label(m.name, m.details, paper) or "" for m in of.methods}
+        labels = {m.name: row_label(m.name, m.details, paper) or "" for m in of.methods}
         rows: list[Row] = []
         for label, printed in paper.rows.items():
             found = [method for method in of.methods if labels[method.name] == label]
             rows += [_row(of, each, paper.columns, paper.frames, label, printed) for each in found]
             if not found:
-                rows.append(Row(label=label, cells=tuple(Cell(note=NOT_RUN, paper=value) for value in printed)))
+                rows.append(Row(label=label, cells=(Cell(note=NOT_RUN),) * len(printed), printed=printed))
         rows += [_gain(rows, *gain) for gain in paper.gains]
-        apart = dict.fromkeys(label for label in labels.values() if label not in paper.rows)
-        below = [
-            _row(
-                of, method, paper.columns, paper.frames, f"{label}, not in this table" if label else "not in the paper"
-            )
-            for label in apart
-            for method in of.methods
-            if labels[method.name] == label
-        ]
+        others = [method for method in of.methods if labels[method.name] not in paper.rows]
+        below: list[Row] = []
+        for method in sorted(others, key=lambda each: list(labels.values()).index(labels[each.name])):
+            label = f"{labels[method.name]}, not in this table" if labels[method.name] else "not in the paper"
+            below.append(_row(of, method, paper.columns, paper.frames, label))
         made.append(
             Table(
                 name=paper.name,
@@ -187,22 +174,10 @@ def region_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
 
 def class_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
     """Intersection over union of each class at picture size; what occurs nowhere is left out."""
-    methods = [method for method in of.methods if method.makes_classes]
-    iou = [each.sums(frames).class_iou() for each in methods]
-    there = [place for place in range(len(of.note.classes)) if any(np.isfinite(each[place]) for each in iou)]
-    rows = [
-        Row(
-            method=method.starred,
-            clips=f"{len(method.records)} of {len(of.clips)}",
-            cells=tuple(
-                Cell(figure=Interval(value=float(each[place])), starred=method.copies_classes) for place in there
-            ),
-        )
-        for method, each in zip(methods, iou, strict=True)
-    ]
-    names = tuple(of.note.classes[place] for place in there)
+    columns = [Column(heading=name, figure=label) for label, name in enumerate(of.note.classes)]
+    methods = tuple(method for method in of.methods if method.makes_classes)
     title = f"IoU of each class: {frames_told(of, frames)}"
-    return Table(name="classes", title=title, headings=names, rows=tuple(rows))
+    return _own_table(replace(of, methods=methods), columns, frames, "classes", title)
 
 
 def _own_table(of: EvaluatedSet, columns: Sequence[Column], frames: Span, name: str, title: str) -> Table:
@@ -230,19 +205,17 @@ def _row(
 ) -> Row:
     """A method's figures, beside what the paper prints in its row."""
     cells: list[Cell] = []
-    for place, column in enumerate(columns):
+    for column in columns:
         why_not = NOTHING if column.region in of.regions else "unknown"
         cells.append(
             Cell(
                 figure=method.sums(frames, column.region).interval(column.figure),
                 digits=column.digits,
                 note=NO_WEIGHTS if column.figure == "lpips" and method.makes_pictures else why_not,
-                paper=printed[place] if printed else None,
-                starred=method.copies_classes and column.of_classes,
             )
         )
     clips = f"{len(method.records)} of {len(of.clips)}"
-    return Row(label=label, method=method.starred, clips=clips, cells=tuple(cells))
+    return Row(label=label, method=method.starred, clips=clips, cells=tuple(cells), printed=printed)
 
 
 def _gain(rows: Sequence[Row], better: str, worse: str, printed: float) -> Row:
@@ -251,16 +224,18 @@ def _gain(rows: Sequence[Row], better: str, worse: str, printed: float) -> Row:
     first = {row.label: row.cells[0].figure for row in reversed(rows)}
     apart = [first[label].value - first[label.replace(better, worse)].value for label in first if better in label]
     figure = Interval(value=sum(apart) / len(apart))  # not known as soon as one is not
-    cell = Cell(figure=figure, note=NOT_RUN, paper=printed)
-    return Row(label=f"{better} over {worse}, mean of variants", cells=(cell, *[Cell()] * (len(rows[0].cells) - 1)))
+    more = len(rows[0].cells) - 1
+    cells = (Cell(figure=figure, note=NOT_RUN), *[Cell()] * more)
+    return Row(label=f"{better} over {worse}, mean of variants", cells=cells, printed=(printed, *[None] * more))
 
 
 def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[str, ...]:
     """What stands below a table: its frames and clips, what brackets and stars mean, what is not known."""
     span = frames_told(of, frames)
     notes = [f"{span[0].upper()}{span[1:]} of {len(of.clips)} clips of {of.scenes} scenes. {_BRACKETS}"]
-    if any(column.of_classes for column in columns) and any(each.copies_classes for each in of.methods):
-        notes.append(STAR_OF_FIGURE)
+    copied = [each.name for each in of.methods if each.details.get("baseline") in FROM_EXACT_CLASSES]
+    if copied and any(isinstance(column.figure, int) or column.figure == "miou_common" for column in columns):
+        notes.append(_COPIED.format(" and ".join(copied)))
     if any(column.region not in of.regions for column in columns):
         notes.append("Unknown: nobody knows which pixels of these clips the source camera saw.")
     if any(column.figure == "lpips" for column in columns) and len(of.regions) > 1:
@@ -312,10 +287,7 @@ def clips_csv(of: EvaluatedSet) -> str:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Difference:
-    """How far one method lies above another in one figure. clips: that both have.
-
-    starred: one of them was given more for this figure than for its others, see `MethodRecords.copies_classes`.
-    """
+    """How far one method lies above another in one figure. clips: that both have."""
 
     first: str
     other: str
@@ -323,7 +295,6 @@ class Difference:
     frames: Span
     clips: int
     apart: Interval
-    starred: bool = False
 
     @property
     def verdict(self) -> str:
@@ -335,11 +306,10 @@ class Difference:
     def __str__(self) -> str:
         each = (self.apart.value, self.apart.low, self.apart.high)
         value, low, high = (f"{number:+.{self.column.digits}f}" for number in each)
-        star = " *" if self.starred else ""
         if isnan(self.apart.low):  # one scene tells nothing of it
-            return value + star
+            return value
         text = f"{value} [{low}, {high}]"
-        return (text if self.verdict == "open" else f"**{text}** {self.verdict}") + star
+        return text if self.verdict == "open" else f"**{text}** {self.verdict}"
 
 
 def differences(
@@ -358,7 +328,7 @@ def differences(
     keys, found = first.common_keys(other) if keys is None else keys, list[Difference]()
     for column in columns if keys else ():
         ours, theirs = (each.sums(frames, column.region, keys) for each in (first, other))
-        apart = difference(ours, theirs, column.figure)
+        apart = ours.interval(column.figure, theirs)
         if apart.known:
             found.append(
                 Difference(
@@ -368,7 +338,6 @@ def differences(
                     frames=frames,
                     clips=len(keys),
                     apart=apart,
-                    starred=(first.copies_classes or other.copies_classes) and column.of_classes,
                 )
             )
     return tuple(found)

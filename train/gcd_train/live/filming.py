@@ -27,8 +27,8 @@ from gcd_train.scenes.description import Scene, moved, rotations
 from gcd_train.scenes.driving.world import HFOV_DEG as _DRIVING_HFOV_DEG
 from gcd_train.scenes.driving.world import driving_scene, looking
 from gcd_train.scenes.drop.world import HFOV_DEG as _STAGE_HFOV_DEG
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering
+from gcd_train.scenes.triangles import freeze
 from gcd_train.scenes.worlds import scene_world
 
 Random = np.random.Generator

@@ -4,11 +4,9 @@ A window is frames out of any video: at a trained rate, cut and resized to the n
 """
 
 import math
-import os
 import re
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
@@ -16,7 +14,6 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from typer import Option
 
 from gcd_model import (
@@ -31,20 +28,18 @@ from gcd_model import (
 )
 from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import Intrinsics, center_crop_box
-from gcd_train.data.encodings import decoded
-from gcd_train.data.files import read
+from gcd_train.data.encodings import read_colour
 from gcd_train.data.sample import Bytes, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
 from gcd_train.evaluation.store import folder_name
 from gcd_train.files import write_whole
+from gcd_train.pictures import opened_video, video_frames
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".webm", ".avi", ".mov", ".m4v")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
-_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _NUMBERED = re.compile(r"(\D*)(\d*)")
 _MIN_RATE, _MAX_RATE = 0.1, 1000.0
-_QUIET = ("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first video is opened; the decoder prints its own lines else
 _RATE_TOLERANCE = 1.01  # 23.976 is 24
 _ANGLES = (SphericalDelta(azimuth_deg=30.0, elevation_deg=10.0), SphericalDelta(azimuth_deg=-30.0))
 """Where steered models look from unless somebody says: to the right and from above, and to the left."""
@@ -119,19 +114,15 @@ class RealVideo:
     def frames(self) -> Iterator[Bytes]:
         """Every frame as RGB u8 [H, W, 3]. Raises DataError for what is no video or picture."""
         if self.pictures:
-            for path in self.pictures:
-                picture = decoded(path, read(path), cv2.IMREAD_COLOR)
-                yield np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
-            return
-        with _opened(self.path) as capture:
-            while (found := capture.read())[0]:
-                yield np.asarray(cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB), np.uint8)
+            yield from map(read_colour, self.pictures)
+        else:
+            yield from video_frames(self.path)
 
     def measured(self) -> tuple[int, float | None]:
         """Frames, counted one by one as containers lie, and frames per second; None where the file does not tell."""
         if self.pictures:
             return len(self.pictures), None
-        with _opened(self.path) as capture:
+        with opened_video(self.path) as capture:
             stated = float(capture.get(cv2.CAP_PROP_FPS))
             count = 0
             while capture.grab():
@@ -226,35 +217,6 @@ def _videos_at(path: Path) -> list[tuple[Path, tuple[Path, ...]]]:
     return [(each, ()) for each in videos] or [(path, pictures)]
 
 
-@contextmanager
-def _opened(path: Path) -> Generator[cv2.VideoCapture]:
-    if not _is_container(path):
-        raise DataError(f"{path} is no whole video file; wanted is one of {', '.join(VIDEO_SUFFIXES)}")
-    os.environ.setdefault(*_QUIET)
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    cv2.utils.logging.setLogLevel(level)
-    try:
-        if not capture.isOpened():
-            raise DataError(f"{path} cannot be decoded: truncated or damaged; copy or record it again")
-        yield capture
-    finally:
-        capture.release()
-
-
-def _is_container(path: Path) -> bool:
-    """By its first bytes: the decoder would also play a text, or follow a play list to other files."""
-    try:
-        if not path.is_file():
-            raise DataError(f"{path} is no regular file; give a video")
-        with path.open("rb") as file:
-            head = file.read(12)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}; check the path and its rights") from error
-    return head[4:8] in _BOXES or head[:4] == b"\x1a\x45\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
-
-
 def _starts(path: Path, count: int, own: float, fps: float, frames: int, options: GalleryOptions) -> list[int]:
     """First frame of each window, evenly from the first to the last that fits; windows do not overlap."""
     span = math.floor((frames - 1) * own / fps + 0.5) + 1
@@ -341,8 +303,10 @@ def view_window(synthesizer: ViewSynthesizer, window: Windowed, options: Gallery
         for number, sample in enumerate(view.samples):
             strips.append(Strip.of(name if number == 0 else f"{name} sample {number + 1}", to_bytes(sample)))
         deviation, word = (view.uncertainty, "uncertainty") if view.uncertainty is not None else (view.std, "deviation")
-        if deviation is not None:
-            strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", _heat(deviation.numpy())))
+        if deviation is not None:  # black is 0, the brightest its largest
+            grey = np.rint(deviation.numpy() / max(float(deviation.max()), 1e-6) * 255).clip(0, 255).astype(np.uint8)
+            heat = [cv2.applyColorMap(each, cv2.COLORMAP_INFERNO)[..., ::-1].astype(np.uint8) for each in grey]
+            strips.append(Strip.of(f"{word}, white {float(deviation.max()):.2g}", np.stack(heat)))
         if view.classes is not None:
             strips.append(Strip.of("classes", painted(view.classes[0], traits.classes)))
     return strips
@@ -352,12 +316,6 @@ def write_views(window: Windowed, strips: Sequence[Strip], folder: Path) -> None
     """`NAME.png`, the sheet, and `NAME.mp4`, all rows side by side. Raises RunError if they cannot be written."""
     write_sheet([(f"{window.video} from {window.start_s:.1f} s", strips)], folder / f"{window.name}.png")
     write_video(strips, window.fps, folder / f"{window.name}.mp4")
-
-
-def _heat(values: NDArray[np.float32]) -> Bytes:
-    """Numbers [T, H, W] as pictures [T, H, W, 3]: black is 0, the brightest is their largest."""
-    grey = np.rint(values / max(float(values.max()), 1e-6) * 255).clip(0, 255).astype(np.uint8)
-    return np.stack([np.asarray(cv2.applyColorMap(each, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8) for each in grey])
 
 
 _STYLE = (

@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from typer import Option
 
-from gcd_model.errors import FileError
 from gcd_model.geometry import DRIVING_GOAL_TARGET, LOOK_AT, Intrinsics, from_pose, spherical_trajectory
-from gcd_model.small_files import decode_json, read_json
+from gcd_model.small_files import decode_json
 from gcd_train.data import kubric4d, parallel_domain4d
-from gcd_train.data.dataset4d import Dataset4D, OntologyItem, layout_of, read_ontology
-from gcd_train.data.files import GEOMETRY, MOST_TEXT, ZIP_FAULTS, read_manifest, read_member
+from gcd_train.data.dataset4d import Dataset4D, Ontology, OntologyItem, layout_of, read_ontology
+from gcd_train.data.files import GEOMETRY, ZIP_FAULTS, read_manifest, read_member
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.pairs import PairedClips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
@@ -38,11 +36,9 @@ _STAGE, _VEHICLE = "world: z up, ground at z = 0", "vehicle: x ahead, y left, z 
 class ShowOptions:
     """Which clip is shown: options of `gcd-train show`."""
 
-    start: Annotated[int | None, Option(min=0, help="First frame of the clip; drawn by --seed if left out.")] = None
-    stride: Annotated[int | None, Option(min=1, help="Every how many frames; drawn by --seed if left out.")] = None
-    seed: Annotated[int, Option(min=0, help="Draws the clip and the camera path.")] = 0
-    clip: Annotated[
-        int | None, Option(min=0, help="In pair shards: seed of the clip to show; the first if left out.")
+    seed: Annotated[
+        int | None,
+        Option(min=0, help="Draws clip and camera path; of pair shards the clip's own."),
     ] = None
     points: Annotated[
         bool, Option("--points", help="Draw the target from the cameras' points, not from geometry.npz.")
@@ -53,17 +49,11 @@ def open_scene(path: Path, options: ShowOptions) -> Footage:
     """The clip of a scene folder, or of a folder of pair shards.
 
     Raises: DataError if there is no such folder or it is of no known layout, FileFault (a DataError) naming the file
-    that cannot be read, RecipeError for options that do not fit.
+    that cannot be read, RecipeError for a seed of no clip.
     """
     path = path.resolve()
     if path.suffix == ".zip" or (path / "world.json").exists():
-        if options.start is not None or options.stride is not None:
-            raise RecipeError(
-                "pair shards hold finished clips: leave out --start and --stride, or name one with --clip"
-            )
-        return _pair_clip(path, options.clip)
-    if options.clip is not None:
-        raise RecipeError("--clip names a clip of pair shards; choose one of a scene with --start, --stride and --seed")
+        return _pair_clip(path, options.seed)
     if not path.is_dir():
         raise DataError(f"{path} is no folder; give a scene such as scn00000 or scene_000000, or pair shards")
     return _scene_clip(_data_set(path), path.name, options)
@@ -95,57 +85,37 @@ def _data_set(path: Path) -> Dataset4D:
 
 
 def _scene_clip(data: Dataset4D, scene: str, options: ShowOptions) -> Footage:
-    """A clip of a scene. Raises: FileFault naming the file that cannot be read, RecipeError for frames that are not."""
+    """A clip of a scene. Raises FileFault naming the file that cannot be read."""
     on_sphere, folder, every = isinstance(data, Kubric4D), data.folder(scene), data.frames(scene)
-    numbers, stride = _frame_numbers(every, KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, options)
+    seed = options.seed or 0
+    sampling = replace(KUBRIC_FRAMES if on_sphere else DRIVING_FRAMES, reach_last=True, reverse=0.0, latest_start=None)
+    if sampling.last_start(every, 1) < 0:  # a scene that is too short is shown whole
+        numbers, stride = tuple(range(min(every, sampling.clip))), 1
+    else:
+        numbers, stride = sampling.draw(generator(seed, 0), every)
     views = [data.views(scene, number, [data.source_camera])[0] for number in numbers]
     width = min(_WIDTH, views[0].lens.width)
     lens, pose = render_lens(views[0].lens, width, round(width / _SHAPE)), views[0].world_from_camera
-    still, poses, path = _orbit(pose, len(numbers), options.seed) if on_sphere else _drive(len(numbers))
+    still, poses, path = _orbit(pose, len(numbers), seed) if on_sphere else _drive(len(numbers))
     draw = Draw(frame_numbers=numbers, fps=data.fps / stride, world_from_source=still, world_from_target=poses)
     sample, target_is = _sample(data, scene, draw, (lens.width, lens.height), exact=not options.points)
-    classed = data.ontology is not None and all(view.classes is not None for view in views)
+    layout = "Kubric-4D layout" if on_sphere else "ParallelDomain-4D layout"
+    with suppress(DataError):  # of our own scenes, the world
+        layout = f"{_world_name(read_manifest(folder).world)}, {layout}"
     return Footage(
-        title=_title(folder, "Kubric-4D" if on_sphere else "ParallelDomain-4D"),
-        folder=str(folder),
+        title=f"{folder.name}, {layout}",
         path=path,
         scene=f"{every} frames at {data.fps:g} fps, {len(data.cameras)} cameras",
-        frame_numbers=numbers,
-        fps=sample.fps,
         source_camera=data.source_camera,
         lens=lens,
         views=views,
         poses=poses,
-        target=sample.target,
+        sample=sample,
         target_is=target_is,
-        target_depth=sample.target_depth,
-        visible=np.ones(sample.target.shape[:3], np.bool_) if sample.visible is None else sample.visible,
-        classes=data.ontology.items if classed and data.ontology is not None else (),
-        instances={} if classed else _asset_names(data, folder),
-        world_from_source=np.repeat(still[None], len(numbers), axis=0),
-        world_from_target=poses,
+        ontology=data.ontology if all(view.classes is not None for view in views) else None,
         look_at=LOOK_AT if on_sphere else DRIVING_GOAL_TARGET,
         world=_STAGE if on_sphere else _VEHICLE,
     )
-
-
-def _frame_numbers(frames: int, sampling: FrameSampling, options: ShowOptions) -> tuple[tuple[int, ...], int]:
-    """The clip's frames and stride; of a scene that is too short all of its frames."""
-    clip = sampling.clip
-    strides = sampling.strides if options.stride is None else (options.stride,)
-    if options.stride is None and options.start is None and sampling.last_start(frames, 1) < 0:
-        return tuple(range(min(frames, clip))), 1
-    reaching = replace(sampling, strides=strides, reach_last=True, reverse=0.0, latest_start=None)
-    if options.start is None:
-        return reaching.draw(generator(options.seed, 0), frames)
-    stride = options.stride or 1
-    last = reaching.last_start(frames, stride)
-    if not 0 <= options.start <= last:
-        raise RecipeError(
-            f"the scene has {frames} frames: with stride {stride} a clip of {clip} may start at 0 to {last}, got "
-            f"{options.start}; change --start or --stride"
-        )
-    return tuple(range(options.start, options.start + clip * stride, stride)), stride
 
 
 def _orbit(world_from_source: NDArray[np.float64], frames: int, seed: int) -> tuple[Poses, Poses, str]:
@@ -180,49 +150,35 @@ def _sample(data: Dataset4D, scene: str, draw: Draw, size: tuple[int, int], *, e
     return pictures_of(data, options).sample(scene, draw), f"points of all {len(data.cameras)} cameras"
 
 
-def _title(folder: Path, layout: str) -> str:
-    """Scene, layout and, of our own scenes, the world it was made in."""
-    try:
-        return f"{folder.name}, {_world_name(read_manifest(folder).world)}, {layout} layout"
-    except DataError:
-        return f"{folder.name}, {layout} layout"
-
-
 def _world_name(world: str) -> str:
     return f"{world} world" + (" (1 m here is 1 dm)" if world.startswith("tabletop") else "")
 
 
-class _Asset(msgspec.Struct, frozen=True):
-    asset_id: str = ""
-
-
-class _Assets(msgspec.Struct, frozen=True):
-    instances: tuple[_Asset, ...] = ()
-
-
-def _asset_names(data: Dataset4D, folder: Path) -> dict[int, str]:
-    """What a Kubric scene calls its instances."""
-    path = kubric4d.metadata_path(folder, data.source_camera)
-    try:
-        assets = read_json(path, _Assets, MOST_TEXT).instances
-    except FileError:
-        return {}  # names are decoration; the reader has checked what matters in this file
-    return {i: f"{asset.asset_id} ({i})" for i, asset in enumerate(assets, 1) if asset.asset_id}
-
-
 def _pair_clip(path: Path, seed: int | None) -> Footage:
-    """The clip of a seed, by default the first of the shard or folder.
+    """A finished clip as it was rendered, in its world or, in driving, in the vehicle's frame.
 
-    Raises: DataError naming the shard, RecipeError for an unknown seed.
+    seed: by default of the first clip of the shard or folder. Raises: DataError naming the shard, RecipeError for an
+    unknown seed.
     """
     folder = path.parent if path.suffix == ".zip" else path
     if seed is None and path.suffix == ".zip" and (number := path.stem.split("-")[1:2]) and number[0].isdecimal():
         seed = int(number[0])
     clips = PairedClips.open(folder)
-    index = _clip_number(folder, clips, seed)
-    clip, (shard, name), numbers = clips[index], clips.places[index], tuple(range(clips.frames))
-    sources, targets = _pair_poses(shard, name)
+    if seed is not None and seed not in clips.seeds:
+        low, high = clips.seeds[0], clips.seeds[-1]
+        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(clips)}, {low} to {high}")
+    index = 0 if seed is None else clips.seeds.index(seed)
+    clip, sample = clips[index], clips.sample(index)
+    sources, targets = _pair_poses(*clips.places[index])
     lens = Intrinsics.from_hfov(clips.world.hfov_deg, clips.width, clips.height)
+    if clips.mount is None:
+        orbit = clips.orbit(index)
+        words = "{:+.1f}° azimuth, {:+.1f}° elevation, {:+.1f} m radius, gradual".format(*orbit.change)
+        sample = replace(sample, frame_numbers=orbit.frame_numbers)
+    else:
+        words, still = "the driving path, up and back at a sine pace", clips.mount.vehicle_from_camera.numpy()
+        targets = still @ np.linalg.inv(sources) @ targets
+        sources = np.broadcast_to(still, targets.shape)
     views = [
         SceneView(
             rgb=clip.source[t],
@@ -232,49 +188,24 @@ def _pair_clip(path: Path, seed: int | None) -> Footage:
             world_from_camera=sources[t],
             lens=lens,
         )
-        for t in numbers
+        for t in range(clips.frames)
     ]
-    world_from_source, world_from_target = sources, targets
-    if clips.mount is None:
-        orbit = clips.orbit(index)
-        azimuth_deg, elevation_deg, radius_m = orbit.change
-        words = f"{azimuth_deg:+.1f}° azimuth, {elevation_deg:+.1f}° elevation, {radius_m:+.1f} m radius, gradual"
-        numbers = orbit.frame_numbers
-    else:
-        words = "the driving path, up and back at a sine pace"
-        world_from_source = np.tile(clips.mount.vehicle_from_camera.numpy(), (clips.frames, 1, 1))
-        world_from_target = world_from_source @ np.linalg.inv(sources) @ targets
+    seen = [depth_visibility(view, clip.target_depth[t], targets[t], lens) for t, view in enumerate(views)]
+    kinds = tuple(OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes))
     return Footage(
         title=f"pair shard, {_world_name(clips.world.name)}, seed {clip.seed}",
-        folder=str(shard),
         path=words,
-        scene=f"{numbers[-1] + 1} frames at {clips.fps * clips.world.stride:g} fps, 2 cameras",
-        frame_numbers=numbers,
-        fps=clips.fps,
+        scene=f"{sample.frame_numbers[-1] + 1} frames at {clips.fps * clips.world.stride:g} fps, 2 cameras",
         source_camera="source",
         lens=lens,
         views=views,
         poses=targets,
-        target=clip.target,
+        sample=replace(sample, visible=np.stack(seen), target_depth=clip.target_depth),
         target_is="rendered exactly",
-        target_depth=clip.target_depth,
-        visible=np.stack(
-            [depth_visibility(view, clip.target_depth[t], targets[t], lens) for t, view in enumerate(views)]
-        ),
-        classes=tuple(OntologyItem(id=i, name=each.name, colour=each.colour) for i, each in enumerate(clips.classes)),
-        instances={},
-        world_from_source=world_from_source,
-        world_from_target=world_from_target,
+        ontology=Ontology(kinds) if kinds else None,
         look_at=LOOK_AT if clips.mount is None else DRIVING_GOAL_TARGET,
         world=_STAGE if clips.mount is None else _VEHICLE,
     )
-
-
-def _clip_number(folder: Path, clips: PairedClips, seed: int | None) -> int:
-    if seed is not None and seed not in clips.seeds:
-        low, high = clips.seeds[0], clips.seeds[-1]
-        raise RecipeError(f"{folder} has no clip of seed {seed}; it has {len(clips)}, {low} to {high}")
-    return 0 if seed is None else clips.seeds.index(seed)
 
 
 def _pair_poses(shard: Path, name: str) -> tuple[Poses, Poses]:

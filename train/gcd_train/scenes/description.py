@@ -76,7 +76,7 @@ class Paint:
 class Part:
     """One unit primitive, scaled, turned and put in its place within a body.
 
-    shape: a name of `primitives.SHAPES`, which fit a cube of side 1 about the origin. centre, size: metres. label:
+    shape: a name of `triangles.SHAPES`, which fit a cube of side 1 about the origin. centre, size: metres. label:
     class id. turn: unit quaternion w, x, y, z, done before the turn about the vertical by yaw, in radians. instance:
     1..255, 0 for what is not counted. body: index of the body it rides on.
     """

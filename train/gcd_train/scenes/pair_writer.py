@@ -31,8 +31,8 @@ from gcd_train.errors import DataError, RenderError
 from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving.world import driving_scene
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, Rendering, stacked
+from gcd_train.scenes.triangles import freeze
 from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, agree, scene_world
 
 _ABANDONED_S = 3600.0  # no shard takes so long

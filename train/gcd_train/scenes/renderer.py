@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from gcd_train.errors import RenderError
 from gcd_train.scenes.description import Doubles, Extent, Floats
-from gcd_train.scenes.frozen import VERTEX, FrozenScene, Run, indexed, runs_of
 from gcd_train.scenes.shaders import SHADOW_FRAGMENT, SHADOW_VERTEX, fragment
 from gcd_train.scenes.shaders import VERTEX as VERTEX_SHADER
+from gcd_train.scenes.triangles import FrozenScene, Run, indexed, runs_of
 
 
 def clip_from_camera(hfov_deg: float, aspect: float, extent: Extent) -> Doubles:
@@ -54,7 +54,8 @@ def sunlight_from_world(sun_to: Doubles, focus: Doubles, extent: Extent) -> Doub
     return matrix
 
 
-_FIELDS = {"position": "3f4", "normal": "3f4", "colour": "4f1", "accent": "4f1", "tags": "4u1"}
+_FIELDS = "3f4 3f4 4f1 4f1 4u1", "position", "normal", "colour", "accent", "tags"
+"""A vertex buffer as programs read it; those that do not use a field step over it."""
 _BODIES = 256
 _LIFT = 0.06 / 55.0
 """Shadows are looked up this far off the surface, as a share of the shadow map's radius: half a shadow pixel."""
@@ -122,7 +123,7 @@ class Renderer:
             corners, indices = indexed(scene.vertices)
             buffer, index = context.buffer(corners.tobytes()), context.buffer(indices.tobytes())
             drawn = [(run, self._array(buffer, index, run)) for run in runs_of(scene.vertices)]
-            casting = context.vertex_array(self._shadow_program, [_taking(buffer, "position", "tags")], index)
+            casting = context.vertex_array(self._shadow_program, [(buffer, *_FIELDS)], index, skip_errors=True)
             for name in _LIGHTS:
                 self._frame[name] = (*getattr(scene.light, name), 0.0)
             for name in _NUMBERS:
@@ -165,9 +166,7 @@ class Renderer:
         key = run.pattern, run.glossy
         if key not in self._programs:
             self._programs[key] = self._program(VERTEX_SHADER, fragment(run.pattern, glossy=run.glossy))
-        program = self._programs[key]
-        wanted = [name for name in _FIELDS if name in program]
-        return self._context.vertex_array(program, [_taking(buffer, *wanted)], index)
+        return self._context.vertex_array(self._programs[key], [(buffer, *_FIELDS)], index, skip_errors=True)
 
     def _move(self, scene: FrozenScene, step: int, casting: Any) -> None:
         """Put bodies where they are at a time step, and draw the shadow map."""
@@ -259,9 +258,3 @@ def _context() -> Any:
         raise RenderError(
             f"no headless OpenGL ({error}); on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri"
         ) from error
-
-
-def _taking(buffer: Any, *names: str) -> tuple[Any, ...]:
-    """A vertex buffer with the fields that a program wants; the others are stepped over."""
-    layout = [_FIELDS[name] if name in names else f"{VERTEX[name].itemsize}x" for name in _FIELDS]
-    return (buffer, " ".join(layout), *names)

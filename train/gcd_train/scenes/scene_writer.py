@@ -26,8 +26,8 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4DWriter
 from gcd_train.errors import DataError, TrainError
 from gcd_train.files import new_folder, remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
-from gcd_train.scenes.frozen import freeze
 from gcd_train.scenes.renderer import Renderer, require_drawing
+from gcd_train.scenes.triangles import freeze
 from gcd_train.scenes.worlds import SceneFormat, SceneWorld
 
 GIVE_UP_AFTER = 5

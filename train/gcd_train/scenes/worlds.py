@@ -101,13 +101,12 @@ CameraWay: TypeAlias = Literal["gradual", "direct"]
 
 
 class WorldOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the source camera really sits, for studies of a wrong mount. height_m, tilt_deg: see CameraMount."""
+    """Where the source camera sits. height_m, tilt_deg: see CameraMount."""
 
     height_m: float = CameraMount().height_m
     tilt_deg: float = CameraMount().tilt_deg
 
 
-_MOUNT = WorldOptions()
 _STRIDE = 2
 """Time steps of a stage from one frame of a clip to the next."""
 
@@ -167,25 +166,20 @@ def pair_world(
     form: SceneFormat,
     *,
     clips_per_shard: int = 8,
-    mount: WorldOptions = _MOUNT,
     path: CameraWay = "gradual",
     clips_per_scene: int = 3,
 ) -> World:
     """Pairs of clips of a world: of driving the forward camera and the path to the view from above, of a world on
     Kubric-4D's stage a source that stands and a target that goes over the sphere.
 
-    mount, path: of driving, where the source camera really sits, and how the target camera gets to its goal.
-    clips_per_scene: of a stage.
+    path: of driving, how the target camera gets to its goal. clips_per_scene: of a stage.
 
-    Raises:
-        PoseError: that is no mount.
-        RecipeError: the scenes are too short for such clips.
+    Raises RecipeError where the scenes are too short for such clips.
     """
     shared: dict[str, Any] = {"name": scenes.name, "edition": scenes.edition, "clips_per_shard": clips_per_shard}
     shared |= {name: getattr(form, name) for name in ("width", "height", "frames", "oversample")}
     if scenes.layout == "parallel_domain4d":
-        CameraMount(height_m=mount.height_m, tilt_deg=mount.tilt_deg)  # refuses what is none before anything is made
-        return World(**shared, fps=scenes.fps, hfov_deg=DRIVING_HFOV_DEG, options=mount, path=path)
+        return World(**shared, fps=scenes.fps, hfov_deg=DRIVING_HFOV_DEG, path=path)
     if (form.frames - 1) * _STRIDE + 2 > scenes.frames:  # its last frame stays out of reach, see `FrameSampling`
         raise RecipeError(
             f"a {scenes.name} scene has {scenes.frames} time steps, too few for {form.frames} frames at stride "

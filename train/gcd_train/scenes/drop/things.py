@@ -28,7 +28,7 @@ from gcd_train.scenes.description import (
     shaded,
     yawed,
 )
-from gcd_train.scenes.primitives import shape
+from gcd_train.scenes.triangles import shape
 
 
 class DropLabel(IntEnum):

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gcd_model.geometry import sphere_poses
-from gcd_train.errors import DataError, RenderError
+from gcd_train.errors import RenderError
 from gcd_train.scenes.description import (
     ORBIT,
     Colour,
@@ -39,7 +39,7 @@ from gcd_train.scenes.description import (
     yawed,
 )
 from gcd_train.scenes.drop.things import DropLabel, random_thing
-from gcd_train.scenes.primitives import shape
+from gcd_train.scenes.triangles import shape
 
 FPS = 24.0
 HFOV_DEG = math.degrees(2 * math.atan(0.5))
@@ -223,12 +223,8 @@ def drop_scene(seed: int, frames: int = 60) -> Scene:
     Args:
         seed: 0 or more.
         frames: time steps at 24 Hz.
-    Raises:
-        DataError: no frame is asked for.
-        RenderError: MuJoCo is not installed, or no attempt at this seed gave a sound simulation.
+    Raises: RenderError if MuJoCo is not installed, or no attempt at this seed gave a sound simulation.
     """
-    if frames < 1:
-        raise DataError(f"a clip has at least one frame, got {frames}; ask for 1 or more")
     reasons: list[str] = []
     for attempt in range(_ATTEMPTS):
         random = np.random.default_rng([seed, 0xD209, attempt])
@@ -237,7 +233,12 @@ def drop_scene(seed: int, frames: int = 60) -> Scene:
         try:
             tracks, deepest_m = simulate(things, random, frames=frames)
             require_sound(tracks, deepest_m, settled)
-            _require_free_cameras(things, tracks)
+            # nothing may come so near to a camera that it could stand inside or fill the view
+            eyes = np.stack([poses[0, :3, 3] for poses in orbit_cameras(1).values()])
+            reach = np.array([np.linalg.norm(thing.size) / 2 for thing in things]) + ORBIT.near_m
+            away = np.linalg.norm(tracks.positions[:, :, None] - eyes, axis=-1).min((0, 2))  # [N]
+            if (away < reach).any():
+                raise UnsoundSceneError(f"a {things[int((away - reach).argmin())].name} reaches a camera")
         except UnsoundSceneError as error:
             reasons.append(str(error))
             continue
@@ -274,15 +275,6 @@ def _random_things(random: np.random.Generator) -> list[Thing]:
     settled, thrown = int(random.integers(6, 17)), int(random.integers(1, 7))
     sides = random.uniform(*_SIDES_M, size=settled + thrown)
     return [random_thing(random, side_m=float(side), dynamic=i >= settled) for i, side in enumerate(sides)]
-
-
-def _require_free_cameras(things: list[Thing], tracks: Tracks) -> None:
-    """Raises UnsoundSceneError if something comes so near to a camera that it could stand inside or fill the view."""
-    cameras = np.stack([poses[0, :3, 3] for poses in orbit_cameras(1).values()])
-    reach = np.array([np.linalg.norm(thing.size) / 2 for thing in things]) + ORBIT.near_m
-    away = np.linalg.norm(tracks.positions[:, :, None] - cameras, axis=-1).min((0, 2))  # [N]
-    if (away < reach).any():
-        raise UnsoundSceneError(f"a {things[int((away - reach).argmin())].name} reaches a camera")
 
 
 DOME_M = 40.0
