@@ -96,7 +96,8 @@ def test_conversion_keeps_every_weight_and_every_fact(tmp_path: Path, write: Cal
     before, after = load(path), load(tmp_path / "ours.safetensors")
     assert_same_weights(after.networks, before.networks)
     assert after.networks.config == before.networks.config
-    assert (after.family, after.card.move_time, after.name) == (before.family, before.card.move_time, before.name)
+    facts = [(each.card.family, each.card.move_time, each.card.name) for each in (before, after)]
+    assert facts[0] == facts[1]
     assert (report.layout, report.leftovers, report.optimizer_size) == ("gcd-node", (), 0)
 
 

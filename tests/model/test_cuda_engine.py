@@ -306,6 +306,7 @@ def test_the_engine_decodes_in_half_precision_where_pictures_stay_alike(
     assert engine.decode(torch.zeros(TINY.frames, 4, 2, 2)).dtype == torch.float32
 
 
+@pytest.mark.slow
 def test_compiled_blocks_are_plain_torch_compiling_is_heard_and_many_shapes_are_allowed(plain: Synthesizer) -> None:
     from torch._dynamo import config
 

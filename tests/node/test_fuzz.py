@@ -97,8 +97,6 @@ REQUESTS = [
 ]
 
 
-# Files.
-
 CONFIG = b"""
 node_id = "front"
 strict = true

@@ -461,6 +461,7 @@ def run_test(project: pytest.Pytester, *options: str, settings: object = None, b
     return project.runpytest_inprocess("-p", "gcd_node.testing", *options)
 
 
+@pytest.mark.slow
 def test_a_golden_run_is_asked_for_made_and_then_met_or_missed_with_causes(project: pytest.Pytester) -> None:
     result = run_test(project)
     result.assert_outcomes(failed=1)
@@ -479,6 +480,7 @@ def test_a_golden_run_is_asked_for_made_and_then_met_or_missed_with_causes(proje
     result.assert_outcomes(passed=1)
 
 
+@pytest.mark.slow
 def test_an_update_makes_a_run_anew_byte_for_byte_and_removes_nothing_else(project: pytest.Pytester) -> None:
     mine = project.path / "golden" / "drive" / "mine.txt"
     mine.parent.mkdir(parents=True)
