@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 from gcd_client.protocol import MAGIC
 
-ROUNDS = int(os.environ.get("GCD_MUTATIONS", "400"))
+ROUNDS = int(os.environ.get("GCD_MUTATIONS", "200"))
 MOST_TRACED = 1000
 GROWN_BYTES = 2_000_000
 
