@@ -315,7 +315,7 @@ def test_compiled_blocks_are_plain_torch_compiling_is_heard_and_many_shapes_are_
     asked = RenderOptions(steps=2, guidance=(1.0, 2.5), progress=lambda done, _: told.append(done))
     views = views_of(compiled, asked, random_clip(TINY), (30.0,))
     assert told.count(0) > 10
-    assert [done for done in told if done] == [1, 2]
+    assert (told, set(told)) == (sorted(told), {0, 1, 2})  # it never runs backwards
     assert_alike(views, views_of(plain, replace(asked, progress=None), random_clip(TINY), (30.0,)))
     assert config.recompile_limit >= 256
     assert config.accumulated_recompile_limit >= 4096

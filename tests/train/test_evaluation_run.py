@@ -103,7 +103,7 @@ def test_what_never_measured_anything_binds_nobody(tmp_path: Path) -> None:
 def test_of_two_lines_the_second_is_refused_while_the_first_measures(tmp_path: Path) -> None:
     first, second = RunKeeper(tmp_path), RunKeeper(tmp_path)
     with first.in_use(note(methods={"a": {}})):
-        with pytest.raises(RunError, match="another line measures in"):
+        with pytest.raises(RunError, match="another run is at work in"):
             second.in_use(note(methods={"b": {}})).__enter__()
         first.keep(record("a", "k"))
     with second.in_use(note(methods={"b": {}})):

@@ -41,7 +41,7 @@ def test_what_a_killed_worker_had_is_done_again(tmp_path: Path) -> None:
 def test_an_item_that_kills_every_worker_is_given_up() -> None:
     outcomes = {outcome.item: outcome for outcome in map_items(always_killed, range(4), workers=2, retries=1)}
     assert {item: outcome.value for item, outcome in outcomes.items()} == {0: 0, 1: 1, 2: None, 3: 9}
-    with pytest.raises(ItemError, match=r"killed 2 times"):
+    with pytest.raises(ItemError, match=r"killed 2 times \(exit code -9\)"):
         outcomes[2].unwrap()
 
 

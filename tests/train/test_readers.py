@@ -132,11 +132,12 @@ def test_compact_files_are_read_where_the_published_ones_are_not(driving: Path) 
 
 
 @pytest.mark.parametrize("bits", [1, 2, 4, 8])
-def test_palette_pictures_give_their_indices_not_their_colours(tmp_path: Path, bits: int) -> None:
+def test_palette_and_grey_pictures_give_their_indices(tmp_path: Path, bits: int) -> None:
     ids = np.random.default_rng(bits).integers(0, 2**bits, (9, 13), dtype=np.uint8)
     colours = [(number * 7 % 256, number * 13 % 256, 99) for number in range(2**bits)]
-    (tmp_path / "a.png").write_bytes(palette_png(ids, colours, bits))
-    np.testing.assert_array_equal(read_palette_indices(tmp_path / "a.png"), ids)
+    for palette in (colours, []):
+        (tmp_path / "a.png").write_bytes(palette_png(ids, palette, bits))
+        np.testing.assert_array_equal(read_palette_indices(tmp_path / "a.png"), ids)
 
 
 def test_ids_count_red_then_green_then_blue(tmp_path: Path) -> None:

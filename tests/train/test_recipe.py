@@ -205,7 +205,7 @@ def test_tables_merge_key_by_key_and_lists_are_replaced() -> None:
 def test_what_a_recipe_does_without_is_gone_before_its_own_words_count() -> None:
     table = on_top({"a": {"b": 1, "c": 2}, "d": 3}, {"without": ["a.b", "d"], "a": {"e": 4}}, "x")
     assert table == {"a": {"c": 2, "e": 4}}
-    for without in (["a.z"], ["z.a"], "a.z", [3], ["a.b.c"]):
+    for without in (["a.z"], ["z.a"], "a.z", [3], ["a.b.c"], ["a.b.c.d"]):
         with pytest.raises(RecipeError, match="`without` lists keys"):
             on_top({"a": {"b": 1}}, {"without": without}, "x")
 

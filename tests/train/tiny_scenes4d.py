@@ -67,16 +67,17 @@ def write_png(path: Path, rgb: NDArray[np.uint8], *, alpha: bool = False) -> Non
 
 
 def palette_png(ids: NDArray[np.uint8], palette: list[tuple[int, int, int]] = PALETTE, bits: int = 8) -> bytes:
-    """An indexed PNG; rows are filtered by `up`, which palette pictures may be."""
+    """An indexed PNG, or a grey one without a palette; rows are filtered by `up`, which palette pictures may be."""
     height, width = ids.shape
     packed = (
         ids if bits == 8 else np.packbits(np.unpackbits(ids[..., None], -1)[..., 8 - bits :].reshape(height, -1), -1)
     )
     rows = np.full((height, packed.shape[1] + 1), 2, np.uint8)
     rows[0, 1:], rows[1:, 1:] = packed[0], packed[1:] - packed[:-1]
-    header = struct.pack(">IIBBBBB", width, height, bits, 3, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, bits, 3 * bool(palette), 0, 0, 0)
     colours = bytes(channel for colour in palette for channel in colour)
-    chunks = [(b"IHDR", header), (b"PLTE", colours), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")]
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")]
+    chunks[1:1] = [(b"PLTE", colours)] * bool(palette)
     packed_chunks = [
         struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
     ]

@@ -97,9 +97,10 @@ def only_writer(folder: Path) -> Generator[None]:
             raise RunError(f"another run is at work in {folder}; wait for it, or choose another --out") from error
         except OSError as error:
             _log.warning("%s is on a file system without locks; start no second run in it (%s)", folder, error)
-        for leftover in folder.glob(".*.partial"):
-            if leftover.is_file():
-                leftover.unlink(missing_ok=True)
+        else:
+            for leftover in folder.glob(".*.partial"):
+                if leftover.is_file():
+                    leftover.unlink(missing_ok=True)
         yield
 
 

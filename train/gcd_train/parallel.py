@@ -6,19 +6,19 @@ was doing when it was killed is done again, and what raises is told in its outco
 
 import logging
 import os
-import pickle
 import signal
 import socket
 import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Any, Generic, TypeVar
 
 from gcd_train.errors import RunError, TrainError
@@ -85,7 +85,7 @@ def map_items(
         return _map_on_ray(function, iter(items), ray_address, retries, gpus)
     if workers == 1:
         return (_outcome(function, item) for item in items)
-    return _map_in_processes(function, iter(items), workers, retries, environments)
+    return _Pool(function, workers, retries, environments).run(iter(items))
 
 
 def one_thread_each() -> None:
@@ -109,94 +109,131 @@ def _outcome(function: Callable[[Item], Value], item: Item) -> Outcome[Item, Val
         return Outcome(item=item, error=ItemError(told))
 
 
-def _map_in_processes(
-    function: Callable[[Any], Any],
-    items: Iterator[Any],
-    workers: int,
-    retries: int,
-    environments: Sequence[Mapping[str, str]],
-) -> Generator[Outcome[Any, Any]]:
-    """Each worker is a pool of one process, so that it is known which item a killed one had."""
-    free, pools = list(range(workers)), dict[int, ProcessPoolExecutor]()
-    at_work: dict[Future[Any], tuple[int, Any, int]] = {}
-    again = deque[tuple[Any, int]]()
-    try:
-        while True:
-            while free and (given := again.popleft() if again else next(((item, 0) for item in items), None)):
-                number = free.pop(0)
-                if number not in pools:
-                    environment = dict(environments[number % len(environments)]) if environments else {}
-                    context = get_context("spawn")  # a fork would share OpenGL's and torch's state
-                    pools[number] = ProcessPoolExecutor(1, context, _settle, (pickle.dumps(function), environment))
-                at_work[pools[number].submit(_done, given[0])] = number, *given
-            if not at_work:
-                return
-            for future in wait(at_work, return_when=FIRST_COMPLETED).done:
-                number, item, killed = at_work.pop(future)
-                free.append(number)
-                try:
-                    value, error = future.result()
-                except BrokenProcessPool:
-                    pools.pop(number).shutdown()
-                    killed += 1
-                    if killed <= retries:
-                        _LOG.warning("a worker ended; its item is done again")
-                        again.append((item, killed))
-                        continue
-                    why = f"its worker was killed {killed} times, most likely for want of memory"
-                    value, error = None, ItemError(f"{why}; give fewer --workers")
-                except Exception as fault:  # whatever pickle raises for what it cannot take
-                    value, error = None, ItemError(f"its result cannot be sent to the parent ({fault})")
-                yield Outcome(item=item, value=value, error=error)
-    finally:
-        busy = {number for number, _, _ in at_work.values()}
-        processes = [(number, p) for number, pool in pools.items() for p in list((pool._processes or {}).values())]  # pyright: ignore[reportPrivateUsage]
-        for number, process in processes:
-            if number in busy:
-                process.terminate()
-        for pool in pools.values():
-            pool.shutdown(wait=False, cancel_futures=True)
-        for _, process in processes:
-            process.join(_STOP_S)
-            if process.is_alive():
-                process.kill()
+@dataclass(slots=True, eq=False)
+class _Attempt:
+    item: Any
+    killed: int = 0
 
 
-_FUNCTION: list[Callable[[Any], Any]] = []
-"""What this process, a worker, does with each item."""
+@dataclass(slots=True, eq=False)
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+    number: int
+    attempt: _Attempt | None = None
 
 
-def _settle(function: bytes, environment: Mapping[str, str]) -> None:
-    """At the start of a worker, which ends with its parent. function: pickled, as libraries read the environment."""
+class _Pool:
+    """Processes with a pipe each, so that it is known which item a killed one had."""
+
+    def __init__(
+        self, function: Callable[[Any], Any], workers: int, retries: int, environments: Sequence[Mapping[str, str]]
+    ) -> None:
+        self._function, self._size, self._retries = function, workers, retries
+        self._environments = environments or ({},)
+        self._workers: list[_Worker] = []
+        self._again: deque[_Attempt] = deque()
+
+    def run(self, items: Iterator[Any]) -> Generator[Outcome[Any, Any]]:
+        try:
+            while busy := self._feed(items):
+                ready = wait([worker.pipe for worker in busy])
+                for worker in [worker for worker in busy if worker.pipe in ready]:
+                    outcome = self._collect(worker)
+                    if outcome is not None:
+                        yield outcome
+        finally:
+            self._stop()
+
+    def _feed(self, items: Iterator[Any]) -> list[_Worker]:
+        """Give every idle worker an item, starting workers as needed; those that have one."""
+        while len(busy := [worker for worker in self._workers if worker.attempt is not None]) < self._size:
+            attempt = self._again.popleft() if self._again else next(map(_Attempt, items), None)
+            if attempt is None:
+                break
+            idle = next((worker for worker in self._workers if worker.attempt is None), None) or self._start()
+            idle.attempt = attempt
+            with suppress(OSError):  # it was killed while idle: its pipe is closed, and reading will tell
+                idle.pipe.send(attempt.item)
+        return busy
+
+    def _collect(self, worker: _Worker) -> Outcome[Any, Any] | None:
+        """What a worker that is ready has made; None where it was killed and its item is put back."""
+        attempt = worker.attempt
+        assert attempt is not None, "only busy workers are waited for"
+        try:
+            value, error = worker.pipe.recv()
+        except (EOFError, OSError):
+            return self._after_death(worker, attempt)
+        worker.attempt = None
+        return Outcome(item=attempt.item, value=value, error=error)
+
+    def _after_death(self, worker: _Worker, attempt: _Attempt) -> Outcome[Any, Any] | None:
+        worker.process.join(_STOP_S)
+        code = worker.process.exitcode
+        self._workers.remove(worker)
+        worker.pipe.close()
+        attempt.killed += 1
+        if attempt.killed <= self._retries:
+            _LOG.warning("a worker ended (exit code %s); its item is done again", code)
+            self._again.append(attempt)
+            return None
+        why = f"its worker was killed {attempt.killed} times (exit code {code}), most likely for want of memory"
+        return Outcome(item=attempt.item, error=ItemError(f"{why}; give fewer --workers"))
+
+    def _start(self) -> _Worker:
+        context = get_context("spawn")  # a fork would share OpenGL's and torch's state
+        ours, theirs = context.Pipe()
+        number = min(set(range(self._size)) - {worker.number for worker in self._workers})
+        environment = dict(self._environments[number % len(self._environments)])
+        process = context.Process(target=_serve, args=(theirs, environment), daemon=True)
+        process.start()
+        theirs.close()
+        worker = _Worker(process, ours, number)
+        self._workers.append(worker)
+        with suppress(OSError):  # it is gone already: the item's turn will tell
+            ours.send(self._function)
+        return worker
+
+    def _stop(self) -> None:
+        for worker in self._workers:
+            worker.pipe.close()
+            if worker.attempt is not None:
+                worker.process.terminate()
+        for worker in self._workers:
+            worker.process.join(_STOP_S)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+
+
+def _serve(pipe: Connection, environment: Mapping[str, str]) -> None:
+    """A worker's life: the function first, then items until the pipe is closed."""
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal: the parent decides
     signal.signal(signal.SIGTERM, _leave)
     one_thread_each()
-    try:
-        _FUNCTION[:] = [pickle.loads(function)]
-    except Exception as error:
-        _FUNCTION[:] = [partial(_refuse, f"a worker cannot import its work ({type(error).__name__}: {error})")]
-    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+    with suppress(EOFError, OSError):  # the parent is done, or gone
+        try:
+            function = pipe.recv()
+        except (EOFError, OSError):
+            return
+        except Exception as error:
+            function = partial(_refuse, f"a worker cannot import its work ({type(error).__name__}: {error})")
+        while True:
+            outcome = _outcome(function, pipe.recv())
+            try:
+                pipe.send((outcome.value, outcome.error))
+            except (TypeError, AttributeError, ValueError) as error:  # what pickle raises for what it cannot take
+                pipe.send((None, ItemError(f"its result cannot be sent to the parent ({error})")))
 
 
 def _refuse(why: str, item: object) -> None:
     raise RunError(why)
 
 
-def _end_with_the_parent() -> None:
-    parent = parent_process()
-    assert parent is not None, "a worker has one"
-    parent.join()
-    os._exit(1)
-
-
 def _leave(number: int, frame: object) -> None:
     raise SystemExit(0)
-
-
-def _done(item: Any) -> tuple[Any, TrainError | None]:
-    outcome = _outcome(_FUNCTION[0], item)
-    return outcome.value, outcome.error
 
 
 def _map_on_ray(

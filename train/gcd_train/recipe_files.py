@@ -56,7 +56,7 @@ def on_top(base: Mapping[str, object], over: Mapping[str, object], name: str) ->
     for key in unwanted if isinstance(unwanted, list) else [unwanted]:
         below, (*path, last) = table, str(key).split(".")
         for part in path:
-            below = below.get(part, {})
+            below = below.get(part) if isinstance(below, dict) else None
         if not isinstance(below, dict) or last not in below:
             raise RecipeError(f'{name}: `without` lists keys of the base, such as "unet.ema"; it has no `{key}`')
         del below[last]

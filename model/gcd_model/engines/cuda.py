@@ -135,16 +135,18 @@ class CudaEngine(Engine):
         progress is told of again."""
         start, steps = start.to(self.like.device), len(schedule.steps)
         done = torch.cuda.Event(blocking=True) if start.is_cuda and (options.cancel or options.progress) else None
-        if options.progress is not None:
-            self._beat = partial(options.progress, 0, steps)
         with self._at_work():
             denoiser, x, before = GuidedDenoiser(self, given, schedule, start), start, start
             for i in watched(steps, options):
+                if options.progress is not None:
+                    self._beat = partial(options.progress, i, steps)
                 branches = 1 + schedule.guided[i]
                 x, before = self._called(branches, partial(self._step, branches), (x, before, *denoiser.inputs(i)))
                 if done is not None:
                     done.record()
                     done.synchronize()  # of the event alone: the device does not notice
+            if options.progress is not None:
+                self._beat = partial(options.progress, steps, steps)
             return x.clone()
 
     def _step(self, branches: int, x: Tensor, before: Tensor, *inputs: Any) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,63 @@
-"""Poses, spherical cameras, camera paths and the pinhole: plain geometry, no network. All of both chapters."""
+"""Poses, spherical cameras, camera paths and the pinhole: plain geometry, no network."""
 
-from gcd_model.geometry.paths import *  # noqa: F403
-from gcd_model.geometry.pose import *  # noqa: F403
+from gcd_model.geometry.paths import (
+    DRIVING_GOAL_POSITION,
+    DRIVING_GOAL_TARGET,
+    DRIVING_SOURCE_POSITION,
+    DRIVING_SOURCE_TARGET,
+    LOOK_AT,
+    Interpolation,
+    Orbit,
+    Spherical,
+    SphericalDelta,
+    Trajectory,
+    driving_trajectory,
+    fitted_trajectory,
+    from_pose,
+    motion_bucket,
+    nearest_delta,
+    path_progress,
+    pose_trajectory,
+    sphere_poses,
+    spherical_trajectory,
+    to_pose,
+)
+from gcd_model.geometry.pose import (
+    CameraMount,
+    Intrinsics,
+    center_crop_box,
+    invert_rigid,
+    look_at,
+    relative_pose,
+    require_rigid,
+)
+
+__all__ = [
+    "DRIVING_GOAL_POSITION",
+    "DRIVING_GOAL_TARGET",
+    "DRIVING_SOURCE_POSITION",
+    "DRIVING_SOURCE_TARGET",
+    "LOOK_AT",
+    "CameraMount",
+    "Interpolation",
+    "Intrinsics",
+    "Orbit",
+    "Spherical",
+    "SphericalDelta",
+    "Trajectory",
+    "center_crop_box",
+    "driving_trajectory",
+    "fitted_trajectory",
+    "from_pose",
+    "invert_rigid",
+    "look_at",
+    "motion_bucket",
+    "nearest_delta",
+    "path_progress",
+    "pose_trajectory",
+    "relative_pose",
+    "require_rigid",
+    "sphere_poses",
+    "spherical_trajectory",
+    "to_pose",
+]

@@ -72,6 +72,8 @@ def train(
             raise RecipeError(
                 "a live model is measured on clips of their own: give --valid (`gcd-train generate live`)"
             )
+        if isinstance(loaded, LiveRecipe) and (stage is not None or latents is not None):
+            raise RecipeError("--stage and --latents are of diffusion models; a live one trains its stages in order")
         compute = ComputeRecipe(device=loaded.device) if isinstance(loaded, LiveRecipe) else loaded.compute
         with _in_processes(compute) as processes:
             _train(loaded, data, valid, out, latents, cast("StageName | None", stage), processes)

@@ -290,9 +290,10 @@ def read_palette_indices(path: Path) -> Bytes:
         raise
     except Exception as error:  # of any kind, where a file is damaged
         raise FileFault(path, f"is damaged ({error})") from error
-    if mode not in ("P", "L"):
-        raise FileFault(path, "holds colours, not a palette: instance numbers cannot be told from it")
-    return indices.astype(np.uint8, copy=False)
+    if mode not in ("P", "L", "1"):
+        raise FileFault(path, "holds neither a palette nor grey of 8 bits: instance numbers cannot be told from it")
+    brighter = 255 // (2 ** content[24] - 1) if mode == "L" else 1  # grey of fewer bits is spread over all levels
+    return indices.astype(np.uint8, copy=False) // brighter
 
 
 def sized(path: Path, picture: NDArray[Number], height: int, width: int, other: str) -> NDArray[Number]:

@@ -59,7 +59,9 @@ class LeRobotWriter:
         self._folder, self._cameras, self._robot, self._fps, self._names = folder, cameras, robot, fps, names
         self._arrow, self._parquet, self._av = extra("pyarrow"), extra("pyarrow.parquet"), extra("av")
         self._frames, self._tasks = 0, dict[str, int]()
-        self._seen = dict[str, list[Floats]]()  # rows [N, C] of every feature, and of colours [N, 3] of some pictures
+        self._seen = dict[
+            str, list[NDArray[Any]]
+        ]()  # rows [N, C] of every feature, and of colours [N, 3] of some pictures
         self._tables, self._episodes = list[Any](), list[dict[str, Any]]()
         self._videos: dict[str, tuple[Any, Any]] = {}
         (folder / "meta").mkdir(parents=True, exist_ok=True)
@@ -144,7 +146,7 @@ class LeRobotWriter:
                 frame.pts, frame.time_base = self._frames + frames - 1, Fraction(1, self._fps)
                 container.mux(stream.encode(frame))
                 if frames % _SAMPLED == 1:
-                    self._seen.setdefault(name, []).append(picture[::4, ::4].reshape(-1, 3) / 255)
+                    self._seen.setdefault(name, []).append(picture[::4, ::4].reshape(-1, 3))
         return frames
 
     def _columns(
@@ -177,11 +179,12 @@ class LeRobotWriter:
             row[f"videos/{name}/to_timestamp"] = (self._frames + frames) / self._fps
         return row
 
-    def _statistics(self, name: str, rows: Floats) -> dict[str, list[Any]]:
+    def _statistics(self, name: str, rows: NDArray[Any]) -> dict[str, list[Any]]:
         """Of rows [N, C] as LeRobot writes it: C numbers each, or [3, 1, 1] for the channels of pictures."""
+        unit = 255 if name in self._cameras else 1
         found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
         shape = (3, 1, 1) if name in self._cameras else (-1,)
-        return {key: row.reshape(shape).tolist() for key, row in found.items()} | {"count": [len(rows)]}
+        return {key: (row / unit).reshape(shape).tolist() for key, row in found.items()} | {"count": [len(rows)]}
 
     def _info(self) -> dict[str, Any]:
         return {

@@ -268,6 +268,8 @@ def ssim_by_views(of: EvaluatedSet) -> Plot:
         if y.known and views and (name == "HexPlane" or region == "all"):
             point = Point(x=views.get(method.name, nan), y=y, clips=len(method.records))
             curves.setdefault(f"{name}, {region}", []).append(point)
+    if all(isnan(curve[0].x) for curve in curves.values()):  # levels alone
+        curves = {}
     title = "HexPlane, frames 2 to the last"
     return Plot(name="ssim_by_views", title=title, across="views given", up="SSIM", curves=curves)
 

@@ -9,7 +9,6 @@
 Files appear whole or not at all, so a run that was killed goes on where it stopped.
 """
 
-import fcntl
 import re
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ import msgspec
 from gcd_model.errors import FileError
 from gcd_model.small_files import read_json
 from gcd_train.errors import RunError
-from gcd_train.files import write_whole
+from gcd_train.files import only_writer, write_whole
 
 Region: TypeAlias = Literal["all", "visible", "occluded"]
 """Which pixels of the target: all, those the source camera saw too, or the others."""
@@ -130,14 +129,7 @@ class RunKeeper:
     @contextmanager
     def in_use(self, note: RunNote) -> Generator[None]:
         """`begin`, and no other line measures in the folder until the block is left. Raises RunError where one does."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / ".lock").open("a") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise RunError(
-                    f"another line measures in {self.folder} now; wait for it, or give another --out and report both"
-                ) from None
+        with only_writer(self.folder):
             self.begin(note)
             yield
 
