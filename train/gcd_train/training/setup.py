@@ -314,7 +314,7 @@ class Conditioner:
 
     def vector(self, fps: Tensor, motion: Tensor) -> Tensor:
         """Micro-conditioning of N clips, [N, V]; see `micro_conditioning`. fps, motion: [N]."""
-        numbers = torch.stack([fps.float(), motion.float().cpu(), torch.full_like(fps, self._recipe.augmentation)], -1)
+        numbers = torch.stack([fps.float(), motion.float().cpu(), torch.full(fps.shape, self._recipe.augmentation)], -1)
         return sinusoid(numbers.to(self._precision.device), self._config.unet.vector_width // 3).flatten(1)
 
     def motion(self, path: Trajectory) -> float:
