@@ -13,8 +13,8 @@ def killed_once(place: tuple[str, int]) -> int:
     folder, number = place
     with Path(folder, f"{number}-attempts").open("a") as file:
         file.write(f"{os.getpid()}\n")
-    if number == 3 and len(Path(folder, f"{number}-attempts").read_text().split()) == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
+    if number in (3, 4) and len(Path(folder, f"{number}-attempts").read_text().split()) == 1:
+        os.kill(os.getpid(), signal.SIGKILL if number == 3 else signal.SIGTERM)
     return number * number
 
 
