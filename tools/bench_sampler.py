@@ -15,11 +15,11 @@ from statistics import mean
 from gcd_model import RenderOptions, load_synthesizer
 from gcd_model.diffusion import SOLVERS, Sampler, Schedule
 from gcd_train.evaluation.measure import predicted_and_measured
-from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.metrics import psnr
 from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.predictors import Prediction
 from gcd_train.evaluation.statistics import ClipTable
+from gcd_train.evaluation.synthesized import SynthesizedViews
 
 UNGUIDED = (1.0, 1.0)
 HEADS = ["steps", "solver", "guidance", "runs", "latents from Euler", "dB to Euler", "latents from fine", "dB to fine"]

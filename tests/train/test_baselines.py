@@ -22,7 +22,6 @@ from gcd_train.evaluation.baselines import (
     GroundHomography,
     ReprojectRgbd,
     ReprojectSemd,
-    VanillaSVD,
     ground_grid,
     source_views,
 )
@@ -30,6 +29,7 @@ from gcd_train.evaluation.clips import PairedSet
 from gcd_train.evaluation.methods import EvaluateOptions, baselines
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import CameraPair, Predictor, SourceClip, pixel_rays, to_pictures, to_pixels
+from gcd_train.evaluation.synthesized import VanillaSVD
 
 FRAMES, HEIGHT, WIDTH = 3, 64, 96
 

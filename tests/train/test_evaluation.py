@@ -15,7 +15,6 @@ from gcd_model.weights.card import FAMILIES, Family
 from gcd_train.errors import DataError
 from gcd_train.evaluation.baselines import CopySource
 from gcd_train.evaluation.clips import PairedSet
-from gcd_train.evaluation.methods import SynthesizedViews
 from gcd_train.evaluation.predictors import (
     Prediction,
     SourceClip,
@@ -23,6 +22,7 @@ from gcd_train.evaluation.predictors import (
     to_pictures,
     to_pixels,
 )
+from gcd_train.evaluation.synthesized import SynthesizedViews
 
 
 @dataclass

@@ -25,11 +25,12 @@ from gcd_train.evaluation.calibration import CalibrationNote, Distances, calibra
 from gcd_train.evaluation.clips import EvaluationSet
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
-from gcd_train.evaluation.methods import EvaluateOptions, SynthesizedViews, planned, run_note
+from gcd_train.evaluation.methods import EvaluateOptions, planned, run_note
 from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.predictors import Predictor
 from gcd_train.evaluation.report import make_report
 from gcd_train.evaluation.store import RunKeeper
+from gcd_train.evaluation.synthesized import SynthesizedViews
 from gcd_train.pictures import require_matplotlib
 
 Views = Annotated[KeptViews, Option(help="Frames to keep as PNG, for the gallery: few are all of four clips.")]

@@ -1,27 +1,22 @@
-"""The baselines: copies, reprojections, HexPlane, video out of a picture."""
+"""Baselines without weights: copies, reprojections, HexPlane."""
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures
 from gcd_model.clip import nearest_classes, palette
 from gcd_model.config import SemanticClass
-from gcd_model.diffusion import unit_noise
-from gcd_model.geometry import pose_trajectory
-from gcd_train.data.sample import Bytes, SceneView, to_network
+from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.data.visibility import NARROW, published_tensor
 from gcd_train.errors import DataError
 from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
     CameraPair,
-    OpenedWeights,
     Prediction,
     SourceClip,
     own_views,
@@ -31,9 +26,7 @@ from gcd_train.evaluation.predictors import (
     to_pixels,
 )
 
-VANILLA_SVD, REPROJECT_RGBD, REPROJECT_SEMD = "vanilla_svd", "reproject_rgbd", "reproject_semd"
-MOTION_BUCKET = 127.0
-"""What Stable Video Diffusion is told of the motion: the middle of its range."""
+REPROJECT_RGBD, REPROJECT_SEMD = "reproject_rgbd", "reproject_semd"
 FROM_EXACT_CLASSES = ("copy_source", "ground_homography")
 """Baselines that are not privileged in their pictures, but make their class maps from the source's exact ones."""
 
@@ -241,71 +234,3 @@ class HexPlane:
             for pose, time in zip(wanted, times, strict=True)
         ]
         return Prediction(video=torch.stack(drawn))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class VanillaSVD:
-    """A video out of the first frame, for each draw from noise of its own.
-
-    The frame is stretched to the size the network was trained at, and what comes out is stretched back: nothing is
-    cropped, so that all of the target is measured.
-
-    weights: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
-        the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
-        the clip's key. details: see Predictor.
-    Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
-    """
-
-    weights: OpenedWeights
-    size: tuple[int, int] | None = None
-    steps: int | None = None
-    samples: int = 1
-    seed: int = 0
-    name: str = VANILLA_SVD
-    privileged: bool = False
-    details: dict[str, str] = field(default_factory=dict[str, str])
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor. No class map. Raises DataError for a clip that is longer than what the network makes."""
-        traits, frames = self.weights().traits, len(clip.source)
-        if frames > traits.config.frames:
-            raise DataError(
-                f"{traits.name} makes {traits.config.frames} frames, {clip.key or 'a clip'} has {frames}; evaluate on "
-                "shorter clips"
-            )
-        height, width = clip.cameras.target.height, clip.cameras.target.width
-        features = self._features(clip)
-        draws = [
-            Prediction(video=_stretched(self._draw(features, clip.key, number), height, width)[:frames])
-            for number in range(self.samples)
-        ]
-        return replace(draws[0], more=tuple(draws[1:]))
-
-    def _features(self, clip: SourceClip) -> SourceFeatures:
-        """Of the first frame, encoded once, for all frames."""
-        config = self.weights().traits.config
-        height, width = self.size or (config.height, config.width)
-        first = _stretched(to_network(clip.source[:1]), height, width, low=-1.0)
-        noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(clip.key)))
-        made = self.weights().encode(Clip(video=first, fps=clip.fps), noise)
-        tokens = None if made.tokens is None else made.tokens.repeat(config.frames, 1)
-        return replace(made, tokens=tokens, latents=made.latents.repeat(config.frames, 1, 1, 1))
-
-    def _draw(self, features: SourceFeatures, key: str, number: int) -> Tensor:
-        """One video, [T, 3, H, W] in [0, 1]: draws go one by one, as full size leaves no room for two."""
-        still = torch.eye(4, dtype=torch.float64).repeat(features.frames, 1, 1)
-        seed = self._seed(f"{key}#{number}")
-        options = RenderOptions(steps=self.steps, seed=seed, motion_bucket=MOTION_BUCKET)
-        (view,) = self.weights().render(features, [pose_trajectory(still)], options)
-        return view.video
-
-    def _seed(self, name: str) -> int:
-        return int.from_bytes(hashlib.sha256(f"{self.seed}:{name}".encode()).digest()[:6])
-
-
-def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> Tensor:
-    """[T, 3, ...] at another size, within low..1."""
-    if pictures.shape[-2:] == (height, width):
-        return pictures
-    resized = F.interpolate(pictures, size=(height, width), mode="bicubic", align_corners=False, antialias=True)
-    return resized.clamp(low, 1.0)

@@ -9,170 +9,36 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import torch
-from torch import Tensor
 from typer import Option
 
-from gcd_model import Clip, RenderOptions, Trajectory, View, ViewSynthesizer, inspect_weights, weights_path
-from gcd_model.clip import nearest_classes
+from gcd_model import RenderOptions, inspect_weights, weights_path
 from gcd_model.config import SemanticClass
-from gcd_model.diffusion import Sampler, SolverName
+from gcd_model.diffusion import SolverName
 from gcd_train.data.files import package_version
-from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.baselines import (
     REPROJECT_RGBD,
     REPROJECT_SEMD,
-    VANILLA_SVD,
     CopySource,
     GroundHomography,
     HexPlane,
     ReprojectRgbd,
     ReprojectSemd,
-    VanillaSVD,
 )
-from gcd_train.evaluation.clips import EvaluationSet, PairedSet, names_of
+from gcd_train.evaluation.clips import EvaluationSet, PairedSet
 from gcd_train.evaluation.hexplane import HexPlaneSettings
-from gcd_train.evaluation.metrics import NO_CLASS, Lpips
+from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import SAMPLES, ClipOptions, open_clips, scene_layout
 from gcd_train.evaluation.predictors import (
-    CameraPair,
-    OpenedWeights,
-    Prediction,
     Predictor,
     SavedFrames,
-    SourceClip,
     open_weights,
 )
 from gcd_train.evaluation.store import LPIPS, RunNote
-from gcd_train.evaluation.tables import counted
-
-_AS_SHIPPED = RenderOptions()
-_SAME_PATH_M = 1e-3
-"""Largest difference between the entries of two poses that count as one; more is another path."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SynthesizedViews:
-    """A model with its own sampler settings, on its fixed view or on each clip's path.
-
-    weights: give the model. options: instead of what it ships with. The noise of their seed is the same for every clip,
-    as in a live node. painted: classes that its colours are read by, where it paints class maps and its file does not
-    say which. classes: so many the clips have, None for any; what a model sees of others, as a robot on a street, is
-    none of them.
-    """
-
-    weights: OpenedWeights
-    options: RenderOptions = _AS_SHIPPED
-    painted: tuple[SemanticClass, ...] = ()
-    classes: int | None = None
-    privileged: bool = False
-
-    @classmethod
-    def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions = _AS_SHIPPED) -> Self:
-        """A model that is measured on these clips. Raises DataError where they do not fit together."""
-        _require_fit(weights(), clips)
-        made, traits = cls(weights=weights, options=options, classes=len(clips.classes) or None), weights().traits
-        if not made.paints_classes or traits.classes:
-            return made
-        if not clips.classes:
-            raise DataError(
-                f"{traits.name} paints class maps but names no classes, and the clips have none either; give clips "
-                "with classes"
-            )
-        return replace(made, painted=clips.classes)
-
-    @property
-    def name(self) -> str:
-        """The weights' name, with what is not as shipped of how they are sampled."""
-        options = self.options
-        told = [] if options.steps is None else [counted(options.steps, "step")]
-        told += [] if options.solver is None else [options.solver]
-        told += [] if options.guidance is None else ["guidance {:g} to {:g}".format(*options.guidance)]
-        return self.weights().traits.name + (f" ({', '.join(told)})" if told else "")
-
-    @property
-    def details(self) -> dict[str, str]:
-        traits, options = self.weights().traits, self.options
-        used = Sampler.of(traits.config.sampling, options)
-        return {
-            "weights": traits.sha256_12,
-            "family": "unknown" if traits.family is None else traits.family.name,
-            "steps": str(used.steps),
-            "solver": used.solver,
-            "guidance": "{:g} to {:g}".format(*used.guidance),
-            "samples": str(options.samples),
-            "seed": str(options.seed),
-            "precision": traits.precision,
-        }
-
-    @property
-    def paints_classes(self) -> bool:
-        """Whether its picture is a class map in colours, which is compared as classes alone."""
-        family = self.weights().traits.family
-        return family is not None and family.output == "semantic"
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor. Raises DataError where the clip's path is not one that the model was trained on."""
-        return self.shown(self.drawer(clip)(self.options))
-
-    def drawer(self, clip: SourceClip) -> Callable[[RenderOptions], View]:
-        """Draws the clip's view, encoded once, with any options. Raises DataError as `predict`."""
-        synthesizer, path = self.weights(), self._path(clip.cameras)
-        own = Clip(video=to_network(clip.source), fps=clip.fps)
-        if synthesizer.traits.live:
-            own = replace(own, mount=clip.cameras.mount, lens=clip.cameras.source)
-        features = synthesizer.encode(own)
-        return lambda options: synthesizer.render(features, [path], options)[0]
-
-    def shown(self, view: View) -> Prediction:
-        """A view as it is measured, all its draws."""
-        classes = [None] * len(view.samples) if view.classes is None else list(view.classes)
-        first, *more = (self._draw(*each) for each in zip(view.samples, classes, strict=True))
-        return replace(first, more=tuple(more))
-
-    def _draw(self, video: Tensor, classes: Tensor | None) -> Prediction:
-        if self.painted:
-            return Prediction(classes=nearest_classes(video, self.painted))
-        if classes is not None and self.classes is not None:
-            classes = torch.where(classes < self.classes, classes, NO_CLASS)
-        return Prediction(video=None if self.paints_classes else video, classes=classes)
-
-    def _path(self, cameras: CameraPair) -> Trajectory:
-        traits, asked = self.weights().traits, cameras.trajectory
-        if traits.live:
-            return asked
-        if traits.config.camera == "none":
-            planned = traits.plan_view()
-            same = planned.at_goal == asked.at_goal
-        else:
-            planned = traits.plan_view(asked.goal_delta, source=asked.source)  # with the limits of the family
-            apart = (planned.source_from_target - asked.source_from_target).abs().max()
-            same = float(apart) <= _SAME_PATH_M
-        if not same:
-            raise DataError(
-                f"{traits.name} reaches its goal in frame {traits.move_time}, the clips go another way there (they "
-                f"arrive in frame {asked.at_goal.index(True)}); evaluate it on clips like those of its training"
-            )
-        return planned
-
-
-def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
-    traits = synthesizer.traits
-    wanted = (traits.config.frames, traits.config.height, traits.config.width)
-    given = (clips.frames, clips.height, clips.width)
-    if wanted != given:
-        raise DataError(f"{traits.name} was trained on clips of T, H, W = {wanted}, got {given}; generate such ones")
-    if not traits.live and (traits.config.camera == "none") != (clips.camera == "none"):
-        raise DataError(
-            f"{traits.name} has camera control {traits.config.camera!r}, the clips {clips.camera!r}; evaluate "
-            "driving models on `generate driving`, others on clips of an orbit"
-        )
-    known = traits.classes[: len(clips.classes)] if traits.live else traits.classes  # its first ones are the streets'
-    if known and clips.classes and names_of(known) != names_of(clips.classes):
-        raise DataError(f"{traits.name} has classes {names_of(traits.classes)}, the clips {names_of(clips.classes)}")
+from gcd_train.evaluation.synthesized import VANILLA_SVD, SynthesizedViews, VanillaSVD
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
