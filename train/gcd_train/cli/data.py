@@ -19,6 +19,7 @@ from gcd_train.cli.common import (
     stop_as_by_ctrl_c,
     with_fields_of,
 )
+from gcd_train.data.anyview import EpisodeExport
 from gcd_train.data.cache_writer import CacheOptions, cache_job, cache_scenes
 from gcd_train.data.compact import Compaction
 from gcd_train.data.lerobot import LeRobotPairs
@@ -112,6 +113,37 @@ def lerobot(
         for done in export_tabletop(out, wanted):
             show(done)
     say(f"wrote {out}; look at it with `gcd-train lerobot {out}`")
+
+
+@export.command()
+def anyview(
+    source: Annotated[Path, typer.Argument(metavar="DATA", help="Scenes in a published layout, or pairs.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the episodes; those that are there are kept.")],
+    view: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Scenes: INPUT:TARGET, two cameras; may be repeated. By default the usual, and the farthest."
+        ),
+    ] = None,
+    limit: Limit = None,
+    workers: Workers = 1,
+    ray: Ray = None,
+) -> None:
+    """Our scenes or pairs as episodes of AnyViewBench, for other people's models.
+
+    Measure what they make of them with `gcd-train evaluate --data OUT --protocol anyviewbench --predictions NAME=FOLDER`.
+    """
+    stop_as_by_ctrl_c()
+    with errors_shown():
+        work = EpisodeExport.of(source, out, tuple(view or ()), limit)
+        one_thread_each()
+        outcomes = map_items(work, work.items, workers=workers, ray_address=ray)
+        made, damaged = _worked_through(outcomes, len(work.items), lambda done: "")
+        splits = work.finish()
+        say(f"episodes: {sum(made)} written, {len(made) - sum(made)} there already; {damaged} damaged")
+        say(f"splits in {out}: {', '.join(splits)}")
+    if damaged:
+        raise typer.Exit(DataError.exit_code)
 
 
 def lerobot_command(

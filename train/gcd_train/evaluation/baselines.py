@@ -21,6 +21,7 @@ from gcd_train.evaluation.predictors import (
     SourceClip,
     own_views,
     pixel_rays,
+    require_one_lens,
     to_labels,
     to_pictures,
     to_pixels,
@@ -215,12 +216,15 @@ class HexPlane:
         return {"baseline": self.name, "seed": str(self.seed), **learnt}
 
     def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor. Raises DataError where the clip's scene has fewer cameras."""
+        """See Predictor. Raises DataError where the clip's scene has fewer cameras, or a lens changes."""
         own, frames = clip.cameras, len(clip.source)
+        require_one_lens(clip, self.name)
         times = [2.0 * number / max(frames - 1, 1) - 1.0 for number in range(frames)]
         pictures = [
-            (colours, Camera(lens=own.source, world_from_camera=own.ground_from_source, time=time))
-            for colours, time in zip(to_pictures(clip.source), times, strict=True)
+            (colours, Camera(lens=own.source, world_from_camera=pose, time=time))
+            for colours, pose, time in zip(
+                to_pictures(clip.source), own.ground_from_source.expand(frames, 4, 4), times, strict=True
+            )
         ]
         for video in clip.others(self.views - 1) if clip.others is not None and self.views > 1 else ():
             for view, time in zip(video, times, strict=True):

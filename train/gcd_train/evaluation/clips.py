@@ -30,8 +30,9 @@ from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_v
 
 Number = TypeVar("Number", bound=np.generic)
 
-SetKind: TypeAlias = Literal["kubric", "driving", "orbit"]
-"""Which tables clips belong to: Kubric-4D and scenes in its layout, driving, or pairs seen along orbits."""
+SetKind: TypeAlias = Literal["kubric", "driving", "orbit", "anyview"]
+"""Which tables clips belong to: Kubric-4D and scenes in its layout, driving, pairs seen along orbits, or episodes of
+AnyViewBench, whose cameras may be anywhere."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,7 +42,8 @@ class HeldOutClip:
     key: unique in its set, and a file name: `scn02900.sample_00`. scene: errors are over scenes. seen: the source side.
     target: uint8 [T, H, W, 3] RGB. target_classes: uint8 [T, H, W], None where there are none. visible: bool [T, H, W],
     target pixels that the source camera saw too; None where nobody knows. change: azimuth and elevation in degrees and
-    radius in metres from source to goal, None for the one path of driving.
+    radius in metres from source to goal, None for paths that are not on the sphere. counted: bool [T], frames that have
+    figures; None for all.
     """
 
     key: str
@@ -51,6 +53,7 @@ class HeldOutClip:
     target_classes: Bytes | None = None
     visible: NDArray[np.bool_] | None = None
     change: tuple[float, float, float] | None = None
+    counted: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +62,8 @@ class EvaluationSet(ABC):
 
     frames, height, width: T, H and W of each clip. identity: digest of what the clips are read from and how they were
     drawn. classes: the ontology, empty for none. painted: targets are painted in the colours of the classes, and all
-    that counts is class maps. cameras: that a method may be given, the source and further ones of the scene.
+    that counts is class maps. cameras: that a method may be given, the source and further ones of the scene. geometry:
+    whether the source's depth is known, and where the ground is.
     """
 
     frames: int
@@ -70,6 +74,7 @@ class EvaluationSet(ABC):
     classes: tuple[SemanticClass, ...] = ()
     painted: bool = False
     cameras: int = 1
+    geometry: bool = True
 
     @property
     def camera(self) -> CameraControl:
@@ -80,6 +85,10 @@ class EvaluationSet(ABC):
     @abstractmethod
     def keys(self) -> tuple[str, ...]:
         """Names of the clips, in order."""
+
+    def length(self, key: str, /) -> int:
+        """Frames of a clip: T but for sets whose clips differ."""
+        return self.frames
 
     @abstractmethod
     def clip(self, key: str, /) -> HeldOutClip:

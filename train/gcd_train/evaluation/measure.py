@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import msgspec
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.config import SemanticClass
@@ -72,15 +70,20 @@ def predicted_and_measured(
         fps=clip.seen.fps,
         draws=len(prediction.draws),
         seconds=seconds,
-        regions=_regions(clip.visible, target, draws, labels, len(classes)),
-        lpips=None if lpips is None or draws is None else tuple(map(_frames, lpips(draws, target))),
+        regions=_regions(clip, target, draws, labels, len(classes)),
+        lpips=None if lpips is None or draws is None else tuple(map(_frames, _counting(lpips(draws, target), clip))),
         step=None if draws is None else tuple(tuple(metrics.frame_change(each).tolist()) for each in draws),
         step_target=tuple(metrics.frame_change(target).tolist()),
     )
 
 
+def _counting(values: Tensor, clip: HeldOutClip) -> Tensor:
+    """Values [..., T], NaN in frames that do not count."""
+    return values if clip.counted is None else values.masked_fill(~torch.from_numpy(clip.counted), math.nan)
+
+
 def _regions(
-    visible: NDArray[np.bool_] | None,
+    clip: HeldOutClip,
     target: Tensor,
     draws: Tensor | None,
     labels: tuple[Tensor, Tensor] | None,
@@ -94,8 +97,10 @@ def _regions(
     detail = [] if draws is None else [metrics.gradient_map(each) for each in draws]
     target_detail, found = metrics.gradient_map(target), dict[Region, RegionRecord]()
     masks: dict[Region, Tensor | None] = {"all": None}
-    if visible is not None:
-        seen = torch.from_numpy(visible.copy())
+    if clip.counted is not None:
+        masks = {"all": torch.from_numpy(clip.counted)[:, None, None].expand_as(target[:, 0])}
+    if clip.visible is not None:
+        seen = torch.from_numpy(clip.visible.copy())
         masks |= {"visible": seen, "occluded": ~seen}
     for name, mask in masks.items():
         share = torch.ones(len(target)) if mask is None else mask.double().mean(dim=(1, 2))
@@ -192,9 +197,9 @@ class ClipWork:
 
     def missing(self) -> list[ClipItem]:
         """Clips with the methods that have no record of them, or not the frames that are to be kept."""
-        keeper, items, frames = RunKeeper(self.folder), list[ClipItem](), self.clips.frames
+        keeper, items = RunKeeper(self.folder), list[ClipItem]()
         for key in self.clips.keys:
-            views = self._views(key)
+            views, frames = self._views(key), self.clips.length(key)
             lacking = [
                 name
                 for name in self.methods

@@ -19,6 +19,7 @@ from gcd_model.config import SemanticClass
 from gcd_model.diffusion import SolverName
 from gcd_train.data.files import package_version
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.anyview import EpisodeSet
 from gcd_train.evaluation.baselines import (
     REPROJECT_RGBD,
     REPROJECT_SEMD,
@@ -148,7 +149,12 @@ def _saved_frames(options: EvaluateOptions, painted: tuple[SemanticClass, ...]) 
 
 def run_note(clips: EvaluationSet, methods: Sequence[Predictor], options: EvaluateOptions, command: str) -> RunNote:
     """What the run says of itself. command: the line that began it. Raises DataError for LPIPS weights."""
-    lpips = {} if options.lpips is None else {LPIPS: Lpips.open(options.lpips).identity}
+    opened = None if options.lpips is None else Lpips.open(options.lpips)
+    if opened is not None and opened.network != "vgg" and options.protocol == "anyviewbench":
+        raise DataError(
+            f"AnyViewBench's LPIPS is by VGG16, {options.lpips} holds {opened.network}; give VGG16's weights"
+        )
+    lpips = {} if opened is None else {LPIPS: opened.identity}
     return RunNote(
         command=command,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -167,6 +173,7 @@ def run_note(clips: EvaluationSet, methods: Sequence[Predictor], options: Evalua
         width=clips.width,
         seed=options.seed,
         classes=tuple(each.name for each in clips.classes),
+        groups=clips.groups if isinstance(clips, EpisodeSet) else {},
         methods={method.name: {**method.details, **lpips} for method in methods},
     )
 
@@ -176,13 +183,14 @@ class MethodKind:
     """What `--methods NAME` measures, or NAME_K, K cameras of a scene.
 
     make: the method, from the clips, the options and K. makes: pictures, class maps or both. usual: it is measured
-    where none are named. views: whether its name ends in K.
+    where none are named. views: whether its name ends in K. geometry: it needs the source's depth, or the ground.
     """
 
     make: Callable[[EvaluationSet, EvaluateOptions, int], Predictor]
     makes: Literal["pictures", "classes", "both"] = "pictures"
     usual: bool = False
     views: bool = False
+    geometry: bool = False
 
 
 def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: EvaluateOptions) -> tuple[Predictor, ...]:
@@ -194,7 +202,8 @@ def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: Evalua
     """
     unfit = {"pictures"} if clips.painted else set[str]() if clips.classes else {"classes"}
     if names is None:
-        names = [name for name, kind in METHODS.items() if kind.usual and kind.makes not in unfit]
+        fitting = {name: kind for name, kind in METHODS.items() if clips.geometry or not kind.geometry}
+        names = [name for name, kind in fitting.items() if kind.usual and kind.makes not in unfit]
     found: list[Predictor] = []
     for name in names:
         stem, _, number = name.rpartition("_")
@@ -209,6 +218,8 @@ def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: Evalua
         if kind.makes in unfit:
             targets = "class maps" if clips.painted else "pictures without class maps"
             raise RecipeError(f"{name} makes {kind.makes} alone, and these targets are {targets}; leave it out")
+        if kind.geometry and not clips.geometry:
+            raise RecipeError(f"{name} wants depth or the ground, which these clips do not tell; leave it out")
         if views > clips.cameras:
             there = f"{clips.cameras - 1} beside the source" if clips.cameras > 1 else "the source alone"
             raise RecipeError(
@@ -250,14 +261,17 @@ def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> 
     samples, seed = options.samples or 1, options.seed
     details = {"baseline": VANILLA_SVD, "samples": str(samples), "seed": str(seed), "weights": digest}
     weights = partial(open_weights, _resolved(options.svd), options.device, options.dtype, None if family else "svd")
-    return VanillaSVD(weights=weights, samples=samples, seed=seed, details=details)
+    shared = clips.kind == "anyview"  # its protocol draws one noise for all episodes
+    return VanillaSVD(weights=weights, samples=samples, seed=seed, shared_noise=shared, details=details)
 
 
 METHODS: dict[str, MethodKind] = {
     "copy_source": MethodKind(make=lambda clips, options, views: CopySource(), makes="both", usual=True),
-    "ground_homography": MethodKind(make=lambda clips, options, views: GroundHomography(), makes="both", usual=True),
-    REPROJECT_RGBD: MethodKind(make=_reproject_rgbd, usual=True),
-    REPROJECT_SEMD: MethodKind(make=_reproject_semd, makes="classes", usual=True),
+    "ground_homography": MethodKind(
+        make=lambda clips, options, views: GroundHomography(), makes="both", usual=True, geometry=True
+    ),
+    REPROJECT_RGBD: MethodKind(make=_reproject_rgbd, usual=True, geometry=True),
+    REPROJECT_SEMD: MethodKind(make=_reproject_semd, makes="classes", usual=True, geometry=True),
     VANILLA_SVD: MethodKind(make=_vanilla_svd),
     "hexplane": MethodKind(make=_hexplane, views=True),
 }

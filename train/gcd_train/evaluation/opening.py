@@ -5,6 +5,7 @@ Paper: one part of each scene's video, in Kubric-4D seen on the way to four goal
 5 degrees, all else is drawn, goals up to 90 degrees away whatever the model; a control list fixes all of it. Source:
 Van Hoorick et al. 2024 (GCD), appendix.
 Release: the first clip of each scene's controls, or the script's own angles; frames of the command line win.
+AnyViewBench: the first frames of each episode, at its own grid; see `anyview`.
 """
 
 import hashlib
@@ -19,6 +20,7 @@ from typer import Option
 from gcd_model import Traits
 from gcd_model.small_files import read_small
 from gcd_train.data import kubric4d, parallel_domain4d
+from gcd_train.data.anyview import SPLITS
 from gcd_train.data.dataset4d import Dataset4D, LayoutName, layout_in, layout_of, scene_number
 from gcd_train.data.files import MANIFEST, Skips, read_manifest
 from gcd_train.data.kubric4d import Kubric4D
@@ -49,10 +51,11 @@ from gcd_train.data.splits import (
     released_controls,
 )
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.evaluation.anyview import EpisodeSet
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
 
-ProtocolName: TypeAlias = Literal["paper", "release"]
-SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2}
+ProtocolName: TypeAlias = Literal["paper", "release", "anyviewbench"]
+SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2, "anyviewbench": 1}
 """Draws of each clip of a scene; of pairs, which no protocol cuts, there is one."""
 Size: TypeAlias = tuple[int, int, int]
 """T, H and W of clips."""
@@ -66,12 +69,21 @@ _SMALL_BYTES = 4 << 20
 class ClipOptions:
     """Which clips are measured: options of `gcd-train evaluate`. None: left out."""
 
-    data: Annotated[list[Path], Option(help="Folder of pairs (several may be given), or one of whole scenes.")]
-    protocol: Annotated[ProtocolName, Option(help="How clips are cut from whole scenes.")] = "paper"
+    data: Annotated[
+        list[Path], Option(help="Folder of pairs (several may be given), one of whole scenes, or AnyViewBench.")
+    ]
+    protocol: Annotated[ProtocolName, Option(help="How clips are cut from whole scenes, or from AnyViewBench.")] = (
+        "paper"
+    )
+    frames: Annotated[
+        int | None, Option(min=3, help="AnyViewBench: of each clip; by default as the weights, else 1 + 4 k up to 41.")
+    ] = None
     controls: Annotated[Path | None, Option(help="Scenes: control list, JSON.")] = None
     split: Annotated[str | None, Option(help="Only scenes of a split: a name as driving-test, or FILE:test.")] = None
     listed: Annotated[Path | None, Option("--list", help="Scenes: only those of a list, one a line.")] = None
-    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes.")] = None
+    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes; of AnyViewBench of a split.")] = (
+        None
+    )
     trajectories: Annotated[
         int | None, Option(min=1, help="Scenes: clips of each; by default 4 (paper, Kubric-4D) or 1.")
     ] = None
@@ -153,8 +165,28 @@ def open_clips(
         DataError: data cannot be read, are of another world than the split, or no clip is left; or a list or a control
             list cannot be read. RecipeError: options that contradict each other or the data, or no such split.
     """
+    if options.protocol == "anyviewbench":
+        return _open_episodes(options, model)
+    if options.frames is not None:
+        raise RecipeError("--frames is for --protocol anyviewbench; other clips are as long as the weights make them")
     layout = scene_layout(options.data)
+    if layout is None and (options.data[0] / SPLITS).is_file():
+        raise DataError(f"{options.data[0]} is in the layout of AnyViewBench; give --protocol anyviewbench")
     return _open_pairs(options) if layout is None else _open_scenes(options, layout, model, size)
+
+
+def _open_episodes(options: ClipOptions, model: Traits | None) -> tuple[EvaluationSet, tuple[str, ...]]:
+    """Episodes of AnyViewBench, or of our scenes in its layout."""
+    others = [getattr(options, name) for name in (*_OF_SCENES, "listed")]
+    if any(each is not None and each is not False for each in others) or len(options.data) > 1:
+        raise RecipeError("AnyViewBench is one --data with --split, --limit and --frames; leave out all other choices")
+    frames, root = options.frames, options.data[0].resolve()  # processes may stand elsewhere
+    if model is not None and frames not in (None, model.config.frames):
+        raise RecipeError(f"{model.name} makes clips of {model.config.frames} frames, not {frames}; leave out --frames")
+    frames = frames if model is None else model.config.frames
+    clips, notes = EpisodeSet.open(root, frames=frames, split=options.split, limit=options.limit)
+    folders = [each.folder.relative_to(root).as_posix() for each, _ in clips.episodes.values()]
+    return replace(clips, identity=_identity(root, folders, [options.protocol, frames], None)), notes
 
 
 def _open_pairs(options: ClipOptions) -> tuple[EvaluationSet, tuple[str, ...]]:

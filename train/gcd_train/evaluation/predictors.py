@@ -10,6 +10,7 @@ from typing import Protocol, Self, TypeAlias
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -30,8 +31,9 @@ class CameraPair:
     """Both cameras of one clip.
 
     ground_from_source: pose of the source camera where z is up and the ground is z = 0, float64 [4, 4], metres: in the
-        vehicle's frame, or on the stage that the camera orbits.
+        vehicle's frame, or on the stage that the camera orbits. [T, 4, 4] of one that moves, in any world.
     source, target: their pinholes, in pixels of the pictures.
+    zooms: a lens changes over the clip; `source` and `target` are those of the first frame.
     trajectory: where the target camera is, frame by frame.
     mount: how the source camera is declared to sit on its vehicle; None where there is no vehicle.
     """
@@ -41,6 +43,7 @@ class CameraPair:
     target: Intrinsics
     trajectory: Trajectory
     mount: CameraMount | None = None
+    zooms: bool = False
 
     @classmethod
     def driving(cls, mount: CameraMount, *, frames: int, height: int, width: int, move_time: int | None = None) -> Self:
@@ -84,12 +87,22 @@ def to_pixels(points: Tensor, camera: Intrinsics) -> Tensor:
     return torch.stack([u, v], dim=-1)
 
 
+def through_lens(video: Tensor, own: Intrinsics, lens: Intrinsics) -> Tensor:
+    """Pictures [T, 3, h, w] of one lens as another one in the same place shows them, [T, 3, H, W]; black beyond."""
+    size = torch.tensor([own.width, own.height])
+    grid = to_pixels(pixel_rays(lens), own) * 2 / size - 1
+    each = grid.float().expand(len(video), -1, -1, -1)
+    drawn = F.grid_sample(video, each, padding_mode="border", align_corners=False)
+    return torch.where((grid.abs() <= 1).all(dim=-1), drawn, 0.0)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SourceClip:
     """What a predictor may look at: the source side of a clip, and where it is to be seen from.
 
     source: uint8 [T, H, W, 3] RGB. source_depth: float32 [T, H, W], metres along the optical axis, 0 for the sky; for
-    privileged predictors only. source_classes: uint8 [T, H, W]; None where the world has no ontology.
+    privileged predictors only; [T, 0, 0] of sets without geometry. source_classes: uint8 [T, H, W]; None where the
+    world has no ontology.
     cameras: of the clip, the source's as it is declared. fps: frames per second.
     key: names the clip in its set; frames that others have made are found by it.
     others: the T views of each of so many further cameras of the scene, for predictors that are given them (raises
@@ -105,6 +118,12 @@ class SourceClip:
     key: str = ""
     others: Callable[[int], Sequence[Sequence[SceneView]]] | None = None
     points: Sequence[SceneView] = ()
+
+
+def require_one_lens(clip: SourceClip, method: str) -> None:
+    """Raises DataError where a lens changes over the clip, which `method` cannot follow."""
+    if clip.cameras.zooms:
+        raise DataError(f"{method} takes one lens for a clip, and one of {clip.key} zooms; give another --split")
 
 
 FAR_M = 1e4
@@ -186,6 +205,7 @@ def find_draws(folder: Path, key: str) -> list[Path]:
     A draw is a folder of pictures by number (`0000.png`, ...; also JPEG and WebP) or a video (`.mp4`), and stands at
 
         KEY, KEY/sample_0, ...                                   ours
+        KEY/frames                                               of AnyView's script
         PREFIX_pred_s0, ... , in `extra` or in the folder itself  of the paper's test script
 
     where PREFIX names the scene and, from the second on, the trajectory: `..._c02_scn02900_fs...` is that of the key
@@ -196,7 +216,7 @@ def find_draws(folder: Path, key: str) -> list[Path]:
     if not key or Path(key).name != key:
         raise DataError(f"saved frames are found by the clip's name, which must be a file name, got {key!r}")
     samples = {int(named[1]): path for path, named in _draws_in(folder / key, _SAMPLE)}
-    alone = [path for path in (folder / key, folder / (key + _VIDEO)) if _is_draw(path)]
+    alone = [path for path in (folder / key, folder / key / "frames", folder / (key + _VIDEO)) if _is_draw(path)]
     found = [samples[number] for number in sorted(samples)] or alone[:1]
     found = found or _released(folder / "extra", key) or _released(folder, key)
     if not found:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gcd_train.errors import RunError
+from gcd_train.evaluation.anyview import benchmark_table, published_table
 from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
 from gcd_train.evaluation.paper import is_model
 from gcd_train.evaluation.runs import EvaluatedSet, gather, on_the_same_goals
@@ -78,8 +79,11 @@ def make_report(
         place = Path("." if len(sets) == 1 else f"{number}-{each.note.kind}-{each.note.modality}")
         writer = _Writer(of=each, out=out, place=place, chosen=tuple(leads))
         spans: tuple[Span, ...] = ("all", *_SPANS) if each.note.protocol == "release" else _SPANS
-        pages += [f"## {each.title}", *writer.tables(spans), *writer.differences(spans)]
-        pages += [*writer.plots(drawn), *writer.gallery(clips)]
+        if each.note.protocol == "anyviewbench":
+            pages += [f"## {each.title}", *writer.benchmark()]
+        else:
+            pages += [f"## {each.title}", *writer.tables(spans), *writer.differences(spans), *writer.plots(drawn)]
+        pages += writer.gallery(clips)
     joined, notes = on_the_same_goals(sets)
     for number, each in enumerate(joined, start=1):
         writer = _Writer(of=each, out=out, place=Path(f"last-frame-{number}"), chosen=tuple(leads))
@@ -146,6 +150,11 @@ class _Writer:
         figures = self._written("tables/figures.csv", all_figures(self.of))
         by_clip = self._written("tables/clips.csv", clips_csv(self.of))
         yield f"All figures with their intervals: {figures}; clip by clip: {by_clip}."
+
+    def benchmark(self) -> Iterator[str]:
+        """Of AnyViewBench: its own means, and what is published."""
+        yield from map(self.table, (benchmark_table(self.of), published_table()))
+        yield f"Clip by clip: {self._written('tables/clips.csv', clips_csv(self.of, 'all'))}."
 
     def differences(self, spans: Sequence[Span]) -> Iterator[str]:
         """Of the chosen methods that the set has, else of its models, else of its first, from all others."""

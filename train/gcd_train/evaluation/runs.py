@@ -104,8 +104,13 @@ class EvaluatedSet:
         return next(each for each in self.methods if each.name == name)
 
 
-_KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits"}
-_PROTOCOLS = {"paper": "the paper's protocol", "release": "the released script's protocol", "pairs": "pairs of clips"}
+_KINDS = {"kubric": "Kubric-4D layout", "driving": "Driving", "orbit": "Orbits", "anyview": "Episodes"}
+_PROTOCOLS = {
+    "paper": "the paper's protocol",
+    "release": "the released script's protocol",
+    "pairs": "pairs of clips",
+    "anyviewbench": "AnyViewBench's protocol",
+}
 
 
 def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:

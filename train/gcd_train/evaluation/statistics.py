@@ -128,7 +128,8 @@ def scene_weights(count: int) -> Array:
 class ClipTable:
     """All that one method was measured as: a row for each clip and frame, a column for all that figures are made of.
 
-    scenes: of the n clips. above, below: [n, T, 6 + K] by region, see `Sums`, summed over draws. true: [n, K], pixels
+    scenes: of the n clips. above, below: [n, T, 6 + K] by region, see `Sums`, summed over draws, nothing after the end
+    of clips that are shorter than others. true: [n, K], pixels
     of each class in all of a clip's targets.
     """
 
@@ -144,13 +145,14 @@ class ClipTable:
         ids = {label for clip in maps for frame in clip for entry in frame for label in entry[:2]}
         count = max([classes, *(1 + label for label in ids - {NO_CLASS})])
         true = np.zeros((len(records), count))
-        shape = (len(REGIONS), len(records), records[0].frames, _CLASSES + count)
+        shape = (len(REGIONS), len(records), max(record.frames for record in records), _CLASSES + count)
         above, below = np.zeros(shape), np.zeros(shape)
         for place, name in enumerate(REGIONS):
             for row, record in enumerate(records):
                 if name in record.regions:
-                    _add_pictures(record, name, above[place, row], below[place, row])
-                    counts = _add_classes(record.regions[name].confusion or (), above[place, row], below[place, row])
+                    own = above[place, row, : record.frames], below[place, row, : record.frames]
+                    _add_pictures(record, name, *own)
+                    counts = _add_classes(record.regions[name].confusion or (), *own)
                     true[row] += counts if name == "all" else 0.0
         return cls(
             scenes=tuple(record.scene for record in records),

@@ -85,8 +85,10 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """What all records of a run have in common; `run.json`.
 
     command: the line that began it. made: UTC, ISO 8601. versions: of gcd-node, torch, python. data: folders.
-    data_identity: digest of the clips. kind: "kubric", "driving" or "orbit": which tables they belong to.
-    modality: of the target pictures. protocol: "paper", "release" or "pairs". classes: names, empty for none.
+    data_identity: digest of the clips. kind: "kubric", "driving", "orbit" or "anyview": which tables they belong to.
+    modality: of the target pictures. protocol: "paper", "release", "pairs" or "anyviewbench". frames, height, width: of
+    the longest clip and the largest, where they differ. classes: names, empty for none. groups: of a benchmark: names
+    of the clips of each split, by group.
     methods: name to what it is: a weight file's digest, steps, guidance, draws, seed, views; all as text.
     """
 
@@ -95,14 +97,15 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     versions: dict[str, str]
     data: tuple[str, ...]
     data_identity: str
-    kind: Literal["kubric", "driving", "orbit"]
+    kind: Literal["kubric", "driving", "orbit", "anyview"]
     modality: Literal["rgb", "semantic"]
-    protocol: Literal["paper", "release", "pairs"]
+    protocol: Literal["paper", "release", "pairs", "anyviewbench"]
     frames: int
     height: int
     width: int
     seed: int
     classes: tuple[str, ...] = ()
+    groups: dict[str, dict[str, tuple[str, ...]]] = {}
     methods: dict[str, dict[str, str]] = {}
 
 

@@ -18,7 +18,14 @@ from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import EvaluationSet, names_of
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import CameraPair, OpenedWeights, Prediction, SourceClip
+from gcd_train.evaluation.predictors import (
+    CameraPair,
+    OpenedWeights,
+    Prediction,
+    SourceClip,
+    require_one_lens,
+    through_lens,
+)
 from gcd_train.evaluation.tables import counted
 
 VANILLA_SVD = "vanilla_svd"
@@ -37,20 +44,23 @@ class SynthesizedViews:
     weights: give the model. options: instead of what it ships with. The noise of their seed is the same for every clip,
     as in a live node. painted: classes that its colours are read by, where it paints class maps and its file does not
     say which. classes: so many the clips have, None for any; what a model sees of others, as a robot on a street, is
-    none of them.
+    none of them. stretched: clips are brought to the size of the model, and its pictures to the size and the lens of
+    the target; what the source's lens does not show stays black.
     """
 
     weights: OpenedWeights
     options: RenderOptions = _AS_SHIPPED
     painted: tuple[SemanticClass, ...] = ()
     classes: int | None = None
+    stretched: bool = False
     privileged: bool = False
 
     @classmethod
     def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions = _AS_SHIPPED) -> Self:
         """A model that is measured on these clips. Raises DataError where they do not fit together."""
         _require_fit(weights(), clips)
-        made, traits = cls(weights=weights, options=options, classes=len(clips.classes) or None), weights().traits
+        free, traits = clips.kind == "anyview", weights().traits
+        made = cls(weights=weights, options=options, classes=len(clips.classes) or None, stretched=free)
         if not made.paints_classes or traits.classes:
             return made
         if not clips.classes:
@@ -92,14 +102,29 @@ class SynthesizedViews:
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor. Raises DataError where the clip's path is not one that the model was trained on."""
-        return self.shown(self.drawer(clip)(self.options))
+        view = self.drawer(clip)(self.options)
+        if not self.stretched:
+            return self.shown(view)
+        source, target = clip.cameras.source, clip.cameras.target
+        own = source.resized(view.samples.shape[-1], view.samples.shape[-2])
+        first, *more = (Prediction(video=through_lens(each, own, target)) for each in view.samples)
+        return replace(first, more=tuple(more))
 
     def drawer(self, clip: SourceClip) -> Callable[[RenderOptions], View]:
         """Draws the clip's view, encoded once, with any options. Raises DataError as `predict`."""
-        synthesizer, path = self.weights(), self._path(clip.cameras)
-        own = Clip(video=to_network(clip.source), fps=clip.fps)
+        synthesizer, cameras = self.weights(), clip.cameras
+        path, config = self._path(cameras), synthesizer.traits.config
+        video, lens, odometry = to_network(clip.source), cameras.source, None
+        if self.stretched:
+            require_one_lens(clip, self.name)
+            video, lens = (
+                _stretched(video, config.height, config.width, low=-1.0),
+                lens.resized(config.width, config.height),
+            )
+            odometry = cameras.ground_from_source
+        own = Clip(video=video, fps=clip.fps)
         if synthesizer.traits.live:
-            own = replace(own, mount=clip.cameras.mount, lens=clip.cameras.source)
+            own = replace(own, mount=cameras.mount, lens=lens, odometry=odometry)
         features = synthesizer.encode(own)
         return lambda options: synthesizer.render(features, [path], options)[0]
 
@@ -137,6 +162,13 @@ class SynthesizedViews:
 
 def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
     traits = synthesizer.traits
+    if clips.kind == "anyview":
+        if not traits.live:
+            raise DataError(
+                f"{traits.name} goes a path of its own or over a sphere, and AnyViewBench's cameras are anywhere: give "
+                "a live model, which takes any pose, or frames with --predictions"
+            )
+        return
     wanted = (traits.config.frames, traits.config.height, traits.config.width)
     given = (clips.frames, clips.height, clips.width)
     if wanted != given:
@@ -160,7 +192,7 @@ class VanillaSVD:
 
     weights: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
         the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
-        the clip's key. details: see Predictor.
+        the clip's key, or, `shared_noise`, from it alone. details: see Predictor.
     Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
     """
 
@@ -169,6 +201,7 @@ class VanillaSVD:
     steps: int | None = None
     samples: int = 1
     seed: int = 0
+    shared_noise: bool = False
     name: str = VANILLA_SVD
     privileged: bool = False
     details: dict[str, str] = field(default_factory=dict[str, str])
@@ -182,19 +215,20 @@ class VanillaSVD:
                 "shorter clips"
             )
         height, width = clip.cameras.target.height, clip.cameras.target.width
-        features = self._features(clip)
+        key = "" if self.shared_noise else clip.key
+        features = self._features(clip, key)
         draws = [
-            Prediction(video=_stretched(self._draw(features, clip.key, number), height, width)[:frames])
+            Prediction(video=_stretched(self._draw(features, key, number), height, width)[:frames])
             for number in range(self.samples)
         ]
         return replace(draws[0], more=tuple(draws[1:]))
 
-    def _features(self, clip: SourceClip) -> SourceFeatures:
+    def _features(self, clip: SourceClip, key: str) -> SourceFeatures:
         """Of the first frame, encoded once, for all frames."""
         config = self.weights().traits.config
         height, width = self.size or (config.height, config.width)
         first = _stretched(to_network(clip.source[:1]), height, width, low=-1.0)
-        noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(clip.key)))
+        noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(key)))
         made = self.weights().encode(Clip(video=first, fps=clip.fps), noise)
         tokens = None if made.tokens is None else made.tokens.repeat(config.frames, 1)
         return replace(made, tokens=tokens, latents=made.latents.repeat(config.frames, 1, 1, 1))

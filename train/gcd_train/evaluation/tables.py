@@ -269,13 +269,13 @@ def all_figures(of: EvaluatedSet) -> str:
     return csv_text(["method", "frames", "pixels", "figure", "value", "low", "high", "clips"], lines)
 
 
-def clips_csv(of: EvaluatedSet) -> str:
-    """Every method on every clip: one line each, frames 2 to the last."""
+def clips_csv(of: EvaluatedSet, frames: Span = "2-last") -> str:
+    """Every method on every clip: one line each."""
     regions: tuple[Region, ...] = ("all", "occluded")
     by_clip: tuple[FigureName, ...] = ("psnr_db", "ssim", "miou_full")
     lines: list[list[str]] = []
     for method in of.methods:
-        sums = [method.table.clip_sums(region=region) for region in regions]
+        sums = [method.table.clip_sums(frames, region) for region in regions]
         values = np.stack([each.figure(name) for each in sums for name in by_clip], axis=1)
         for record, row in zip(method.records, values.tolist(), strict=True):
             change = ("", "", "") if record.change is None else tuple(f"{part:g}" for part in record.change)
