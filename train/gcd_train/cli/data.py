@@ -121,17 +121,15 @@ def anyview(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the episodes; those that are there are kept.")],
     view: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Scenes: INPUT:TARGET, two cameras; may be repeated. By default the usual, and the farthest."
-        ),
+        typer.Option(help="Scenes: INPUT:TARGET, two cameras; may be repeated. By default the usual, the farthest."),
     ] = None,
     limit: Limit = None,
     workers: Workers = 1,
     ray: Ray = None,
 ) -> None:
-    """Our scenes or pairs as episodes of AnyViewBench, for other people's models.
+    """Scenes or pairs as episodes of AnyViewBench, for other people's models.
 
-    Measure what they make of them with `gcd-train evaluate --data OUT --protocol anyviewbench --predictions NAME=FOLDER`.
+    `gcd-train evaluate --data OUT --protocol anyviewbench --predictions NAME=FOLDER` measures what these make of them.
     """
     stop_as_by_ctrl_c()
     with errors_shown():
