@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -24,9 +25,11 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.anyview import benchmark_table, grid_size, published_table
 from gcd_train.evaluation.baselines import HexPlane
+from gcd_train.evaluation.methods import EvaluateOptions, run_note
+from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.predictors import pixel_rays, through_lens
-from gcd_train.evaluation.runs import gather
+from gcd_train.evaluation.runs import gather, on_the_same_goals
 from gcd_train.evaluation.store import Run
 from gcd_train.evaluation.synthesized import SynthesizedViews
 from gcd_train.pictures import write_mp4
@@ -221,13 +224,20 @@ def test_means_go_by_episode_split_and_group_without_black_targets(root: Path, t
 
 
 def test_a_mean_over_groups_is_unknown_without_a_group(root: Path) -> None:
-    told = note(kind="anyview", protocol="anyviewbench", groups={"a": {"a1": ("a1.e",)}, "b": {"b1": ("b1.e",)}})
+    told = note(
+        kind="anyview",
+        protocol="anyviewbench",
+        data_identity="its own",
+        groups={"a": {"a1": ("a1.e",)}, "b": {"b1": ("b1.e",)}},
+    )
     both = [record("model", "a1.e"), record("copy", "a1.e"), record("copy", "b1.e")]
     of = gather([Run(folder=root, note=told, records=tuple(both))])[0]
     found = {(row.method, row.label): str(row.cells[0]) for row in benchmark_table(of).rows}
     assert found["model", "mean over groups"] == "-"
     assert found["copy", "mean over groups"] == found["model", "a"] == "20.00"
     assert {row.method for row in published_table().rows}.isdisjoint({"model", "copy"})
+    other = Run(folder=root, note=note(), records=(record("other", "a1.e"),))
+    assert on_the_same_goals(gather([Run(folder=root, note=told, records=tuple(both)), other])) == ((), ())
 
 
 def test_both_cameras_may_move(tmp_path: Path) -> None:
@@ -318,6 +328,13 @@ def test_what_does_not_fit_the_benchmark_is_one_line(
     usual = [] if "--protocol" in line else ["--protocol", "anyviewbench"]
     got, output = run("evaluate", "--data", root, *usual, *line, "--out", tmp_path / "out")
     assert (got, said in " ".join(output.split())) == (code, True), output
+
+
+def test_its_lpips_is_that_of_vgg(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Lpips, "open", lambda folder: SimpleNamespace(network="alex", identity="alex-0"))
+    options = EvaluateOptions(data=[root], protocol="anyviewbench", lpips=root)
+    with pytest.raises(DataError, match="VGG16"):
+        run_note(open_clips(options)[0], (), options, "")
 
 
 def test_folders_that_are_no_benchmark_are_one_line(tmp_path: Path) -> None:

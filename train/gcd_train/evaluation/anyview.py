@@ -75,16 +75,15 @@ class EpisodeSet(EvaluationSet):
             RecipeError: no such split. RenderError: Pillow is missing.
         """
         pillow()  # what is not installed is said now, not clip by clip
-        groups, notes = read_groups(root), Skips(logged=False)
+        chosen = [(group, name) for group, splits in read_groups(root).items() for name in splits]
+        found, notes = find_episodes(root, [name for _, name in chosen]), Skips(logged=False)
         if split is not None:
-            groups = {group: tuple(s for s in splits if split in (s, group)) for group, splits in groups.items()}
-            groups = {group: splits for group, splits in groups.items() if splits}
-            if not groups:
-                known = ", ".join(split for splits in read_groups(root).values() for split in splits)
+            known = ", ".join(name for _, name in chosen)
+            chosen = [(group, name) for group, name in chosen if split in (group, name)]
+            if not chosen:
                 raise RecipeError(f"{root / SPLITS} has no split or group {split!r}; there are {known}")
-        found = find_episodes(root, [split for splits in read_groups(root).values() for split in splits])
         episodes, kept = dict[str, tuple[Episode, int]](), dict[str, dict[str, tuple[str, ...]]]()
-        for group, name in ((group, name) for group, splits in groups.items() for name in splits):
+        for group, name in chosen:
             opened = {key: Episode.open(folder) for key, folder in list(found[name].items())[:limit]}
             there = {f"{name}.{key}": each for key, each in opened.items() if each is not None}
             if not opened:

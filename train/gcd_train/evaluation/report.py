@@ -116,7 +116,7 @@ def _about(run: Run) -> str:
         f"- made: {note.made}, {', '.join(f'{name} {version}' for name, version in note.versions.items())}",
         f"- clips: {', '.join(note.data)}, digest {note.data_identity}",
         f"- protocol: {note.protocol}, seed {note.seed}",
-        f"- size: {note.frames} frames of {note.width}x{note.height}",
+        f"- size: {'at most ' * bool(note.groups)}{note.frames} frames of {note.width}x{note.height}",
         "",
         *markdown_rows(["method", "clips", "s/clip", "what it is"], rows),
     ]
