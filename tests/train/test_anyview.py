@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 import torch
 from driving_plane import PlaneClips
-from fake_model import FakeModel, traits_of
+from fake_model import FakeModel
 from made_records import note, record
 from tiny_scenes4d import write_driving, write_kubric
+from tiny_world import smaller
 from typer.testing import CliRunner
 
-from gcd_model.config import SVD_14
 from gcd_model.geometry import Intrinsics, relative_pose, sphere_poses
 from gcd_train.cli.main import app
 from gcd_train.data.anyview import CameraVideo, Episode, EpisodeExport, write_episode
 from gcd_train.data.dataset4d import Dataset4D
 from gcd_train.data.kubric4d import Kubric4D
-from gcd_train.errors import DataError, RecipeError
+from gcd_train.errors import DataError, RecipeError, TrainError
 from gcd_train.evaluation.anyview import benchmark_table, grid_size, published_table
 from gcd_train.evaluation.baselines import HexPlane
 from gcd_train.evaluation.methods import EvaluateOptions, run_note
@@ -280,8 +280,7 @@ def test_another_lens_in_the_same_place_shows_the_same_directions() -> None:
 
 
 def test_a_live_model_is_told_lens_and_motion_at_its_own_size_and_drawn_at_the_grid(root: Path) -> None:
-    traits = replace(traits_of(replace(SVD_14, frames=4, height=64, width=96), "svd"), family=None)
-    model = FakeModel(LiveTraits(traits))
+    model = FakeModel(SimpleNamespace(name="live", live=True, classes=(), family=None, config=smaller(4, 64, 96)))
     clips, _ = open_clips(ClipOptions(data=[root], protocol="anyviewbench", split="far"), model.traits)
     assert (clips.keys, clips.frames) == (("far_a.e0",), 4)
     clip = clips.clip("far_a.e0")
@@ -294,25 +293,12 @@ def test_a_live_model_is_told_lens_and_motion_at_its_own_size_and_drawn_at_the_g
     assert given.odometry is clip.seen.cameras.ground_from_source
 
 
-class LiveTraits:
-    """Of a fake live model."""
-
-    live, classes, uncertainty_scale, family = True, (), None, None
-
-    def __init__(self, traits: object) -> None:
-        self.traits = traits
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.traits, name)
-
-
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
         (["--methods", "ground_homography"], 78, "wants depth or the ground"),
         (["--methods", "reproject_semd"], 78, "reproject_semd makes classes alone"),
         (["--methods", "hexplane_4"], 78, "hexplane_4 wants 4 cameras"),
-        (["--weights", "random:kubric90"], 66, "AnyViewBench's cameras are anywhere"),
         (["--frames", "7"], 66, "has 6 frames"),
         (["--split", "other"], 78, "has no split or group 'other'"),
         (["--trajectories", "2"], 78, "leave out all other choices"),
@@ -335,6 +321,13 @@ def test_its_lpips_is_that_of_vgg(root: Path, monkeypatch: pytest.MonkeyPatch) -
     options = EvaluateOptions(data=[root], protocol="anyviewbench", lpips=root)
     with pytest.raises(DataError, match="VGG16"):
         run_note(open_clips(options)[0], (), options, "")
+
+
+def test_a_model_without_free_poses_or_of_another_length_is_refused(root: Path) -> None:
+    options, config = ClipOptions(data=[root], protocol="anyviewbench", frames=5), smaller(4, 64, 96)
+    for live, said in ((False, "cameras are anywhere"), (True, "makes clips of 4 frames")):
+        with pytest.raises(TrainError, match=said):
+            open_clips(options, SimpleNamespace(name="a", live=live, config=config))  # pyright: ignore
 
 
 def test_folders_that_are_no_benchmark_are_one_line(tmp_path: Path) -> None:

@@ -181,6 +181,11 @@ def _open_episodes(options: ClipOptions, model: Traits | None) -> tuple[Evaluati
     if any(each is not None and each is not False for each in others) or len(options.data) > 1:
         raise RecipeError("AnyViewBench is one --data with --split, --limit and --frames; leave out all other choices")
     frames, root = options.frames, options.data[0].resolve()  # processes may stand elsewhere
+    if model is not None and not model.live:
+        raise DataError(
+            f"{model.name} goes a path of its own or over a sphere, and AnyViewBench's cameras are anywhere: give a "
+            "live model, which takes any pose, or frames with --predictions"
+        )
     if model is not None and frames not in (None, model.config.frames):
         raise RecipeError(f"{model.name} makes clips of {model.config.frames} frames, not {frames}; leave out --frames")
     frames = frames if model is None else model.config.frames
