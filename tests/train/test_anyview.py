@@ -304,7 +304,7 @@ def test_a_live_model_is_told_lens_and_motion_at_its_own_size_and_drawn_at_the_g
         (["--trajectories", "2"], 78, "leave out all other choices"),
         (["--frame-start", "0"], 78, "leave out all other choices"),
         (["--protocol", "paper"], 66, "give --protocol anyviewbench"),
-        (["--predictions", "x=mine/far_a.e0", "--no-baselines"], 70, "holds no frames for clip far_a.e0"),
+        (["--predictions", "x=mine/far_a.e0", "--no-baselines"], 73, "holds no frames for clip far_a.e0"),
     ],
 )
 def test_what_does_not_fit_the_benchmark_is_one_line(
