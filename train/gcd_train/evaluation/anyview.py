@@ -126,7 +126,7 @@ class EpisodeSet(EvaluationSet):
         height, width = grid_size(episode.height, episode.width)
         poses = [torch.from_numpy(each.poses) for each in (source, target)]
         seen, true = (on_grid(each.pictures, height, width) for each in (source, target))
-        counted = true.any(axis=(1, 2, 3))
+        counted = np.array([frame.any() for frame in true])
         cameras = CameraPair(
             ground_from_source=poses[0],
             source=source.lenses[0].resized(width, height),
