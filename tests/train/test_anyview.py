@@ -25,6 +25,7 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.errors import DataError, RecipeError, TrainError
 from gcd_train.evaluation.anyview import benchmark_table, grid_size, published_table
 from gcd_train.evaluation.baselines import HexPlane
+from gcd_train.evaluation.hexplane import Camera
 from gcd_train.evaluation.methods import EvaluateOptions, run_note
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import ClipOptions, open_clips
@@ -240,16 +241,25 @@ def test_a_mean_over_groups_is_unknown_without_a_group(root: Path) -> None:
     assert on_the_same_goals(gather([Run(folder=root, note=told, records=tuple(both)), other])) == ((), ())
 
 
-def test_both_cameras_may_move(tmp_path: Path) -> None:
+def test_both_cameras_may_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = [filmed(azimuth_deg=each) for each in (90.0, 0.0)]
     episode(benchmark(tmp_path, {"g": ["s"]}) / "s" / "deep" / "e", *made)
     clips, _ = open_clips(ClipOptions(data=[tmp_path], protocol="anyviewbench", frames=4))
     assert clips.keys == ("s.deep-e",)
-    cameras = clips.clip("s.deep-e").seen.cameras
+    seen = clips.clip("s.deep-e").seen
+    cameras = seen.cameras
     poses = [torch.from_numpy(each.poses[:4]) for each in made]
     torch.testing.assert_close(cameras.source_from_target, torch.linalg.inv(poses[1]) @ poses[0])
     torch.testing.assert_close(cameras.ground_from_source, poses[1])
     assert (cameras.source.fx, cameras.source.cy) == (50 * 4, 7 * 4)
+
+    def learn(pictures: Sequence[tuple[torch.Tensor, Camera]], *rest: object, **more: object) -> None:
+        given = torch.stack([camera.world_from_camera for _, camera in pictures])
+        raise DataError(f"learns from {(given - poses[1]).abs().max():.3f}")
+
+    monkeypatch.setattr("gcd_train.evaluation.baselines.learn", learn)
+    with pytest.raises(DataError, match=r"learns from 0\.000"):
+        HexPlane().predict(seen)
 
 
 def test_a_lens_that_zooms_is_refused_by_what_takes_one(tmp_path: Path) -> None:
