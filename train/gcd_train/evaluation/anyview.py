@@ -177,7 +177,8 @@ def benchmark_table(of: EvaluatedSet) -> Table:
     out = [split for splits in of.note.groups.values() for split, keys in splits.items() if not keys]
     notes = [f"Unweighted means over frames, episodes, splits, {len(groups)} groups; black targets do not count."]
     notes += [f"Left out, without pixels or not there: {', '.join(out)}."] if out else []
-    return Table(name="anyviewbench", title=of.title, headings=_HEADINGS, rows=tuple(rows), notes=tuple(notes))
+    title = "Means over groups, of a group and of a split"
+    return Table(name="anyviewbench", title=title, headings=_HEADINGS, rows=tuple(rows), notes=tuple(notes))
 
 
 def _row(method: MethodRecords, label: str, groups: Mapping[str, Mapping[str, Sequence[str]]]) -> Row:
