@@ -261,7 +261,7 @@ def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> 
     samples, seed = options.samples or 1, options.seed
     details = {"baseline": VANILLA_SVD, "samples": str(samples), "seed": str(seed), "weights": digest}
     weights = partial(open_weights, _resolved(options.svd), options.device, options.dtype, None if family else "svd")
-    shared = clips.kind == "anyview"  # its protocol draws one noise for all episodes
+    shared = isinstance(clips, EpisodeSet)  # its protocol draws one noise for all episodes
     return VanillaSVD(weights=weights, samples=samples, seed=seed, shared_noise=shared, details=details)
 
 

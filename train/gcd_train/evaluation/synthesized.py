@@ -16,6 +16,7 @@ from gcd_model.diffusion import Sampler, unit_noise
 from gcd_model.geometry import pose_trajectory
 from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError
+from gcd_train.evaluation.anyview import EpisodeSet
 from gcd_train.evaluation.clips import EvaluationSet, names_of
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
@@ -59,7 +60,7 @@ class SynthesizedViews:
     def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions = _AS_SHIPPED) -> Self:
         """A model that is measured on these clips. Raises DataError where they do not fit together."""
         _require_fit(weights(), clips)
-        free, traits = clips.kind == "anyview", weights().traits
+        free, traits = isinstance(clips, EpisodeSet), weights().traits
         made = cls(weights=weights, options=options, classes=len(clips.classes) or None, stretched=free)
         if not made.paints_classes or traits.classes:
             return made
@@ -162,7 +163,7 @@ class SynthesizedViews:
 
 def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
     traits = synthesizer.traits
-    if clips.kind == "anyview":  # opened for this model, whatever its size
+    if isinstance(clips, EpisodeSet):  # opened for this model, whatever its size
         return
     wanted = (traits.config.frames, traits.config.height, traits.config.width)
     given = (clips.frames, clips.height, clips.width)
