@@ -7,13 +7,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import torch
 from driving_plane import PlaneClips
 from fake_model import FakeModel
 from made_records import note, record
-from tiny_scenes4d import write_driving, write_kubric
+from tiny_scenes4d import driving_pose, write_driving, write_kubric
 from tiny_world import smaller
 from typer.testing import CliRunner
 
@@ -21,6 +22,7 @@ from gcd_model.geometry import Intrinsics, relative_pose, sphere_poses
 from gcd_train.cli.main import app
 from gcd_train.data.anyview import CameraVideo, Episode, EpisodeExport, write_episode
 from gcd_train.data.dataset4d import Dataset4D
+from gcd_train.data.files import MANIFEST, Matrix, SceneManifest
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.errors import DataError, RecipeError, TrainError
 from gcd_train.evaluation.anyview import benchmark_table, grid_size, published_table
@@ -381,6 +383,34 @@ def test_scenes_of_both_layouts_become_episodes_that_are_measured(tmp_path: Path
     clips, notes = open_clips(ClipOptions(data=[out], protocol="anyviewbench"))
     assert (len(clips.keys), notes) == (3, ())
     assert clips.clip("parallel_domain4d-yaw-0-camera0.scene_000005").target.shape == (5, *grid_size(36, 48), 3)
+
+
+def test_cameras_on_our_vehicles_move_with_them(tmp_path: Path) -> None:
+    way = np.tile(np.eye(4), (3, 1, 1))
+    way[:, 0, 3] = [0.0, 1.5, 4.0]
+    manifest = SceneManifest(
+        layout="parallel_domain4d",
+        world="driving",
+        seed=5,
+        version="0",
+        edition=1,
+        compact=False,
+        frames=3,
+        fps=10.0,
+        width=48,
+        height=36,
+        oversample=1,
+        hfov_deg=85.0,
+        files={},
+        cameras=("yaw-0", "camera0"),
+        world_from_vehicle=msgspec.convert(way.tolist(), tuple[Matrix, ...]),
+    )
+    (write_driving(tmp_path / "in", 5, frames=3) / MANIFEST).write_bytes(msgspec.json.encode(manifest))
+    work = EpisodeExport.of(tmp_path / "in", tmp_path / "out", ["yaw-0:camera0"])
+    assert [work(item) for item in work.items] == [True]
+    assert work.finish() == ("driving-yaw-0-camera0",)
+    found = read(tmp_path / "out" / "driving-yaw-0-camera0" / "scene_000005", "cam0", 3)
+    assert np.abs(found.poses - way @ driving_pose("camera0")).max() < 1e-6
 
 
 def test_pairs_become_episodes_with_both_cameras(tmp_path: Path) -> None:
