@@ -7,7 +7,7 @@
                                              lowdim/cam0.npz with [T, 3, 3] and [T, 4, 4]
 
 cam1 is the input, cam0 the target; both may move. Extrinsics are world from camera, intrinsics a pinhole in pixels of
-the stored pictures. Source: README and docs/PROTOCOL.md of TRI-ML/AnyView-DVS (Van Hoorick et al. 2026). They do not
+the stored pictures. Source: README and PROTOCOL page of TRI-ML/AnyView-DVS (Van Hoorick et al. 2026). They do not
 say, and this is assumed: camera axes are x right, y down, z ahead; pixels count from the picture's corner; all cameras
 of an episode have its resolution; an episode lies somewhere below a folder that is called as its split.
 """

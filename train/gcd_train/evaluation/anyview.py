@@ -2,7 +2,7 @@
 
     frame -> episode -> split -> group -> mean over the groups, each an unweighted mean
 
-Source: docs/PROTOCOL.md and README of TRI-ML/AnyView-DVS; Van Hoorick et al. 2026, "AnyView: Synthesizing Any Novel
+Source: PROTOCOL page and README of TRI-ML/AnyView-DVS; Van Hoorick et al. 2026, "AnyView: Synthesizing Any Novel
 View in Dynamic Scenes". Not said there, and assumed: sizes between the two stages of the grid are not rounded.
 """
 
