@@ -196,6 +196,12 @@ def counted_lerobot(here: Path) -> None:
     lerobot(here, '{"episode_index": 0, "length": 30}\n')
 
 
+def benchmark(here: Path) -> None:
+    (here / "bench/s/e").mkdir(parents=True)
+    (here / "bench/splits.json").write_text('{"groups": {"g": ["s"]}}')
+
+
+BENCHMARK = "gcd-train evaluate --data bench --protocol anyviewbench --out out"
 CHECK, INSPECT = "gcd-node check launch.toml", "gcd-node weights inspect model"
 EVALUATE, REPORT = "gcd-train evaluate --data scenes --out out", "gcd-train report run --out report"
 ON_PAIRS = "gcd-train train package:paper-driving --data pairs --valid pairs --out out"
@@ -248,6 +254,8 @@ TEXT_DOORS = {
     "lerobot_cameras": Door(
         "json", "cameras.json", "gcd-train lerobot set --calibration cameras.json", counted_lerobot
     ),
+    "benchmark_index": Door("json", "bench/splits.json", BENCHMARK, folders("bench")),
+    "benchmark_episode": Door("json", "bench/s/e/metadata.json", BENCHMARK, benchmark),
     "cache_index": Door("json", "cache/index.json", ON_CACHE, folders("cache")),
 }
 

@@ -93,8 +93,9 @@ def find_episodes(root: Path, splits: Sequence[str]) -> dict[str, dict[str, Path
 
     for place, folders, files in os.walk(root, onerror=passed_on):
         parts = Path(place).relative_to(root).parts
-        folders[:] = [] if METADATA in files or len(parts) > _MOST_DEPTH else sorted(folders)
-        if METADATA in files:
+        told = METADATA in (*folders, *files)
+        folders[:] = [] if told or len(parts) > _MOST_DEPTH else sorted(folders)
+        if told:
             split = next((part for part in parts if part in found), None)
             if split is None:
                 raise DataError(f"{place} is an episode in no folder of a split that {SPLITS} names; take it out")
