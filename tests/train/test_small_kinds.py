@@ -280,7 +280,7 @@ def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
     assert len({path.parent for path in before}) == 1
     assert not (tmp_path / "first" / "latents").exists()
-    then = study("study-gradual-pretrained", f"model.weights={weights}")
+    then = study("study", f"model.weights={weights}")
     for folder in ("second", "third"):  # which share their latents
         trainer(tmp_path / folder, then, latents=latents).run("latents")
     after = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
@@ -288,7 +288,7 @@ def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     assert len({path.parent for path in after}) == 2
     start = start_networks(then.model, model_config(then.model), then.seed)
     assert torch.equal(start.unet.conv_out.weight, made.networks.unet.conv_out.weight.float())
-    scratch = study("study-gradual-scratch", f"model.weights={weights}")
+    scratch = study("study", f"model.weights={weights}", "model.scratch=true")
     anew = start_networks(scratch.model, model_config(scratch.model), scratch.seed)
     assert not torch.equal(anew.unet.stem.weight, start.unet.stem.weight)
     assert torch.equal(anew.decoder.stem.weight, start.decoder.stem.weight)
