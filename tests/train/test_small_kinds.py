@@ -79,6 +79,7 @@ def painted_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None:
     synthesizer = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu")
     traits, clips = synthesizer.traits, TinyOrbits(1, seed=4)
@@ -194,6 +195,7 @@ def assert_alike(one: Tensor | None, other: Tensor | None) -> None:
         torch.testing.assert_close(one, other)
 
 
+@pytest.mark.slow
 def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run: Path) -> None:
     recipe, clips = orbit_recipe(), LatentClips.open(orbit_run / "latents")
     rows = clips.rows(torch.tensor([1]), torch.tensor([2]), torch.tensor([False]), CPU)
