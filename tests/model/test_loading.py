@@ -115,6 +115,7 @@ def test_one_model_ships_it_is_small_and_the_card_is_of_these_weights() -> None:
     assert inspect_weights(WEIGHTS).sha256_12 in WEIGHTS.with_suffix(".md").read_text()
 
 
+@pytest.mark.slow
 def test_a_view_is_finite_trained_and_the_same_twice() -> None:
     synthesizer = load_synthesizer("package:live-small", device="cpu")
     config = synthesizer.traits.config

@@ -220,6 +220,7 @@ def _our_flops(unet: VideoUNet) -> int:
     return counter.get_total_flops()
 
 
+@pytest.mark.slow
 def test_one_branch_at_full_size_costs_at_least_0_485_tflop_less_than_the_published_graph(full_size: Networks) -> None:
     plain, ours = _plain_flops(full_size.unet) / 1e12, _our_flops(full_size.unet) / 1e12
     assert plain == pytest.approx(6.265, abs=0.005)

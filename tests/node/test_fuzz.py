@@ -191,6 +191,7 @@ READ = ["message", "unchecked", "frame", "page", "request", "launch", "changes",
     ],
     ids=READ,
 )
+@pytest.mark.slow
 def test_what_was_tampered_with_ends_as_what_it_is_or_a_documented_error(
     tmp_path: Path,
     read: Callable[[bytes, Path], str],

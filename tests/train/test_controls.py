@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from gcd_model.geometry import to_pose
 from gcd_train.data.files import Skips
-from gcd_train.data.splits import Part, kubric_split, read_controls, read_scene_list, read_split
+from gcd_train.data.splits import Part, kubric_split, read_controls, read_scene_list, read_split, write_sweep
 from gcd_train.errors import DataError
 
 OFFICIAL = Path(__file__).parents[2].parent / "shared" / "spec" / "official"
@@ -105,6 +106,24 @@ def test_a_damaged_control_list_is_named(tmp_path: Path, sample: dict[str, objec
     path.write_text(json.dumps({"a": {"s": sample}}))
     with pytest.raises(DataError, match=rf"controls\.json.*{match}"):
         read_controls(path)
+
+
+def test_a_sweep_goes_to_the_right_from_ten_degrees_up_whatever_scenes_there_are(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.json"
+    assert write_sweep(path, ["scn00007", "scn00009"], step_deg=45.0) == 5
+    swept = read_controls(path)
+    for controls in swept.values():
+        starts = {control.start for control in controls}
+        assert [control.goal.azimuth_deg - control.start.azimuth_deg for control in controls] == pytest.approx(
+            [0.0, 45.0, 90.0, 135.0, 180.0]
+        )
+        ((start,), *_) = [starts]
+        assert (start.elevation_deg, start.radius_m) == (10.0, 15.0)
+        assert {(control.goal.elevation_deg, control.goal.radius_m) for control in controls} == {(10.0, 15.0)}
+        to_the_right = to_pose(start).inverse() @ to_pose(controls[1].goal)
+        assert to_the_right[0, 3] > 0  # x of the source camera is right
+    write_sweep(path, ["scn00009"], step_deg=45.0)
+    assert read_controls(path)["scn00009"] == swept["scn00009"]
 
 
 def test_skips_are_counted_logged_once_and_merged(caplog: pytest.LogCaptureFixture) -> None:

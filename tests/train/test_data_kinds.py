@@ -248,11 +248,11 @@ def test_clips_of_both_paths_do_not_go_together(tmp_path: Path) -> None:
 
 
 def test_a_recipe_for_the_other_path_is_refused(tmp_path: Path) -> None:
-    recipe = load_recipe("package:study-gradual-scratch")
+    recipe = load_recipe("package:study")
     data, valid = pair_folder(tmp_path / "train", "direct"), pair_folder(tmp_path / "valid", "direct", 1_000_000)
     with pytest.raises(DataError, match=r"goal in frame 0, the recipe's data\.path says frame 2"):
         opened_pairs(recipe, data, valid)
-    direct = load_recipe("package:study-direct-scratch")
+    direct = load_recipe("package:study", changes=["data.path=direct"])
     assert len(opened_pairs(direct, data, valid).clips) == 1
 
 

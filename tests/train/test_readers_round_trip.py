@@ -16,6 +16,8 @@ from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
 from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.errors import DataError
+from gcd_train.evaluation.clips import further_poses
+from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.scenes.driving.classes import class_ids
 from gcd_train.scenes.driving.world import driving_drive
 from gcd_train.scenes.renderer import Renderer, Rendering
@@ -73,6 +75,36 @@ def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
         assert np.abs(one.astype(int) - other).mean() < 12
     assert exact.visible is not None
     assert splatted.visible is not None
+
+
+def test_a_camera_that_is_drawn_for_an_exact_scene_sees_what_one_there_sees(stage_root: Path) -> None:
+    dataset, orbit = Kubric4D(stage_root), replace(MAX90, frames=CLIP)
+    pairs = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), exact=True))
+    own = [dataset.views("scn00000", time, ["view3", "view9"]) for time in (0, 1)]
+    poses = np.stack([view.world_from_camera for view in own[0]])
+    for seen, there in zip(pairs.seen_from("scn00000", (0, 1), poses), own, strict=True):
+        for one, other in zip(seen, there, strict=True):
+            assert np.abs(one.rgb.astype(int) - other.rgb).mean() < 3  # drawn with twice the samples
+            np.testing.assert_array_equal(one.world_from_camera, other.world_from_camera)
+            near = (one.depth > 0) & (other.depth < SKY_M / 2)
+            assert np.median(np.abs(one.depth[near] / other.depth[near] - 1)) < 0.03  # half a pixel apart
+    with pytest.raises(DataError, match="--exact"):
+        ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32))).seen_from("scn00000", (0,), poses)
+
+
+def test_a_method_gets_the_scenes_own_cameras_first_and_drawn_ones_then(stage_root: Path) -> None:
+    options = ClipOptions(data=[stage_root], exact=True, trajectories=1, frame_start=0, frame_skip=1)
+    clips, _ = open_clips(options, size=(1, 32, 48))
+    assert clips.cameras == 16 + 48
+    seen = clips.clip(clips.keys[0]).seen
+    assert seen.others is not None
+    poses = [views[0].world_from_camera for views in seen.others(18)]
+    np.testing.assert_array_equal(poses[:15], [views[0].world_from_camera for views in seen.others(15)])
+    np.testing.assert_allclose(poses[15:], further_poses()[:3])
+    apart = np.linalg.norm(np.array(poses)[:, None, :3, 3] - np.array(poses)[:, :3, 3], axis=-1)
+    assert apart[~np.eye(18, dtype=bool)].min() > 0.5
+    with pytest.raises(DataError, match="63 cameras beside the source"):
+        seen.others(64)
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 from gcd_model.geometry import SphericalDelta
 from gcd_train.cli.main import app
 from gcd_train.errors import RunError
+from gcd_train.evaluation.figures import all_plots, make_figure
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
-from gcd_train.evaluation.report import all_plots, make_report
+from gcd_train.evaluation.report import make_report
 from gcd_train.evaluation.runs import EvaluatedSet, gather, on_the_same_goals
 from gcd_train.evaluation.store import ClipRecord, Run, RunKeeper, RunNote
 from gcd_train.evaluation.tables import (
@@ -348,6 +349,41 @@ def test_a_report_is_written_from_records_and_kept_frames(tmp_path: Path) -> Non
     video = cv2.VideoCapture(str(next((out / "gallery").glob("*.mp4"))))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES + 7  # the last is held
     assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 4 * (47 + 4)
+
+
+@pytest.mark.parametrize(("kind", "columns"), [("failures", 3), ("ablation", 3), ("angles", 0)])
+def test_a_figure_is_one_picture_of_what_was_measured(tmp_path: Path, kind: str, columns: int) -> None:
+    out = tmp_path / "figure.png"
+    given = ["figure", kind, str(shown(tmp_path / "run")), "--out", str(out), "--clips", "2"]
+    done = CliRunner().invoke(app, given)
+    assert done.exit_code == 0, done.output
+    picture = cv2.imread(str(out))
+    if columns:
+        assert picture.shape[1] == columns * (47 + 4) + 1  # source, the model, target
+        assert int(picture[-20, 60, 0]) == 60 + FRAMES - 1  # the model's last frame
+    else:
+        assert min(picture.shape[:2]) > 300
+
+
+def test_the_clips_that_a_model_misses_most_come_first(tmp_path: Path) -> None:
+    run, drawn = shown(tmp_path / "run"), [0, 0]
+    for place, clips in enumerate((1, SCENES)):
+        make_figure("failures", [run], tmp_path / "figure.png", clips=clips)
+        drawn[place] = len(cv2.imread(str(tmp_path / "figure.png")))
+    assert drawn[1] == SCENES * drawn[0]
+    at = RunKeeper(run).views("gradual (1 step)", "scn00000.sample_00")  # the worst of all, by the records
+    for path in (at / "sample_0").iterdir():
+        assert cv2.imwrite(str(path), np.full((32, 47, 3), 99, np.uint8))
+    make_figure("failures", [run], tmp_path / "figure.png", clips=1)
+    assert int(cv2.imread(str(tmp_path / "figure.png"))[-20, 60, 0]) == 99
+
+
+@pytest.mark.parametrize(
+    ("kind", "methods"), [("views", ()), ("failures", ("nobody",)), ("failures", ("gradual (1 step)", "copy_source"))]
+)
+def test_a_figure_of_what_the_runs_do_not_hold_is_refused(tmp_path: Path, kind: str, methods: Sequence[str]) -> None:
+    with pytest.raises(RunError):
+        make_figure(kind, [shown(tmp_path / "run")], tmp_path / "figure.png", methods=methods)
 
 
 def test_a_lead_that_no_run_has_is_said_in_one_line(tmp_path: Path) -> None:

@@ -79,6 +79,7 @@ def painted_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_run_on_orbits_ends_in_a_file_that_is_steered(orbit_run: Path) -> None:
     synthesizer = load_synthesizer(orbit_run / "tiny-orbits.safetensors", device="cpu")
     traits, clips = synthesizer.traits, TinyOrbits(1, seed=4)
@@ -194,6 +195,7 @@ def assert_alike(one: Tensor | None, other: Tensor | None) -> None:
         torch.testing.assert_close(one, other)
 
 
+@pytest.mark.slow
 def test_the_network_is_told_of_orbits_what_the_synthesizer_would_tell(orbit_run: Path) -> None:
     recipe, clips = orbit_recipe(), LatentClips.open(orbit_run / "latents")
     rows = clips.rows(torch.tensor([1]), torch.tensor([2]), torch.tensor([False]), CPU)
@@ -280,7 +282,7 @@ def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
     assert len({path.parent for path in before}) == 1
     assert not (tmp_path / "first" / "latents").exists()
-    then = study("study-gradual-pretrained", f"model.weights={weights}")
+    then = study("study", f"model.weights={weights}")
     for folder in ("second", "third"):  # which share their latents
         trainer(tmp_path / folder, then, latents=latents).run("latents")
     after = {path: path.stat().st_mtime_ns for path in latents.rglob("*.safetensors")}
@@ -288,7 +290,7 @@ def test_views_start_from_what_continues_pictures(tmp_path: Path) -> None:
     assert len({path.parent for path in after}) == 2
     start = start_networks(then.model, model_config(then.model), then.seed)
     assert torch.equal(start.unet.conv_out.weight, made.networks.unet.conv_out.weight.float())
-    scratch = study("study-gradual-scratch", f"model.weights={weights}")
+    scratch = study("study", f"model.weights={weights}", "model.scratch=true")
     anew = start_networks(scratch.model, model_config(scratch.model), scratch.seed)
     assert not torch.equal(anew.unet.stem.weight, start.unet.stem.weight)
     assert torch.equal(anew.decoder.stem.weight, start.decoder.stem.weight)

@@ -299,6 +299,7 @@ def test_an_adapter_kept_apart_gives_the_same_on_its_base(lora: LoraRecipe) -> N
     assert_close(output(adapted(given(), apart)), output(networks), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_at_full_size_rank_32_is_under_two_percent_and_the_temporal_part_as_large_as_published() -> None:
     networks = empty_networks(SVD_14)
     assert sum(value.numel() for name, value in networks.named_parameters() if is_temporal(name)) == 656_076_838

@@ -113,6 +113,7 @@ def run(*words: object) -> tuple[int, str]:
     return made.exit_code, made.output
 
 
+@pytest.mark.slow
 def test_the_command_reports_and_stores_a_scale(tmp_path: Path, weights: Path) -> None:
     data = PlaneClips.make(2, width=64).write(tmp_path / "clips", 1)
     stored = tmp_path / "calibrated.safetensors"

@@ -22,8 +22,10 @@ from gcd_train.cli.common import (
 from gcd_train.data.anyview import EpisodeExport
 from gcd_train.data.cache_writer import CacheOptions, cache_job, cache_scenes
 from gcd_train.data.compact import Compaction
+from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
+from gcd_train.data.splits import write_sweep
 from gcd_train.errors import DataError
 from gcd_train.files import remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
@@ -142,6 +144,24 @@ def anyview(
         say(f"splits in {out}: {', '.join(splits)}")
     if damaged:
         raise typer.Exit(DataError.exit_code)
+
+
+@export.command()
+def sweep(
+    scenes: Annotated[Path, typer.Argument(metavar="DATA", help="Folder with scn00000 and so on.")],
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="The control list, JSON.")],
+    step_deg: Annotated[float, typer.Option(min=1.0, max=180.0, help="From one goal to the next.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Draws the azimuth of each scene's source.")] = 0,
+    limit: Limit = None,
+) -> None:
+    """The paper's study of angles as a control list: goals 0 to 180 degrees to the right of the source camera.
+
+    `gcd-train evaluate --controls FILE` measures them, `gcd-train figure angles` draws them.
+    """
+    with errors_shown():
+        names = Kubric4D(scenes).scenes[:limit]
+        count = write_sweep(out, names, step_deg=step_deg, seed=seed)
+    say(f"wrote {out}: {count} clips of each of {len(names)} scenes")
 
 
 def lerobot_command(

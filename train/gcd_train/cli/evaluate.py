@@ -23,6 +23,7 @@ from gcd_train.cli.common import (
 from gcd_train.errors import DataError, RecipeError, TrainError
 from gcd_train.evaluation.calibration import CalibrationNote, Distances, calibrate, distances, write_calibration
 from gcd_train.evaluation.clips import EvaluationSet
+from gcd_train.evaluation.figures import FigureKind, make_figure
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
 from gcd_train.evaluation.methods import EvaluateOptions, planned, run_note
@@ -96,6 +97,19 @@ def report_command(
     with errors_shown():
         path = make_report(runs, out, leads=lead or (), clips=clips, drawn=plots, command=command_line())
     typer.echo(f"wrote {path}")
+
+
+def figure_command(
+    kind: Annotated[FigureKind, typer.Argument(help="Over angles, over views given, variants beside, worst clips.")],
+    runs: Annotated[list[Path], typer.Argument(help="Folders that `gcd-train evaluate` wrote.", metavar="RUN...")],
+    out: Annotated[Path, typer.Option(help="The picture, PNG.")],
+    method: Annotated[list[str] | None, typer.Option(help="Only this one; may be repeated.")] = None,
+    clips: Annotated[int, typer.Option(min=1, help="Clips of an ablation or of failures.")] = 6,
+) -> None:
+    """Draw one figure of the paper from what was measured; nothing is measured again."""
+    with errors_shown():
+        make_figure(kind, runs, out, methods=method or (), clips=clips)
+    say(f"wrote {out}")
 
 
 def calibrate_command(

@@ -203,13 +203,18 @@ class Encodings:
         by_path = family.motion_bucket is None and family.limits is not None
         motion = family.name if by_path else None  # families with the recipe's number write the same latents
         steered = (config.camera, motion, recipe.unet.motion_bucket)
-        options = digest_of(self._latents, recipe.seed, self.clips.origin, steered, recipe.unet.loss.class_weights)
+        options = digest_of(self._latents, self._seed, self.clips.origin, steered, recipe.unet.loss.class_weights)
         return f"{autoencoder_digest(networks)}-{options}"
 
     @property
     def _latents(self) -> LatentsRecipe:
         assert self.recipe.latents is not None, "clips are encoded only if the recipe has the table"
         return self.recipe.latents
+
+    @property
+    def _seed(self) -> int:
+        """Of the draws; without any, runs that differ in seed alone share their latents."""
+        return self.recipe.seed if self._latents.augmentation or self._latents.sample else 0
 
     def _description(self, identity: str) -> LatentsMeta:
         config, count = self.config, len(self.clips)
@@ -228,7 +233,7 @@ class Encodings:
     def _encoded(self, networks: Networks, conditioner: Conditioner, number: int, flips: int) -> dict[str, Tensor]:
         """One clip's row of every array."""
         sample = self.clips.sample(number)
-        path, draws = sample.trajectory, Draws(self.recipe.seed, "latents", number, self.precision.device)
+        path, draws = sample.trajectory, Draws(self._seed, "latents", number, self.precision.device)
         source, target = (self.precision.frames(to_network(side)) for side in (sample.source, sample.target))
         sources, targets = ([side, side.flip(-1)][:flips] for side in (source, target))
         encoders, recipe = FrozenEncoders(networks=networks, at_once=len(source)), self._latents
@@ -263,7 +268,7 @@ class Encodings:
         latents: [N, T, C, h, w]; the first, middle and last frame of each are decoded, each by itself.
         """
         decoder = self.precision.placed(networks.decoder)
-        draws = Draws(self.recipe.seed, "sensitivity", 0, self.precision.device)
+        draws = Draws(self._seed, "sensitivity", 0, self.precision.device)
         frames = latents[:, [0, latents.shape[1] // 2, -1]].flatten(0, 1) / networks.config.vae.scale
         rows = self.precision.frames(frames)
         plain = decoder(rows, None)

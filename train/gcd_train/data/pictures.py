@@ -190,6 +190,20 @@ class ExactPictures(Pictures):
             ]
         return made
 
+    def seen_from(self, scene: str, numbers: Sequence[int], poses: Doubles) -> list[list[SceneView]]:
+        """What cameras that stand still would see of a scene at these times: a view of each for every time.
+
+        poses: f64 [C, 4, 4], world_from_camera.
+        """
+        folder, lens = self._dataset.folder(scene), render_lens(self._dataset.lens(scene), self._width, self._height)
+        still, moved = frames_of(folder, list(numbers), lens), geometry_poses(folder, numbers)
+        cameras = {f"drawn{place}": moved @ pose for place, pose in enumerate(poses)}
+        seen = [[] for _ in numbers]
+        for step, name, rendering in self._own_renderer().views(still, cameras):
+            pose = poses[int(name.removeprefix("drawn"))]
+            seen[step].append(_view(rendering.rgb, rendering.depth, pose, lens))
+        return seen
+
     def _own_renderer(self) -> "Renderer":
         """Of this process: an OpenGL context does not survive a fork."""
         if self._renderer is None or self._renderer[0] != os.getpid():
@@ -234,6 +248,12 @@ class ViewPairs(DrawnSamples):
         """
         draw = self.sampling.controlled(control, self.dataset.frames(scene), self.dataset.fps)
         return self._pictures.sample(scene, draw)
+
+    def seen_from(self, scene: str, numbers: Sequence[int], poses: Doubles) -> list[list[SceneView]]:
+        """See ExactPictures; of scenes that have no geometry there is nothing to draw. Raises DataError."""
+        if not isinstance(self._pictures, ExactPictures):
+            raise DataError(f"{scene} is drawn from points, which show no more than its own cameras; use --exact")
+        return self._pictures.seen_from(scene, numbers, poses)
 
     def _made(self, number: int, random: np.random.Generator) -> Sample:
         scene, _ = self._place(number)

@@ -20,6 +20,7 @@ from gcd_train.data.dataset4d import layout_of, scene_number
 from gcd_train.data.files import Skips
 from gcd_train.data.paths import Control, Controls, OrbitSampling, Sampling, generator
 from gcd_train.errors import DataError, RecipeError
+from gcd_train.files import write_whole
 
 Part = Literal["train", "val", "test"]
 
@@ -218,6 +219,33 @@ def _camera(numbers: tuple[float, float, float] | None) -> Spherical | None:
         return None
     azimuth_deg, elevation_deg, radius_m = numbers
     return Spherical(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
+
+
+_SWEPT_ELEVATION_DEG, _SWEPT_RADIUS_M = 10.0, 15.0
+
+
+def write_sweep(path: Path, scenes: Sequence[str], *, step_deg: float, seed: int = 0) -> int:
+    """The control list of the paper's study of angles; gives how many clips a scene has.
+
+    Each scene is seen from an elevation of 10 degrees, 15 m away and an azimuth that follows from seed and scene, and
+    the camera goes 0, `step_deg` and so on to 180 degrees to its right, for which `read_controls` has a sample each.
+    Source: Van Hoorick et al. 2024 (GCD), appendix B.2.
+    """
+    turns = np.arange(0.0, 180.0 + 1e-6, step_deg)
+    listed: dict[str, dict[str, _Entry]] = {}
+    for scene in scenes:
+        azimuth_deg = float(generator(seed, scene_number(scene)).uniform(0.0, 360.0))
+        listed[scene] = {
+            f"sample_{place:02d}": _Entry(
+                frame_start=_RELEASED_START,
+                frame_skip=_RELEASED_SKIP,
+                spherical_start=(azimuth_deg, _SWEPT_ELEVATION_DEG, _SWEPT_RADIUS_M),
+                spherical_end=(azimuth_deg + turn, _SWEPT_ELEVATION_DEG, _SWEPT_RADIUS_M),
+            )
+            for place, turn in enumerate(turns.tolist())
+        }
+    write_whole(path, msgspec.json.format(msgspec.json.encode(listed)))
+    return len(turns)
 
 
 PAPER_ELEVATION_DEG = 5.0

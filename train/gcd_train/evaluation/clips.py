@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
-from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, to_pose
+from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, sphere_poses, to_pose
 from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.files import ZIP_FAULTS
 from gcd_train.data.pairs import PairedClip, PairedClips
@@ -318,12 +318,18 @@ class SceneSet(EvaluationSet):
         return np.stack([nearest_resized(row, self.width, self.height) for row in rows])
 
     def _others(self, scene: str, times: Sequence[int], count: int) -> Sequence[Sequence[SceneView]]:
-        """See SourceClip. The farthest from the source first, then always the one farthest from all before."""
+        """See SourceClip. The farthest from the source first, then always the one farthest from all before; the scene's
+        own cameras before those that are drawn for it."""
         names = [name for name in self.dataset.cameras if name != self.dataset.source_camera]
-        if not 0 <= count <= len(names):
+        if not 0 <= count < self.cameras:
             raise DataError(
-                f"{scene} has {len(names)} cameras beside the source, a method wants {count}; give it fewer views"
+                f"{scene} has {self.cameras - 1} cameras beside the source, a method wants {count}; give it fewer views"
             )
+        drawn = count - len(names)
+        if drawn > 0:
+            each = self.pairs.seen_from(scene, times, further_poses()[:drawn])
+            further = [[views[place] for views in each] for place in range(drawn)]
+            return [*self._others(scene, times, len(names)), *further]
         first = self.dataset.views(scene, times[0], [self.dataset.source_camera, *names])
         at, order = np.stack([view.world_from_camera[:3, 3] for view in first]), [0]
         while len(order) <= count:
@@ -344,6 +350,22 @@ class SceneSet(EvaluationSet):
             )
 
         return [[resized(views[place]) for views in each] for place in range(count)]
+
+
+FURTHER_CAMERAS = 48
+"""Cameras that are drawn for an exact scene on Kubric-4D's stage where a method wants more than it has."""
+_GOLDEN, _SILVER = 0.6180339887498949, 0.4142135623730951  # shares of a turn, and of the height, from one to the next
+
+
+def further_poses() -> NDArray[np.float64]:
+    """Where these stand, world_from_camera [48, 4, 4], 15 m from the middle of the stage as its own cameras, up to 50
+    degrees high: as many to each area of the sphere, and any first few of them all around.
+    """
+    numbers = np.arange(FURTHER_CAMERAS)
+    azimuths = 360.0 * (numbers * _GOLDEN % 1.0)
+    elevations = np.rad2deg(np.arcsin(np.sin(np.deg2rad(50.0)) * (numbers * _SILVER % 1.0)))
+    views = np.stack([azimuths, elevations, np.full(FURTHER_CAMERAS, 15.0)], axis=-1)
+    return sphere_poses(torch.from_numpy(views)).numpy()
 
 
 def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:

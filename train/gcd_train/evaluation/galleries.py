@@ -137,8 +137,13 @@ def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None
     blocks = [_row(label, strip) for label, rows in clips for strip in rows]
     if not blocks:
         raise RunError(f"there is nothing to show in {out}; evaluate with --views all")
-    width = max(block.shape[1] for block in blocks)
-    write_whole(out, png(np.concatenate([_padded(block, len(block), width) for block in blocks])))
+    write_whole(out, png(stacked_sheet(blocks)))
+
+
+def stacked_sheet(rows: Sequence[Pictures]) -> Pictures:
+    """Rows of pictures one below the other, white where one is shorter."""
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate([_padded(row, len(row), width) for row in rows])
 
 
 def write_video(rows: Sequence[Strip], fps: float, out: Path) -> bool:

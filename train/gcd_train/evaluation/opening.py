@@ -32,6 +32,7 @@ from gcd_train.data.paths import (
     KUBRIC_FRAMES,
     MAX90,
     MAX180,
+    Controls,
     DrivingSampling,
     FrameSampling,
     OrbitSampling,
@@ -52,7 +53,7 @@ from gcd_train.data.splits import (
 )
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.anyview import EpisodeSet
-from gcd_train.evaluation.clips import EvaluationSet, PairedSet, SceneSet, chosen
+from gcd_train.evaluation.clips import FURTHER_CAMERAS, EvaluationSet, PairedSet, SceneSet, chosen
 
 ProtocolName: TypeAlias = Literal["paper", "release", "anyviewbench"]
 SAMPLES: dict[ProtocolName, int] = {"paper": 4, "release": 2, "anyviewbench": 1}
@@ -261,7 +262,7 @@ def _open_scenes(
         identity=_identity(folder, scenes, cuts, options.controls),
         classes=tuple(data.ontology.classes) if painted and data.ontology is not None else (),
         painted=painted,
-        cameras=len(data.cameras),
+        cameras=len(data.cameras) + (FURTHER_CAMERAS if orbits and options.exact else 0),
     )
     return clips, tuple(notes.lines())
 
@@ -278,13 +279,20 @@ def _controls(options: ClipOptions, scenes: Sequence[str], sampling: Sampling) -
     elif options.protocol == "release":
         listed = released_controls(scenes, orbit=orbits)
     return SceneControls(
-        clips=options.trajectories or (4 if options.protocol == "paper" and orbits else 1),
+        clips=options.trajectories or _clips_of(options.protocol, listed, orbits=orbits),
         sampling=sampling,
         seed=options.seed,
         listed=listed,
         start=options.frame_start,
         skip=options.frame_skip,
     )
+
+
+def _clips_of(protocol: ProtocolName, listed: Controls | None, *, orbits: bool) -> int:
+    """How many clips of a scene there are by default: in the paper's protocol all that are listed."""
+    if protocol == "release" or (listed is None and not orbits):
+        return 1
+    return 4 if listed is None else max(map(len, listed.values()))
 
 
 def _sampling(options: ClipOptions, clip: int, *, orbits: bool, gradual: bool) -> Sampling:

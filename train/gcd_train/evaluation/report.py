@@ -1,23 +1,19 @@
 """The report as a folder: `report.md`, its tables as CSV, plots, galleries and videos."""
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
-from math import inf, isnan, nan
+from math import isnan
 from pathlib import Path
 from statistics import fmean
-from typing import Any
-
-import numpy as np
 
 from gcd_train.errors import RunError
 from gcd_train.evaluation.anyview import benchmark_table, published_table
+from gcd_train.evaluation.figures import all_plots, draw
 from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, write_video
 from gcd_train.evaluation.paper import is_model
 from gcd_train.evaluation.runs import EvaluatedSet, gather, on_the_same_goals
-from gcd_train.evaluation.statistics import FEW_SCENES, SEED, Interval, Span
-from gcd_train.evaluation.store import Region, Run, folder_name
+from gcd_train.evaluation.statistics import FEW_SCENES, SEED, Span
+from gcd_train.evaluation.store import Run, folder_name
 from gcd_train.evaluation.tables import (
     NOTHING,
     Difference,
@@ -38,7 +34,7 @@ from gcd_train.evaluation.tables import (
     to_markdown,
 )
 from gcd_train.files import write_whole
-from gcd_train.pictures import new_figure, require_matplotlib, save
+from gcd_train.pictures import require_matplotlib
 
 _SPANS: tuple[Span, ...] = ("2-last", "last")
 """Of tables; the released script's figures are over all frames, so these come first where a run used it."""
@@ -209,102 +205,3 @@ class _Writer:
         """Write a file; gives the link to it."""
         write_whole(self.out / self.place / name, text.encode())
         return f"[{Path(name).name}]({self.place / name})"
-
-
-ANGLE_STEP_DEG = 15.0
-_MOST_ANGLES = 13  # so many different ones are shown as they are
-_HEXPLANE = re.compile(r"hexplane[ _-]?(\d+)", re.IGNORECASE)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Point:
-    """x: where on the axis, NaN for a level right across. y: the figure there. clips: that it is of."""
-
-    x: float
-    y: Interval
-    clips: int
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Plot:
-    """name: of its files. title, across, up: what it shows. curves: points by the name of their line."""
-
-    name: str
-    title: str
-    across: str
-    up: str
-    curves: dict[str, list[Point]]
-
-
-def all_plots(of: EvaluatedSet) -> tuple[Plot, ...]:
-    """All that the records are enough for."""
-    return tuple(plot for plot in (error_by_angle(of), ssim_by_views(of)) if plot.curves)
-
-
-def error_by_angle(of: EvaluatedSet) -> Plot:
-    """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; no curve on one path for all.
-
-    Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
-    """
-    curves: dict[str, list[Point]] = {}
-    for method in of.methods:
-        turned = {each.key: abs(each.change[0]) for each in method.records if each.change is not None}
-        many, groups = len({round(angle, 1) for angle in turned.values()}) > _MOST_ANGLES, dict[float, list[str]]()
-        for key, angle in turned.items():  # as it is or, where many differ, in the middle of its step
-            middle = (min(angle, 179.999) // ANGLE_STEP_DEG + 0.5) * ANGLE_STEP_DEG
-            groups.setdefault(middle if many else round(angle, 1), []).append(key)
-        points = [
-            Point(x=x, y=method.sums("last", keys=keys).interval("psnr_db"), clips=len(keys))
-            for x, keys in sorted(groups.items())
-        ]
-        known = [point for point in points if point.y.known]
-        curves |= {method.name: known} if len(known) > 1 else {}
-    across = "azimuth turned by, degrees"
-    return Plot(name="psnr_by_angle", title="Last frame, all pixels", across=across, up="PSNR, dB", curves=curves)
-
-
-def ssim_by_views(of: EvaluatedSet) -> Plot:
-    """SSIM over the number of views that HexPlane is given; every other method as a level. No curve without HexPlane.
-
-    Source: GCD, section 5: how many input views a reconstruction needs to come near.
-    """
-    views = {method.name: int(m[1]) for method in of.methods if (m := _HEXPLANE.search(method.name))}
-    regions: tuple[Region, ...] = ("all", "occluded")
-    curves: dict[str, list[Point]] = {}
-    for region, method in product(regions, sorted(of.methods, key=lambda m: views.get(m.name, inf))):
-        name = "HexPlane" if method.name in views else method.name
-        y = method.sums(region=region).interval("ssim")
-        if y.known and views and (name == "HexPlane" or region == "all"):
-            point = Point(x=views.get(method.name, nan), y=y, clips=len(method.records))
-            curves.setdefault(f"{name}, {region}", []).append(point)
-    if all(isnan(curve[0].x) for curve in curves.values()):  # levels alone
-        curves = {}
-    title = "HexPlane, frames 2 to the last"
-    return Plot(name="ssim_by_views", title=title, across="views given", up="SSIM", curves=curves)
-
-
-_SIZE_IN = (7.2, 4.4)
-_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
-
-
-def draw(plot: Plot, out: Path) -> None:
-    """One PNG: lines with 95 % intervals, levels dashed. Raises RenderError without matplotlib."""
-    figure = new_figure(*_SIZE_IN)
-    axes = figure.add_subplot()
-    for number, (name, curve) in enumerate(plot.curves.items()):
-        x, y, colour = [point.x for point in curve], [point.y.value for point in curve], f"C{number % 10}"
-        if isnan(x[0]):
-            axes.axhline(y[0], linestyle="--", linewidth=1.0, color=colour, label=name)
-            continue
-        bounds = np.array([(each.value - each.low, each.high - each.value) for each in (point.y for point in curve)])
-        yerr, mark = np.nan_to_num(bounds).clip(0.0).T, _MARKS[number % len(_MARKS)]
-        style: dict[str, Any] = {"marker": mark, "color": colour, "markersize": 4, "linewidth": 1.2}
-        axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=name, **style)
-    axes.set_title(plot.title, fontsize=10, loc="left")
-    places = sorted({point.x for curve in plot.curves.values() for point in curve if not isnan(point.x)})
-    axes.set(xlabel=plot.across, ylabel=plot.up, xticks=places, xlim=(places[0] - 1, places[-1] + 1))
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
-    figure.tight_layout()
-    save(figure, out)
