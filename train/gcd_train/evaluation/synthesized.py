@@ -50,7 +50,8 @@ class SynthesizedViews:
     def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions = _AS_SHIPPED) -> Self:
         """A model that is measured on these clips. Raises DataError where they do not fit together."""
         _require_fit(weights(), clips)
-        made, traits = cls(weights=weights, options=options, classes=len(clips.classes) or None), weights().traits
+        traits, count = weights().traits, len(clips.classes) or None
+        made = cls(weights=weights, options=options, classes=count, privileged=traits.splat == "given")
         if not made.paints_classes or traits.classes:
             return made
         if not clips.classes:
@@ -100,6 +101,10 @@ class SynthesizedViews:
         own = Clip(video=to_network(clip.source), fps=clip.fps)
         if synthesizer.traits.live:
             own = replace(own, mount=clip.cameras.mount, lens=clip.cameras.source)
+        elif synthesizer.traits.splat != "none":
+            own = replace(own, lens=clip.cameras.source)
+        if self.privileged:
+            own = replace(own, depth=torch.from_numpy(clip.source_depth))
         features = synthesizer.encode(own)
         return lambda options: synthesizer.render(features, [path], options)[0]
 
