@@ -131,6 +131,12 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
             raise RecipeError(
                 f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
             )
+    beside = ((each, each.beside(clips.keys)) for each in methods if isinstance(each, SavedFrames))
+    notes += tuple(
+        f"{each.folder} holds frames of {len(names)} clips more than the set, which are not measured, first {names[0]}"
+        for each, names in beside
+        if names
+    )
     return clips, tuple(methods), notes
 
 

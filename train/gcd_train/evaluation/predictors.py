@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -291,6 +291,15 @@ class SavedFrames:
             raise DataError(f"{self.folder} cannot be read ({error}); give NAME=FOLDER") from error
         more = {"privileged": "yes"} if self.privileged else {}
         return {FRAMES_IN: str(self.folder), "digest": digest.hexdigest()[:12], **more}
+
+    def beside(self, keys: Collection[str]) -> list[str]:
+        """Names of clips that lie in the folder and are not among these; outputs of the paper's script aside."""
+        named = {path.stem if path.suffix == _VIDEO else path.name: path for path in self.folder.iterdir()}
+        return sorted(
+            name
+            for name, path in named.items()
+            if name not in keys and not _RELEASED.fullmatch(name) and (_is_draw(path) or any(_draws_in(path, _SAMPLE)))
+        )
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor; each sample that was saved is a draw.
