@@ -215,7 +215,7 @@ def test_figures_of_other_pixels_are_marked_and_never_subtracted() -> None:
     assert targets_apart(part[0], records("a")[0]) != ""
     (main, _), text = main_tables(of), to_markdown(region_table(of))
     assert [row.method for row in main.rows] == ["b †", "a"]
-    assert (f"b shows the middle 32 x 32 of a frame's {of.note.width} x {of.note.height} pixels" in text) is True
+    assert f"† Measured on the middle 32 x 32 of a frame's {of.note.width} x {of.note.height} pixels" in text
 
 
 def test_the_row_of_frames_made_elsewhere_names_their_source() -> None:

@@ -20,8 +20,8 @@ _LINE = "———"
 _OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
 _BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
 _CROPPED = (
-    "† {} shows the middle {} x {} of a frame's {} x {} pixels and is measured there alone: other pixels than of the "
-    "rows without †, so no difference to those is drawn."
+    "† Measured on the middle {} x {} of a frame's {} x {} pixels, which is all that is shown: {}. These are other "
+    "pixels than those of other rows, so no difference to them is drawn."
 )
 _ELSEWHERE = "{}: made elsewhere, read from {} (digest {})."
 _COPIED = "mIoU of {}: these class maps are made from the source's exact ones, which no model is given."
@@ -241,7 +241,7 @@ def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[s
     notes = [f"{span[0].upper()}{span[1:]} of {len(of.clips)} clips of {of.scenes} scenes. {_BRACKETS}"]
     for crop in dict.fromkeys(each.crop for each in of.methods if each.crop is not None):
         daggers = " and ".join(each.name for each in of.methods if each.crop == crop)
-        notes.append(_CROPPED.format(daggers, crop[2], crop[3], of.note.width, of.note.height))
+        notes.append(_CROPPED.format(crop[2], crop[3], of.note.width, of.note.height, daggers))
     for name, details in ((each.name, each.details) for each in of.methods if FRAMES_IN in each.details):
         notes.append(_ELSEWHERE.format(name, details[FRAMES_IN], details.get("digest", "unknown")))
     copied = [each.name for each in of.methods if each.details.get("baseline") in FROM_EXACT_CLASSES]

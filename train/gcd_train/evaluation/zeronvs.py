@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ _GAIN, _REACH = 0.5, 10.0
 _HEADS, _HEAD_WIDTH = 8, 64  # of the U-Net, and of a head of the image encoder: no shape of a tensor tells these
 _CLIP_MEAN, _CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 _UNET, _VAE = "model.diffusion_model.", "first_stage_model."
+_CONVERTERS = "diffusers.loaders.single_file_utils"
 _IMAGE, _PROJECTION = "cond_stage_model.model.visual.", "cc_projection."
 
 
@@ -84,9 +86,7 @@ class ZeroNvsNetworks:
             float32 [3, H, W] in [0, 1], on the CPU.
         Source: DDIM (Song et al. 2021, Eq. 12), classifier-free guidance (Ho and Salimans 2022).
         """
-        from diffusers import DDIMScheduler
-
-        scheduler = DDIMScheduler(
+        scheduler = _library("diffusers").DDIMScheduler(
             beta_start=0.00085,
             beta_end=0.012,
             beta_schedule="scaled_linear",
@@ -225,8 +225,6 @@ def open_zeronvs(path: str, device: str, dtype: str | None) -> ZeroNvsNetworks:
     place, name = placement(device, None, dtype, live=False)
     try:
         parts = {"U-Net": _unet(tensors), "autoencoder": _vae(tensors), "image encoder": _image_encoder(tensors)}
-    except ImportError as error:
-        raise RecipeError(f"{ZERONVS} needs diffusers and transformers: pip install 'gcd-node[zeronvs]'") from error
     except (KeyError, AttributeError, TypeError, ValueError) as error:  # what converters raise where a tensor is absent
         raise CheckpointError(f"{path} lacks tensors of ZeroNVS, for one {error}; fetch it again") from error
     token, inputs = tensors[f"{_PROJECTION}weight"].shape
@@ -237,10 +235,19 @@ def open_zeronvs(path: str, device: str, dtype: str | None) -> ZeroNvsNetworks:
         wrong = [key for key, blank in blanks.items() if key not in weights or weights[key].shape != blank.shape]
         if wrong:
             raise CheckpointError(f"{path}: the {part} lacks {wrong[0]}, or has it in another shape; fetch it again")
-        network.load_state_dict(weights, assign=True)
-        network.eval().requires_grad_(False).to(place, torch.float32)
+        kind = precision(name) if part == "U-Net" else torch.float32
+        network.load_state_dict({key: weights[key].to(place, kind) for key in blanks}, assign=True)
+        network.eval().requires_grad_(False).to(place)
     unet, vae, image_encoder = (network for network, _ in list(parts.values())[:3])
-    return ZeroNvsNetworks(unet=unet.to(precision(name)), vae=vae, image_encoder=image_encoder, projection=projection)
+    return ZeroNvsNetworks(unet=unet, vae=vae, image_encoder=image_encoder, projection=projection)
+
+
+def _library(name: str) -> Any:
+    """A module of the extra. Raises RecipeError where it is not installed."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise RecipeError(f"{ZERONVS} needs {name}: pip install 'gcd-node[zeronvs]' ({error})") from error
 
 
 Part = tuple[nn.Module, Mapping[str, Tensor]]
@@ -253,9 +260,6 @@ def _of(tensors: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
 
 def _unet(tensors: Mapping[str, Tensor]) -> Part:
     """With the moving averages of the weights where the file has them, as its authors sample."""
-    from diffusers import UNet2DConditionModel
-    from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
-
     plain = {name: tensor for name, tensor in tensors.items() if name.startswith(_UNET)}
     averages = {name: "model_ema." + name.removeprefix("model.").replace(".", "") for name in plain}
     if all(name in tensors for name in averages.values()):
@@ -265,7 +269,7 @@ def _unet(tensors: Mapping[str, Tensor]) -> Part:
         widths.append(plain[halving].shape[0])
     widths.append(plain[f"{_UNET}middle_block.0.in_layers.0.weight"].shape[0])
     with torch.device("meta"):
-        network = UNet2DConditionModel(
+        network = _library("diffusers").UNet2DConditionModel(
             in_channels=8,
             block_out_channels=tuple(widths),
             down_block_types=(*("CrossAttnDownBlock2D",) * (len(widths) - 1), "DownBlock2D"),
@@ -273,25 +277,22 @@ def _unet(tensors: Mapping[str, Tensor]) -> Part:
             cross_attention_dim=tensors[f"{_PROJECTION}weight"].shape[0],
             attention_head_dim=_HEADS,  # diffusers' name for their number
         )
-    return network, convert_ldm_unet_checkpoint(plain, network.config)
+    return network, _library(_CONVERTERS).convert_ldm_unet_checkpoint(plain, network.config)
 
 
 def _vae(tensors: Mapping[str, Tensor]) -> Part:
-    from diffusers import AutoencoderKL
-    from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
-
     weights, widths = {name: tensor for name, tensor in tensors.items() if name.startswith(_VAE)}, list[int]()
     while (block := f"{_VAE}encoder.down.{len(widths)}.block.0.conv2.weight") in weights:
         widths.append(weights[block].shape[0])
     with torch.device("meta"):
-        network = AutoencoderKL(
+        network = _library("diffusers").AutoencoderKL(
             block_out_channels=tuple(widths),
             down_block_types=("DownEncoderBlock2D",) * len(widths),
             up_block_types=("UpDecoderBlock2D",) * len(widths),
             layers_per_block=2,
             latent_channels=4,
         )
-    return network, convert_ldm_vae_checkpoint(weights, network.config)
+    return network, _library(_CONVERTERS).convert_ldm_vae_checkpoint(weights, network.config)
 
 
 _LAYERS = {
@@ -305,8 +306,6 @@ _LAYERS = {
 
 def _image_encoder(tensors: Mapping[str, Tensor]) -> Part:
     """CLIP's image tower under the names of its first publication (Radford et al. 2021)."""
-    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
-
     given, inner = _of(tensors, _IMAGE), "vision_model."
     weights = {
         f"{inner}embeddings.class_embedding": given["class_embedding"],
@@ -326,7 +325,7 @@ def _image_encoder(tensors: Mapping[str, Tensor]) -> Part:
             joined = given[f"{old}attn.in_proj_{kind}"].chunk(3)
             weights |= {f"{new}self_attn.{each}_proj.{kind}": part for each, part in zip("qkv", joined, strict=True)}
     width, _, patch, _ = given["conv1.weight"].shape
-    config = CLIPVisionConfig(
+    config = _library("transformers").CLIPVisionConfig(
         hidden_size=width,
         intermediate_size=given["transformer.resblocks.0.mlp.c_fc.weight"].shape[0],
         num_hidden_layers=layers,
@@ -337,7 +336,7 @@ def _image_encoder(tensors: Mapping[str, Tensor]) -> Part:
         hidden_act="quick_gelu",
     )
     with torch.device("meta"):
-        network = CLIPVisionModelWithProjection(config)
+        network = _library("transformers").CLIPVisionModelWithProjection(config)
     places = torch.arange(len(given["positional_embedding"]))[None]
     network.vision_model.embeddings.register_buffer("position_ids", places, persistent=False)
     return network, weights
