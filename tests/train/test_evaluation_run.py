@@ -322,7 +322,7 @@ def test_frames_of_a_method_that_was_given_more_are_starred(tmp_path: Path) -> N
         (["--methods", "copy_source", "--svd", "random:svd"], 78, "--svd is for vanilla_svd"),
         (["--methods", "copy_source", "--zeronvs-scale", "5"], 78, "--zeronvs-scale is for zeronvs"),
         (["--methods", "zeronvs", "--zeronvs", "zeronvs.ckpt"], 78, "zeronvs wants its weights"),
-        (["--methods", "zeronvs", "--zeronvs", "no.ckpt", "--zeronvs-scale", "5"], 65, "no.ckpt"),
+        (["--methods", "zeronvs", "--zeronvs", "no.ckpt", "--zeronvs-scale", "5"], 78, "no.ckpt"),
         (["--methods", "vanilla_svd", "--svd", "random:driving"], 78, "random:driving is of the family driving"),
         (["--methods", "copy_source", "--weights", "random:driving", "--weights", "b"], 78, "got random:driving and b"),
         (["--methods", "copy_source,hexplane_2"], 78, "hexplane_2 wants 2 cameras, and these clips have the source"),
