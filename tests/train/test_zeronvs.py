@@ -13,6 +13,7 @@ from driving_plane import PlaneClips, seen_of
 from made_records import note, record
 from torch import Tensor
 
+from gcd_model.diffusion import unit_noise
 from gcd_model.errors import CheckpointError
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.clips import PairedSet
@@ -249,8 +250,6 @@ def test_camera_numbers_are_those_calculated_by_hand() -> None:
 def test_a_view_is_the_one_calculated_by_hand(networks: ZeroNvsNetworks) -> None:
     random = torch.Generator().manual_seed(1)
     picture, camera = torch.rand(3, SIZE, SIZE, generator=random) * 2 - 1, torch.randn(19, generator=random)
-    from gcd_model.diffusion import unit_noise
-
     steps = torch.Generator().manual_seed(7)
     first = unit_noise((1, 4, SIZE // 8, SIZE // 8), 7)
     noises = [first, *(torch.randn(first.shape, generator=steps) for _ in range(STEPS))]
