@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
@@ -18,7 +17,7 @@ from gcd_train.data.sample import to_network
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import EvaluationSet, names_of
 from gcd_train.evaluation.metrics import NO_CLASS
-from gcd_train.evaluation.predictors import CameraPair, OpenedWeights, Prediction, SourceClip
+from gcd_train.evaluation.predictors import CameraPair, OpenedWeights, Prediction, SourceClip, fitted, middle, resized
 from gcd_train.evaluation.tables import counted
 
 VANILLA_SVD = "vanilla_svd"
@@ -160,13 +159,14 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
 class VanillaSVD:
     """A video out of the first frame, for each draw from noise of its own.
 
-    The frame is stretched to the size the network was trained at, and what comes out is stretched back: nothing is
-    cropped, so that all of the target is measured.
+    The middle of the frame, of the shape the network was trained at, is resized to that size, as in the paper. What
+    comes out is resized to the same part of the target and measured there, in the target's own pixels; the paper
+    resized its targets to 576 x 1024 instead.
 
     weights: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
         the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
         the clip's key. details: see Predictor.
-    Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
+    Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD".
     """
 
     weights: OpenedWeights
@@ -186,19 +186,20 @@ class VanillaSVD:
                 f"{traits.name} makes {traits.config.frames} frames, {clip.key or 'a clip'} has {frames}; evaluate on "
                 "shorter clips"
             )
-        height, width = clip.cameras.target.height, clip.cameras.target.width
-        features = self._features(clip)
+        height, width = self.size or (traits.config.height, traits.config.width)
+        features, lens = self._features(clip, height, width), clip.cameras.target
+        crop = middle(lens, width / height)
+        size = (lens.height, lens.width) if crop is None else (crop[3], crop[2])
         draws = [
-            Prediction(video=_stretched(self._draw(features, clip.key, number), height, width)[:frames])
+            Prediction(video=resized(self._draw(features, clip.key, number), *size)[:frames], crop=crop)
             for number in range(self.samples)
         ]
         return replace(draws[0], more=tuple(draws[1:]))
 
-    def _features(self, clip: SourceClip) -> SourceFeatures:
-        """Of the first frame, encoded once, for all frames."""
+    def _features(self, clip: SourceClip, height: int, width: int) -> SourceFeatures:
+        """Of the first frame at this size, encoded once, for all frames."""
         config = self.weights().traits.config
-        height, width = self.size or (config.height, config.width)
-        first = _stretched(to_network(clip.source[:1]), height, width, low=-1.0)
+        first = fitted(to_network(clip.source[:1]), height, width)
         noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(clip.key)))
         made = self.weights().encode(Clip(video=first, fps=clip.fps), noise)
         tokens = None if made.tokens is None else made.tokens.repeat(config.frames, 1)
@@ -214,11 +215,3 @@ class VanillaSVD:
 
     def _seed(self, name: str) -> int:
         return int.from_bytes(hashlib.sha256(f"{self.seed}:{name}".encode()).digest()[:6])
-
-
-def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> Tensor:
-    """[T, 3, ...] at another size, within low..1."""
-    if pictures.shape[-2:] == (height, width):
-        return pictures
-    resized = F.interpolate(pictures, size=(height, width), mode="bicubic", align_corners=False, antialias=True)
-    return resized.clamp(low, 1.0)
