@@ -8,8 +8,8 @@ What the paper leaves open is from
     Zero-1-to-3, which it was made from (issue 86 of cvlab-columbia/zero123): unscaled source latents, and nothing but
     zeros as the condition that guidance leads away from;
     its users' code and threestudio, which it was made with: cameras with OpenGL's axes.
-Assumed: each frame has noise of its own, as the paper made frames one at a time; CLIP sees pictures resized bicubically,
-corner on corner.
+Assumed: each frame has noise of its own, as the paper made frames one at a time; CLIP's pictures are resized
+bicubically, corner on corner.
 """
 
 import hashlib
