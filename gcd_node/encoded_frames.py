@@ -96,7 +96,7 @@ class EncodedFrames:
             video=torch.from_numpy(to_clip_tensor(frame.image[None])),
             fps=window.fps,
             mount=context.mount,
-            lens=context.intrinsics if context.traits.live else None,
+            lens=context.intrinsics if context.traits.live or context.traits.splat != "none" else None,
             depth=None if depth is None else torch.from_numpy(depth)[None],
             odometry=self._odometry(frame, window.epoch),
         )

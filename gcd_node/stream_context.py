@@ -81,10 +81,16 @@ def prepare_stream(
         before: of the same activation, if the source has changed in mid-stream. Its calibration file is not read again;
             one for another shape, which cannot tell what the camera keeps of it now, is left out instead of refused.
     Raises:
-        ConfigError: a frame rate the source cannot give; a source pose in words the model does not know; pictures that
-            are too small; a calibration that is unusable, for other pictures, or stated beside hfov_deg; a depth
-            network that cannot be used; in strict mode, a rate or field of view the model was not trained for.
+        ConfigError: weights that want depth; a frame rate the source cannot give; a source pose in words the model does
+            not know; pictures that are too small; a calibration that is unusable, for other pictures, or stated beside
+            hfov_deg; a depth network that cannot be used; in strict mode, a rate or field of view the model was not
+            trained for.
     """
+    if traits.splat == "given":
+        raise ConfigError(
+            f"[model] weights: {traits.name} wants the depth of every frame, which only the live model is given here; "
+            'take weights that were trained with model.splat = "estimated"'
+        )
     fps, is_foreign_rate = _window_fps(config, traits, source)
     lens = _lens_in_use(config, source, before)
     fit = _fit(config, traits, source, None if before and lens and not lens.fits(source.width, source.height) else lens)

@@ -5,7 +5,8 @@
 #
 #   launch/small-study.sh [FOLDER [PART ...]]    FOLDER: for data, latents, trainings, evaluations, report (runs/small-study)
 #
-#   PART     driving  gradual against direct, pretrained against scratch, and baselines, on pairs of the driving world
+#   PART     driving  gradual against direct, pretrained against scratch, with the source's points shown (exact or estimated
+#                     depth) against without, and baselines, on pairs of the driving world
 #            drop     the same and goals up to 90 against 180 degrees, on scenes in Kubric-4D's layout
 #            report   what is found, of all that was measured by then
 #            by default all of them
@@ -52,7 +53,7 @@ learned() { # NAME RECIPE FOLDER-OF-DATA [PART-OF-IT] [OPTION ...]: a training, 
 }
 
 driving() {
-  local data=$ROOT/data path start seed name first=study-pretrain
+  local data=$ROOT/data path start splat variant seed name first=study-pretrain
   for path in gradual direct; do
     gcd_train generate driving --path "$path" --out "$data/train/$path" --clips "$CLIPS" "${PAIRS[@]}"
     gcd_train generate driving --path "$path" --out "$data/valid/$path" --clips "$VALID" --first-seed 1000100 "${PAIRS[@]}"
@@ -62,14 +63,15 @@ driving() {
   gcd_train evaluate --methods "$BASELINES,ground_homography" --svd "$ROOT/$first/$first.safetensors" \
     --data "$data/test/gradual" --out "$ROOT/evaluated/baselines" "${MEASURE[@]}"
   for seed in $SEEDS; do
-    for path in gradual direct; do
-      for start in pretrained scratch; do
-        name=study-$path-$start-s$seed
-        learned "$name" study "$data" "$path" --set "seed=$seed" --set "data.path=$path" \
-          --set "model.weights=$ROOT/$first/$first.safetensors" --set "model.scratch=$(from_nothing "$start")"
-        gcd_train evaluate --weights "$ROOT/$name/$name.safetensors" --no-baselines \
-          --data "$data/test/$path" --out "$ROOT/evaluated/$name" "${MEASURE[@]}"
-      done
+    for variant in "gradual pretrained none" "gradual scratch none" "direct pretrained none" "direct scratch none" \
+      "gradual pretrained given" "gradual pretrained estimated"; do
+      read -r path start splat <<<"$variant"
+      name=study-$path-$start-$splat
+      name=${name%-none}-s$seed
+      learned "$name" study "$data" "$path" --set "seed=$seed" --set "data.path=$path" --set "model.splat=$splat" \
+        --set "model.weights=$ROOT/$first/$first.safetensors" --set "model.scratch=$(from_nothing "$start")"
+      gcd_train evaluate --weights "$ROOT/$name/$name.safetensors" --no-baselines \
+        --data "$data/test/$path" --out "$ROOT/evaluated/$name" "${MEASURE[@]}"
     done
   done
 }

@@ -1,5 +1,6 @@
 """Clip, relative camera, frame rate, motion and noise strength become everything the U-Net takes, once a window."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -13,6 +14,7 @@ from gcd_model.config import CAMERA_FEATURES, CameraControl, ImageEncoderConfig
 from gcd_model.errors import ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory
 from gcd_model.layers import sinusoid
+from gcd_model.live.splat import splat, unproject
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
@@ -27,9 +29,9 @@ class SourceFeatures:
     tokens: [T, D] from the image tower, or None without one. latents: [T, C, h, w], not scaled; C is 0 for the live
     model, which has none.
     fps: what the network is told. augmentation: strength of the noise the VAE saw.
-    The rest is what the live model's points are made of, None for others. video: float32 [T, 3, H, W] in [-1, 1].
-    metres: float32 [T, H, W], 0 for a hole. stated: bool [T], whether a frame came with a depth at all. odometry:
-    float64 [T, 4, 4], world_from_camera, or None.
+    The rest is what the points of the live model, or of a splat, are made of, None for others. video: float32
+    [T, 3, H, W] in [-1, 1]. metres: float32 [T, H, W], 0 for a hole. stated: bool [T], whether a frame came with depth.
+    odometry: float64 [T, 4, 4], world_from_camera, or None.
     """
 
     tokens: Tensor | None
@@ -139,6 +141,34 @@ def with_unconditional(rows: Tensor, views: int, unconditional: bool) -> Tensor:
     """Image tokens or latents of a clip for K views: [R*K*T, ...]; the unconditional branch sees zeros, as released."""
     repeated = rows.repeat(views, *[1] * (rows.ndim - 1))
     return torch.cat([torch.zeros_like(repeated), repeated]) if unconditional else repeated
+
+
+def splatted(video: Tensor, metres: Tensor, lens: Intrinsics, path: Trajectory) -> Tensor:
+    """What a camera on the path sees of the source's pixels, each put where its depth says, frame by frame.
+
+    Args:
+        video: [T, 3, H, W] in [-1, 1]. metres: [T, H, W] along the axis; 0, negative or not finite: no point.
+        lens: of the source, and of the view.
+    Returns:
+        float32 [T, 4, H, W]: colour in [-1, 1], before black, and the share of a pixel that points cover, 0 to 1.
+    Source: a depth warp as a condition of video diffusion, Ren et al. 2025 (GEN3C), Yu et al. 2025 (TrajectoryCrafter).
+    """
+    here, labels = torch.eye(4, dtype=torch.float64), torch.zeros_like(metres[0], dtype=torch.uint8)
+    frames = zip(video, metres, path.source_from_target, strict=True)
+    seen = [
+        splat(unproject(depth, picture, labels, lens, here, 0.0), pose, lens, 1, 0.0) for picture, depth, pose in frames
+    ]
+    return torch.stack([torch.cat([s.coverage * (s.colour + 1) - 1, s.coverage[None]]) for s in seen])
+
+
+def splat_channels(splats: Tensor, encode: Callable[[Tensor], Tensor]) -> Tensor:
+    """A splat as the U-Net takes it, [T, C + 1, h, w]: latents of its colour as of the source, and the mean coverage.
+
+    splats: see `splatted`. encode: pictures [T, 3, H, W] to unscaled condition latents [T, C, h, w].
+    """
+    latents = encode(splats[:, :3])
+    coverage = F.interpolate(splats[:, 3:].to(latents), size=latents.shape[-2:], mode="area")
+    return torch.cat([latents, coverage], dim=1)
 
 
 # --- the CLIP image tower: one token per frame that says what is in it -----------------------------------------------

@@ -25,7 +25,8 @@ def require_multiple(what: str, width: int, of: str, divisor: int) -> None:
 class UNetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Shape of the video U-Net.
 
-    condition_channels: channels of the source latents, which are joined to the noisy ones.
+    condition_channels: channels that are joined to the noisy latents: the source latents, then a splat's, see
+        `with_splat`.
     attention: for each level, shallowest first, whether it has transformers; the middle always has one.
     context_width: width of the image token; None leaves cross-attention out.
     vector_width: width of the micro-conditioning vector. camera_width: of the camera vector, 0 for none.
@@ -149,6 +150,9 @@ CameraControl = Literal["spherical", "relative_pose", "none"]
 Prediction = Literal["v", "x0"]
 """What the U-Net's output stands for: the published v, or the clean latents themselves."""
 
+SplatDepth = Literal["none", "given", "estimated"]
+"""Whether a model is shown the source's points from the view's camera, and where their depth is from."""
+
 CAMERA_FEATURES: dict[CameraControl, int] = {"spherical": 13, "relative_pose": 12, "none": 0}
 """Numbers per frame that describe the camera to the network."""
 
@@ -179,6 +183,8 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     image_encoder: None for a model without image token.
     semantic_classes: the colours a semantic model paints its pictures in, by class id; views then come with class maps.
         Empty where nobody named them.
+    splat: ours; what the view's camera sees of the source's points is a condition beside the source latents, with the
+        clip's depth ("given") or, where it has none, with the packaged live model's ("estimated").
     prediction, vae.patch, vae.linear, sampling.shared_noise: ours, for small models; as they are here the model is the
         paper's.
     """
@@ -191,6 +197,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     vae: VAEConfig = VAEConfig()
     image_encoder: ImageEncoderConfig | None = ImageEncoderConfig()
     sampling: SamplingConfig = SamplingConfig()
+    splat: SplatDepth = "none"
     prediction: Prediction = "v"
     semantic_classes: tuple[SemanticClass, ...] = ()
 
@@ -202,8 +209,12 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise OptionError(f"the image tower gives width {token}, the U-Net wants {self.unet.context_width}")
         if self.unet.latent_channels != self.vae.latent_channels:
             raise OptionError(f"latent channels: U-Net {self.unet.latent_channels}, VAE {self.vae.latent_channels}")
-        if self.unet.condition_channels != self.vae.latent_channels:
-            raise OptionError(f"condition_channels must be the {self.vae.latent_channels} of the source latents")
+        latents = self.vae.latent_channels
+        if self.unet.condition_channels != (latents if self.splat == "none" else 2 * latents + 1):
+            raise OptionError(
+                f"condition_channels must be {latents} of the source latents and {latents + 1} of a splat, got "
+                f"{self.unet.condition_channels} with splat = {self.splat!r}"
+            )
         if self.semantic_classes:
             require_ontology("semantic_classes", self.semantic_classes)
 
@@ -217,6 +228,13 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         """Whether any of the switches is on that the paper's model does not have."""
         vae = self.vae
         return self.prediction != "v" or vae.patch > 1 or vae.linear or self.sampling.shared_noise
+
+
+def with_splat(config: ModelConfig, splat: SplatDepth) -> ModelConfig:
+    """The same model with a splat, or without: latents of the picture of its points, and how much they cover."""
+    channels = config.vae.latent_channels
+    unet = replace(config.unet, condition_channels=channels if splat == "none" else 2 * channels + 1)
+    return replace(config, splat=splat, unet=unet)
 
 
 # --- named set-ups ---------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import torch
 from gcd_model.config import SMALL
 from gcd_model.engines.onnx import load_export
 from gcd_model.engines.onnx_export import ExportPrecision, Manifest, Report, export_onnx, is_export, require_onnx
-from gcd_model.errors import CheckpointError, OptionError
+from gcd_model.errors import OptionError
 from gcd_model.live.blocks import layout
 from gcd_model.live.config import LIVE_TINY
 from gcd_model.live.synthesizer import LiveSynthesizer
@@ -19,15 +19,13 @@ from gcd_model.networks import LiveNetworks, LoadedWeights, random_networks, wei
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.traits import Traits
 from gcd_model.weights.card import FAMILIES, FULL_PRECISION, LIVE, Card, Hints, family_named, precision
-from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter
+from gcd_model.weights.load import Told, load_adapted, load_weights, read_adapter, weights_path
 
 EngineName = Literal["torch", "cuda", "onnxruntime"]
 """What can compute networks; see `Engine`."""
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 
 _LOG = logging.getLogger(__name__)
-PACKAGED = Path(__file__).parent / "weights"
-"""Where the weights that ship with the package lie."""
 
 
 def load_synthesizer(
@@ -158,21 +156,6 @@ def _stored_in(name: str, engine: EngineName | None) -> torch.dtype:
     if name == "float8" and engine != "cuda":
         raise OptionError("float8 is for the engine cuda alone; take it, or bfloat16")
     return precision("bfloat16" if name == "float8" else name)
-
-
-def weights_path(source: str | Path) -> Path:
-    """File of weights; `package:NAME` ships with the package. Raises CheckpointError, listing what there is."""
-    kind, _, name = str(source).partition(":")
-    if not isinstance(source, str) or kind != "package":
-        return Path(source)
-    path = PACKAGED / f"{name}.safetensors"
-    if Path(name).name == name and path.is_file():
-        return path
-    there = ", ".join(sorted(file.stem for file in PACKAGED.glob("*.safetensors")))
-    raise CheckpointError(
-        f"no weights called {name!r} ship with the package; there are: {there or 'none'}. "
-        "Give a path, or random:kubric90 to try things out with random weights"
-    )
 
 
 def random_weights(family: str, *, frames: int | None = None) -> LoadedWeights:

@@ -8,13 +8,20 @@ import torch
 from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, View, nearest_classes
-from gcd_model.conditioning import Conditioning, SourceFeatures, micro_conditioning, with_unconditional
+from gcd_model.conditioning import (
+    Conditioning,
+    SourceFeatures,
+    micro_conditioning,
+    splat_channels,
+    splatted,
+    with_unconditional,
+)
 from gcd_model.diffusion import RenderOptions, Schedule, unit_noise
 from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
-from gcd_model.geometry import Trajectory
+from gcd_model.geometry import Intrinsics, Trajectory
 from gcd_model.layers import prepare
-from gcd_model.live.eyes import PlacedFrame, SeenFrame
+from gcd_model.live.eyes import PlacedFrame, SeenFrame, estimated_depth
 from gcd_model.networks import Networks
 from gcd_model.traits import Traits
 from gcd_model.vae import to_pixels
@@ -162,14 +169,38 @@ class Synthesizer:
         if strength > 0:
             noise = unit_noise(tuple(video.shape), augmentation.seed, device=device) if noise is None else noise
             noisy = video + strength * noise.to(device)
-        at_once = _ENCODE_FRAMES if device.type == "cpu" else len(video)
-        tokens = [self._engine.tokens(frames) for frames in video.split(at_once)]
+        tokens = [self._engine.tokens(frames) for frames in video.split(self._at_once(video))]
+        lens, metres = (None, None) if self.traits.splat == "none" else self._points(clip)
         return SourceFeatures(
             tokens=torch.cat([each for each in tokens if each is not None]) if self._config.image_encoder else None,
-            latents=torch.cat([self._engine.condition_mean(frames) for frames in noisy.split(at_once)]),
+            latents=self._latents(noisy),
             fps=clip.fps,
             augmentation=strength,
+            lens=lens,
+            video=None if metres is None else video,
+            metres=metres,
         )
+
+    def _at_once(self, frames: Tensor) -> int:
+        return _ENCODE_FRAMES if self._engine.like.device.type == "cpu" else len(frames)
+
+    def _latents(self, frames: Tensor) -> Tensor:
+        """Condition latents of frames, unscaled."""
+        return torch.cat([self._engine.condition_mean(few) for few in frames.split(self._at_once(frames))])
+
+    def _points(self, clip: Clip) -> tuple[Intrinsics, Tensor]:
+        """Lens and depth [T, H, W] of the source's points. Raises OptionError where nobody says or estimates them."""
+        traits, lens = self.traits, clip.lens
+        if lens is None and traits.lens_deg is not None:
+            height, width = clip.video.shape[-2:]
+            lens = Intrinsics.from_hfov(traits.lens_deg[0], width, height)  # as trained
+        if lens is None or (clip.depth is None and traits.splat == "given"):
+            raise OptionError(
+                f"{traits.name} is shown the source's points, and the clip has no {'depth' if lens else 'lens'}; give "
+                "it, or take weights that do without"
+            )
+        device = self._engine.like.device
+        return lens, (estimated_depth(clip.video.to(device), lens) if clip.depth is None else clip.depth.to(device))
 
     @out_of_memory_is_our_error
     @torch.inference_mode()
@@ -211,11 +242,12 @@ class Synthesizer:
         cameras = [self._engine.camera(path) for path in trajectories]
         cameras = [each.repeat(samples, 1) for each in cameras if each is not None]
         unconditional, rows = schedule.branches == 2, views * samples
+        conditions = [self._condition(features, path).repeat(samples, 1, 1, 1) for path in trajectories]
         given = Conditioning(
             vector=torch.cat([vector.expand(samples * config.frames, -1) for vector in vectors]).to(like),
             camera=torch.cat(cameras) if cameras else None,
             tokens=None if features.tokens is None else with_unconditional(features.tokens, rows, unconditional),
-            latents=with_unconditional(features.latents, rows, unconditional),
+            latents=with_unconditional(torch.cat(conditions), 1, unconditional),
         )
         noise = self._noise(tuple(features.latents.shape[1:]), options)
         latents = self._engine.sample(schedule.start(noise.to(like.device), views), given, schedule, options)
@@ -225,6 +257,14 @@ class Synthesizer:
                 f"{options.seed}); try --dtype float32, and look at the weights with `gcd-node weights inspect`"
             )
         return latents.unflatten(0, (views, samples))
+
+    def _condition(self, features: SourceFeatures, path: Trajectory) -> Tensor:
+        """What joins the noisy latents of a view, [T, C', h, w]: the source's latents, then a splat's."""
+        video, metres, lens = features.video, features.metres, features.lens
+        if video is None or metres is None or lens is None:
+            return features.latents
+        seen = splat_channels(splatted(video, metres, lens, path), self._latents)
+        return torch.cat([features.latents, seen], dim=1)
 
     def _noise(self, each: tuple[int, ...], options: RenderOptions) -> Tensor:
         """Unit noise the sampling starts from, [S, T, C, h, w]; the same for every view, and if shared every frame."""

@@ -10,7 +10,7 @@ import msgspec
 import torch
 from torch import Tensor
 
-from gcd_model.config import ModelConfig, SemanticClass
+from gcd_model.config import ModelConfig, SemanticClass, SplatDepth
 from gcd_model.errors import OptionError, PoseError, ShapeError, ViewFixedError, ViewRangeError
 from gcd_model.geometry import (
     CameraMount,
@@ -77,6 +77,11 @@ class Traits(Card):
     def takes_any_pose(self) -> bool:
         """Whether views may stand anywhere and look anywhere."""
         return self.config.camera == "relative_pose" and (self.family is None or self.family.limits is None)
+
+    @property
+    def splat(self) -> SplatDepth:
+        """See ModelConfig; the live model has its own points."""
+        return "none" if isinstance(self.config, LiveConfig) else self.config.splat
 
     @property
     def fps(self) -> float:

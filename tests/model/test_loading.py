@@ -14,10 +14,11 @@ from gcd_model.config import SMALL
 from gcd_model.errors import CheckpointError, OptionError, ViewFixedError
 from gcd_model.geometry import SphericalDelta
 from gcd_model.live.config import LIVE_TINY
-from gcd_model.loading import PACKAGED, load_synthesizer
+from gcd_model.loading import load_synthesizer
 from gcd_model.synthesizer import Synthesizer
+from gcd_model.weights import load
 from gcd_model.weights.card import FAMILIES, Card
-from gcd_model.weights.load import inspect_weights, save_weights
+from gcd_model.weights.load import PACKAGED, inspect_weights, save_weights
 
 
 def dtypes(synthesizer: Synthesizer) -> dict[str, set[torch.dtype]]:
@@ -76,7 +77,7 @@ def test_random_networks_are_the_same_every_time_and_of_another_family_others() 
 
 
 def test_packaged_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loading, "PACKAGED", tmp_path)
+    monkeypatch.setattr(load, "PACKAGED", tmp_path)
     with pytest.raises(CheckpointError):
         load_synthesizer("package:small")
     card = Card(name="small", config=SMALL_GCD, family=FAMILIES["kubric90"], move_time=13)

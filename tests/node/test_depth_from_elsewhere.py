@@ -30,6 +30,7 @@ from msgspec.structs import replace as struct_replace
 from gcd_client.images import depth_m, images, inverse_depth
 from gcd_client.protocol import to_json
 from gcd_model import Clip, RenderOptions, SourceFeatures, Traits, Trajectory, View
+from gcd_model.config import SplatDepth, with_splat
 from gcd_node.cli.main import run_app
 from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError
 from gcd_node.frame import Frame, Image
@@ -221,6 +222,17 @@ def test_what_a_source_measures_reaches_the_live_model_frame_by_frame() -> None:
 def test_a_node_refuses_depth_that_it_cannot_use(made: Traits, kind: str) -> None:
     with pytest.raises(ConfigError):
         played(FakeSynthesizer(made), "model.depth_model=missing.onnx", f"model.depth_kind={kind}")
+
+
+@pytest.mark.parametrize("splat", ["given", "estimated"])
+def test_of_weights_that_are_shown_points_a_node_runs_those_that_estimate_depth(splat: SplatDepth) -> None:
+    model = FakeSynthesizer(replace(traits(), config=with_splat(traits().diffusion, splat)))
+    if splat == "given":
+        with pytest.raises(ConfigError, match="estimated"):
+            played(model)
+    else:
+        assert played(model, frames=28).of("win")
+        assert model.clips[-1].lens is not None
 
 
 class Telling(FakeSynthesizer):

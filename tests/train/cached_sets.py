@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gcd_model.geometry import Intrinsics, driving_trajectory
 from gcd_train.data.cache import CacheIdentity, ClipPlan, FrozenEncoders, SceneShard
 from gcd_train.data.cache_writer import CacheJob, CacheOptions, cache_scenes, load_encoders
+from gcd_train.data.sample import Sample
 from gcd_train.errors import DataError
 from gcd_train.parallel import Outcome
 
@@ -33,11 +35,21 @@ class FakePictures:
     def frames(self, scene: str, /) -> int:
         return self.length
 
-    def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> tuple[np.ndarray, np.ndarray]:
+    def moment(self, scene: str, time: int, positions: tuple[int, ...], /) -> Sample:
         if (scene, time) in self.broken:
             raise DataError(f"{scene}/rgb/yaw-0/{time}.png is cut")
         shade = 20 * self.scenes.index(scene) + 10 * time
-        return _picture(shade, 0), np.stack([_picture(shade, 1 + position) for position in positions])
+        path = driving_trajectory(frames=CLIP, move_time=CLIP - 1).source_from_target[list(positions)]
+        return Sample(
+            source=np.stack([_picture(shade, 0)] * len(positions)),
+            target=np.stack([_picture(shade, 1 + position) for position in positions]),
+            source_from_target=path.numpy(),
+            fps=self.fps,
+            scene=scene,
+            frame_numbers=(time,) * len(positions),
+            lens=Intrinsics.from_hfov(85.0, WIDTH, HEIGHT),
+            source_depth=np.full((len(positions), HEIGHT, WIDTH), 5.0 + time, np.float32),
+        )
 
 
 def _picture(shade: int, hue: int) -> np.ndarray:

@@ -292,7 +292,9 @@ def test_another_lens_in_the_same_place_shows_the_same_directions() -> None:
 
 
 def test_a_live_model_is_told_lens_and_motion_at_its_own_size_and_drawn_at_the_grid(root: Path) -> None:
-    model = FakeModel(SimpleNamespace(name="live", live=True, classes=(), family=None, config=smaller(4, 64, 96)))
+    model = FakeModel(
+        SimpleNamespace(name="live", live=True, splat="none", classes=(), family=None, config=smaller(4, 64, 96))
+    )
     clips, _ = open_clips(ClipOptions(data=[root], protocol="anyviewbench", split="far"), model.traits)
     assert (clips.keys, clips.frames) == (("far_a.e0",), 4)
     clip = clips.clip("far_a.e0")

@@ -174,8 +174,10 @@ def video(baseline: VanillaSVD, clip: SourceClip) -> torch.Tensor:
 
 
 def test_the_published_layout_gives_a_video_of_the_clips_size_and_length(opened: VanillaSVD) -> None:
-    made = video(opened, first_of())
-    assert made.shape == (4, 3, 32, 48)
+    prediction = opened.predict(first_of())
+    made = prediction.video
+    assert prediction.crop == (0, 4, 48, 24)  # the networks' shape is twice as wide as high
+    assert made.shape == (4, 3, 24, 48)
     assert made.dtype == torch.float32
     assert 0.0 <= float(made.min()) < float(made.max()) <= 1.0
     assert (opened.name, opened.privileged) == ("vanilla_svd", False)
@@ -189,6 +191,15 @@ def test_it_looks_at_the_first_frame_alone(told: FakeModel) -> None:
     assert torch.equal(video(baseline, clip), video(baseline, blind))
     others[0] = 255 - others[0]
     assert not torch.equal(video(baseline, clip), video(baseline, blind))
+
+
+def test_it_looks_at_the_middle_alone_that_has_the_shape_of_its_training(told: FakeModel) -> None:
+    clip, baseline = first_of(), VanillaSVD(weights=lambda: told, size=SIZE)
+    edges = clip.source.copy()
+    edges[:, :4], edges[:, -4:] = 0, 255
+    assert torch.equal(video(baseline, clip), video(baseline, replace(clip, source=edges)))
+    assert baseline.predict(first_of()).crop is not None
+    assert replace(baseline, size=(32, 48)).predict(clip).crop is None
 
 
 def test_draws_differ_and_come_again_with_the_seed(told: FakeModel) -> None:

@@ -30,6 +30,7 @@ class FakeTraits:
     """The part of Traits that evaluation asks for."""
 
     live = False
+    splat = "none"
     config: ModelConfig
     family: Family = FAMILIES["driving"]
     name: str = "fake-small"

@@ -83,8 +83,9 @@ def test_a_cached_clip_is_what_the_encoders_make_of_it(folder: Path, place: Clip
     encoders, pictures = tiny_encoders(), FakePictures()
     moments = [pictures.moment("scene_000002", time, (i,)) for i, time in enumerate(PLAN.times(place))]
     with torch.no_grad():
-        source = torch.cat([to_network(picture[None]) for picture, _ in moments])
-        target = torch.cat([to_network(pictures) for _, pictures in moments])
+        source, target = (
+            torch.cat([to_network(getattr(moment, side)) for moment in moments]) for side in ("source", "target")
+        )
         mean = encoders.target(target).mean * 0.18215
         tokens, plain = encoders.tokens(source), encoders.condition(source)
     assert_close(clip.target, mean, atol=1e-3, rtol=2e-3)  # float16
@@ -158,11 +159,11 @@ def test_a_job_travels_to_another_process(tmp_path: Path) -> None:
     job = CacheJob(folder=tmp_path, pictures=pictures, choice=CHOICE, identity=tiny_identity())
     arrived = pickle.loads(pickle.dumps(job))
     assert arrived.identity == job.identity
-    (source, targets), there = (each.pictures.moment("scene_000003", 1, (0, 2)) for each in (job, arrived))
-    assert np.array_equal(source, there[0])
-    assert np.array_equal(targets, there[1])
-    assert targets.shape == (2, HEIGHT, WIDTH, 3)
-    apart = np.abs(targets.astype(int) - source).mean(axis=(1, 2, 3))
+    here, there = (each.pictures.moment("scene_000003", 1, (0, 2)) for each in (job, arrived))
+    assert np.array_equal(here.source, there.source)
+    assert np.array_equal(here.target, there.target)
+    assert here.target.shape == (2, HEIGHT, WIDTH, 3)
+    apart = np.abs(here.target.astype(int) - here.source).mean(axis=(1, 2, 3))
     assert apart[0] < 0.5 * apart[1]  # the path begins where the source stands
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from driving_plane import PlaneClips, seen_of
+from msgspec import structs
 
 from gcd_model.config import SemanticClass
 from gcd_model.errors import NonFiniteError, ShapeError
@@ -52,6 +53,21 @@ def noisy(clip: HeldOutClip, seed: int) -> Prediction:
 
 def drawn(clip: HeldOutClip, draws: int) -> Prediction:
     return replace(noisy(clip, 0), more=tuple(noisy(clip, seed) for seed in range(1, draws)))
+
+
+@pytest.mark.parametrize("classes", [True, False])
+def test_what_shows_a_part_is_measured_as_if_the_clip_were_that_part(classes: bool) -> None:
+    clip, part = held_out(classes=classes), (slice(None), slice(4, 28), slice(6, 42))
+    made = Prediction(
+        video=to_pictures(clip.target[part]) * 0.9, classes=torch.from_numpy(clip.seen.source[part][..., 0] % 2)
+    )
+    small = replace(clip, target=clip.target[part], visible=clip.visible[part])
+    small = replace(small, target_classes=clip.target_classes[part]) if classes else small
+    found, wanted = record_of(clip, replace(made, crop=(6, 4, 36, 24))), record_of(small, made)
+    assert found.crop == (6, 4, 36, 24)
+    assert structs.replace(found, crop=None, seconds=0) == structs.replace(wanted, seconds=0)
+    with pytest.raises(ShapeError):
+        record_of(clip, made)
 
 
 def record_of(clip: HeldOutClip, prediction: Prediction, *, lpips: Lpips | None = None) -> ClipRecord:

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 
 from gcd_model.conditioning import micro_conditioning, relative_pose_features, spherical_features
 from gcd_model.config import SMALL, ModelConfig
+from gcd_model.geometry import Intrinsics
 from gcd_model.networks import Networks, random_networks
 from gcd_model.weights.card import FAMILIES
 from gcd_train.data.batches import SampleBatches, SampleLoader, SampleOrder
@@ -55,6 +56,7 @@ class CountedSamples:
             fps=24.0 / (1 + index % 4),
             scene=f"scn{index % 3:05d}",
             frame_numbers=tuple(range(FRAMES)),
+            lens=Intrinsics.from_hfov(53.13, WIDTH, HEIGHT),
         )
 
 

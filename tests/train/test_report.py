@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from gcd_train.errors import RunError
 from gcd_train.evaluation.figures import all_plots, make_figure
 from gcd_train.evaluation.paper import PAPER_TABLES, row_label
 from gcd_train.evaluation.report import make_report
-from gcd_train.evaluation.runs import EvaluatedSet, gather, on_the_same_goals
+from gcd_train.evaluation.runs import EvaluatedSet, gather, on_the_same_goals, targets_apart
 from gcd_train.evaluation.store import ClipRecord, Run, RunKeeper, RunNote
 from gcd_train.evaluation.tables import (
     differences,
@@ -147,7 +148,8 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
     [
         ("hexplane_4", {}, 3, "HexPlane"),
         ("4D-GS", {}, 3, "4D-GS"),
-        ("Zero-NVS", {}, 3, "ZeroNVS"),
+        ("zeronvs (scale 5)", {}, 3, "ZeroNVS"),
+        ("dynibar", {"frames in": "/frames"}, 3, "DynIBaR"),
         ("vanilla_svd", {}, 3, "Vanilla SVD"),
         ("reproject_rgbd", {}, 4, "Reproject RGB-D"),
         ("reproject_semd", {}, 5, "Reproject Sem-D"),
@@ -186,10 +188,10 @@ def test_visible_pixels_diversity_and_sharpness_stand_in_a_table() -> None:
     table = region_table(measured(two("a", draws=2), two("b")))
     assert table.headings == (
         *("PSNR all", "PSNR visible", "PSNR occluded", "SSIM all", "SSIM visible", "SSIM occluded"),
-        *("diversity", "gradient energy"),
+        *("diversity", "gradient energy", "flicker"),
     )
     values = [str(cell).split(" ")[0] for cell in table.rows[0].cells]
-    assert values == ["20.00", "30.00", "10.00", "0.500", "0.500", "0.500", "0.0100", "0.50"]
+    assert values == ["20.00", "30.00", "10.00", "0.500", "0.500", "0.500", "0.0100", "0.50", "0.50"]
     assert str(table.rows[1].cells[6]) == "-"
     assert "nan" not in to_markdown(table)
 
@@ -203,6 +205,26 @@ def test_a_claim_is_made_only_where_zero_lies_outside() -> None:
     assert (found["PSNR all"], found["PSNR occluded"], found["SSIM all"]) == ("better", "better", "open")
     back = {each.column.heading: each.verdict for each in differences(*reversed(of.methods))}
     assert back["PSNR all"] == "worse"
+
+
+def test_figures_of_other_pixels_are_marked_and_never_subtracted() -> None:
+    part = [msgspec.structs.replace(each, crop=(8, 0, 32, 32)) for each in records("b")]
+    of = measured(part, records("a", 1.0))
+    assert differences(*of.methods) == ()
+    assert {record.crop for record in of.clips.values()} == {None}  # what says which goals are alike is of whole frames
+    assert targets_apart(part[0], records("a")[0]) != ""
+    (main, _), text = main_tables(of), to_markdown(region_table(of))
+    assert [row.method for row in main.rows] == ["b †", "a"]
+    assert f"† Measured on the middle 32 x 32 of a frame's {of.note.width} x {of.note.height} pixels" in text
+
+
+def test_the_row_of_frames_made_elsewhere_names_their_source() -> None:
+    of = measured(records("dynibar"), kind="kubric", protocol="paper")
+    given = {"frames in": "/frames/dynibar", "digest": "0123456789ab"}
+    of = replace(of, methods=(replace(of.methods[0], details=given),))
+    table = main_tables(of, ("2-last",))[0]
+    assert [row.method for row in table.rows if row.label == "DynIBaR"] == ["dynibar"]
+    assert "dynibar: made elsewhere, read from /frames/dynibar (digest 0123456789ab)." in table.notes
 
 
 def test_error_against_angle_is_of_the_last_frame_and_either_way_round() -> None:

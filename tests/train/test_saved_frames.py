@@ -89,6 +89,15 @@ def test_a_clip_that_is_not_there_is_named_with_what_was_looked_for(tmp_path: Pa
         predicted(tmp_path)
 
 
+def test_clips_that_lie_there_beside_those_of_the_set_are_named(tmp_path: Path) -> None:
+    save(tmp_path / KEY)
+    save(tmp_path / "more" / "sample_0")
+    save_video(tmp_path / "most.mp4")
+    save(tmp_path / "extra" / "a_c00_scn02900_fs2_pred_s0")
+    (tmp_path / "notes").mkdir()
+    assert SavedFrames(name="other", folder=tmp_path).beside([KEY]) == ["more", "most"]
+
+
 def test_another_length_or_size_is_refused_not_resized(tmp_path: Path) -> None:
     save(tmp_path / "short" / KEY, CLIP.target[:2])
     with pytest.raises(DataError, match=f"holds 2 frames, clip {KEY} has 3"):

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,8 +23,7 @@ from gcd_train.training.setup import model_config, sampled_as_trained
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "tools"))
-
-import study_findings  # noqa: E402
+study_findings = import_module("study_findings")
 
 SCRIPT = ROOT / "launch" / "small-study.sh"
 

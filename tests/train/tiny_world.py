@@ -15,6 +15,7 @@ from gcd_model import Clip, Traits, View, load_synthesizer
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, CameraControl, ModelConfig
 from gcd_model.geometry import (
     CameraMount,
+    Intrinsics,
     Spherical,
     SphericalDelta,
     Trajectory,
@@ -105,6 +106,8 @@ class TinyClips(Clips):
             fps=self.fps,
             scene="tiny",
             frame_numbers=tuple(range(FRAMES)),
+            lens=Intrinsics.from_hfov(85.0, WIDTH, HEIGHT),
+            source_depth=np.full((FRAMES, HEIGHT, WIDTH), 10.0, np.float32),
         )
 
 

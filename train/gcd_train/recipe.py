@@ -5,7 +5,7 @@ from typing import Annotated, Literal, TypeAlias
 import msgspec
 from msgspec import Meta
 
-from gcd_model.config import CameraControl
+from gcd_model.config import CameraControl, SplatDepth
 from gcd_model.live.config import LiveConfig
 from gcd_train.recipe_data import (
     Budget,
@@ -109,8 +109,11 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     autoencoder and the image tower from it alone; the U-Net and what steers it start at random. See
     gcd_train.training.setup.
     train: what the U-Net stage trains: "all" of the U-Net and what steers it, as published; "temporal", of the U-Net
-    only what works across frames; "lora", adapters as [model.lora] says. family: how it is used, see
-    docs/launch-file.md. frames, height, width: trained length and size in pixels, left out as the base has them.
+    only what works across frames; "lora", adapters as [model.lora] says.
+    splat: also show the network the source's points as the target camera sees them, with depth that is "given" by the
+    data or "estimated" from pictures. Weights without such channels are taken, and compute at first what they did.
+    family: how it is used, see docs/launch-file.md. frames, height, width: trained length and size in pixels, left out
+    as the base has them.
     """
 
     base: Literal["plain-small", "svd-14", "small"] = "plain-small"
@@ -119,6 +122,7 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     steps: Count | None = None
     weights: str | None = None
     scratch: bool = False
+    splat: SplatDepth = "none"
     train: TrainedPart = "all"
     lora: LoraRecipe = LoraRecipe()
     family: str = "driving"
@@ -131,6 +135,11 @@ class ModelRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     def __post_init__(self) -> None:
         if self.train == "lora" and (self.weights is None or self.scratch):
             raise ValueError('model.train "lora" adds to a trained U-Net: give model.weights, and leave scratch out')
+        if self.splat != "none" and (self.train == "temporal" or (self.train == "lora" and not self.lora.stem)):
+            raise ValueError(
+                'model.splat enters by the first convolution, which this trains not: take model.train "all", or '
+                '"lora" with model.lora.stem = true'
+            )
 
 
 class VAERecipe(StageRecipe, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -320,6 +329,8 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 "a [student] learns whole clips of a teacher, and is used without guidance: give model.weights, leave "
                 "out [vae], and set unet.dropout and unet.image_share to 0"
             )
+        if self.model.splat != "none" and self.data.task == "image-to-video":
+            raise ValueError('data.task "image-to-video" has no target cameras to splat for: leave model.splat out')
         if (self.data.kind == "cache") != (self.unet.source == "cache"):
             raise ValueError('a latent cache is read with both data.kind "cache" and unet.source "cache"')
 

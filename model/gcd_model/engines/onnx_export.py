@@ -86,7 +86,11 @@ def graphs(networks: Networks) -> Iterator[Graph]:
     """Every graph of a checkpoint, at the size its config states."""
     config, tower, unet = networks.config, networks.image_encoder, networks.unet
     frames, factor = config.frames, config.vae.down_factor
-    latents = torch.zeros(frames, config.vae.latent_channels, config.height // factor, config.width // factor)
+    size = config.height // factor, config.width // factor
+    latents, condition = (
+        torch.zeros(frames, channels, *size)
+        for channels in (config.vae.latent_channels, unet.config.condition_channels)
+    )
     if tower is not None:
         pixels = torch.zeros(1, 3, tower.config.image_size, tower.config.image_size)
         yield Graph("image_encoder", tower, {"pixels": pixels}, "token")
@@ -99,7 +103,7 @@ def graphs(networks: Networks) -> Iterator[Graph]:
         inputs["camera"] = torch.zeros(frames, CAMERA_FEATURES[config.camera])
     yield Graph("embeddings", _Function(networks, _embeddings), inputs, "embeddings")
     widths = unet.embedding_widths
-    inputs = {"latents": latents, "condition": latents.clone(), "embeddings": torch.zeros(frames, sum(widths))}
+    inputs = {"latents": latents, "condition": condition, "embeddings": torch.zeros(frames, sum(widths))}
     if tower is not None:
         attending = [stage.attention is not None for stage in unet.all_stages()]
         inputs["crosses"] = torch.zeros(frames, sum(compress(widths, attending)))

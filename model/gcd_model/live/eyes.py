@@ -6,17 +6,20 @@ frame + an earlier one -> depth network, ego-motion -> SeenFrame -> SeenWorld ->
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
+from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics, invert_rigid
 from gcd_model.live.blocks import likeliest
-from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.config import SIZE_FACTOR, SKY_M, LiveConfig
 from gcd_model.live.depth_net import Reference, depth_inputs, plane_depth, read_depth, sweep_costs
 from gcd_model.live.ego_motion import EgoMotion
 from gcd_model.live.splat import Splat, Surfels, inverse_depth, relative_slopes, splat, true_at, unproject
 from gcd_model.networks import LiveNetworks
+from gcd_model.weights.load import load_weights, weights_path
 
 _FRAMES = 6
 """So many earlier frames are kept."""
@@ -177,6 +180,30 @@ def _taken(depth: Tensor, learned: Tensor) -> Tensor:
     """Depth from elsewhere: bad numbers are holes, a hole in what the network calls sky is sky."""
     metres = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).float().to(learned.device)
     return torch.where((metres == 0) & (learned >= SKY_M), SKY_M, metres)
+
+
+@lru_cache(maxsize=2)
+def _packaged_eyes(device: torch.device) -> Eyes:
+    networks = load_weights(weights_path("package:live-small")).networks
+    assert isinstance(networks, LiveNetworks)
+    return Eyes(networks.to(device, torch.float32))
+
+
+@torch.no_grad()
+def estimated_depth(video: Tensor, lens: Intrinsics) -> Tensor:
+    """Depth as the packaged live model sees it in each frame by itself, without ground or motion.
+
+    Args:
+        video: float32 [T, 3, H, W] in [-1, 1]; H and W multiples of 32.
+    Returns:
+        float32 [T, H, W], metres along the axis; 0 for the sky, as in data.
+    Raises: OptionError for another size.
+    """
+    if video.shape[-2] % SIZE_FACTOR or video.shape[-1] % SIZE_FACTOR:
+        size = f"{video.shape[-2]} x {video.shape[-1]}"
+        raise OptionError(f"depth is estimated for heights and widths that are multiples of {SIZE_FACTOR}, got {size}")
+    metres = torch.stack([_packaged_eyes(video.device).look(frame, lens).metres for frame in video])
+    return torch.where(metres < SKY_M, metres, 0.0)
 
 
 _NEAREST_M = 0.1

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gcd_model.clip import Augmentation, Clip, View
-from gcd_model.conditioning import SourceFeatures
+from gcd_model.conditioning import SourceFeatures, splatted
 from gcd_model.diffusion import RenderOptions, watched
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, invert_rigid
@@ -316,13 +316,8 @@ def visibility_of(clip: Clip, path: Trajectory) -> Tensor:
     if clip.depth is None or path.frames != clip.frames:
         found = "no depth" if clip.depth is None else f"{path.frames} poses for {clip.frames} frames"
         raise ShapeError(f"what a view sees follows from depth and a pose for every frame, got {found}")
-    lens, here = lens_of(clip), torch.eye(4, dtype=torch.float64)
-    labels = torch.zeros(lens.height, lens.width, dtype=torch.uint8)
-    frames = zip(clip.video, clip.depth, path.source_from_target, strict=True)
-    splats = [
-        splat(unproject(metres, frame, labels, lens, here, 0.0), pose, lens, 1, 0.0) for frame, metres, pose in frames
-    ]
-    return torch.stack([torch.where(each.coverage >= COVERED, SEEN_NOW, PAINTED).to(torch.uint8) for each in splats])
+    coverage = splatted(clip.video, clip.depth, lens_of(clip), path)[:, 3]
+    return torch.where(coverage >= COVERED, SEEN_NOW, PAINTED).to(torch.uint8)
 
 
 def _is_finite(view: View) -> bool:

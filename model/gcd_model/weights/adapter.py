@@ -11,6 +11,7 @@ from typing import Annotated, Self
 
 import msgspec
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gcd_model.config import ModelConfig
@@ -82,13 +83,13 @@ def adapted(networks: Networks, adapter: Adapter) -> Networks:
     Raises:
         CheckpointError: the adapter was trained on another base, or does not fit it.
     """
-    digest = base_digest(networks.state_dict())
+    config = adapter.card.diffusion
+    digest = base_digest(widened(networks.state_dict(), config))
     if digest != adapter.base:
         raise CheckpointError(
             f"the adapter stands on the base {adapter.base}, these weights are {digest}; give the file it was "
             "trained from"
         )
-    config = adapter.card.diffusion
     result, base = empty_networks(config), carried_over(networks, config)
     state, tensors, known = dict(base.weights), adapter.tensors, shapes_of(result.state_dict())
     for name, tensor in tensors.items():
@@ -142,7 +143,7 @@ def carried_over(networks: Networks, config: ModelConfig, *, anew: tuple[str, ..
         CheckpointError: they are of another architecture; names the first weights that are missing, superfluous or
             of another shape.
     """
-    given: Mapping[str, Tensor] = networks.state_dict()
+    given = widened(networks.state_dict(), config)
     if networks.config.vae.shared and not config.vae.shared:
         given = unshared(given)
     if networks.config.camera != config.camera:
@@ -156,6 +157,15 @@ def carried_over(networks: Networks, config: ModelConfig, *, anew: tuple[str, ..
     except CheckpointError as error:
         raise CheckpointError(f"holds another model than is wanted: {error}") from error
     return CarriedOver(weights, fresh)
+
+
+def widened(weights: Mapping[str, Tensor], config: ModelConfig) -> Mapping[str, Tensor]:
+    """Weights of a model without a splat as those of one with it, whose channels start at zero: the same function."""
+    stem = "unet.stem.weight"
+    channels = config.unet.latent_channels, config.unet.condition_channels
+    if config.splat == "none" or weights[stem].shape[1] != 2 * channels[0]:
+        return weights
+    return {**weights, stem: F.pad(weights[stem], (0, 0, 0, 0, 0, sum(channels) - 2 * channels[0]))}
 
 
 def unshared(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -35,6 +35,8 @@ from gcd_model.weights.names import Levels, Naming, assembled, published_names
 from gcd_model.weights.read import WeightsFile, read_file, read_weights
 from gcd_model.weights.save import CARRIED, write_published, write_safetensors
 
+PACKAGED = Path(__file__).parent
+"""Where the weights that ship with the package lie."""
 _SAMPLED_ABOVE = 512 << 20  # bytes; larger files are digested by samples
 _SAMPLE, _SAMPLES, _END = 64 << 10, 64, 1 << 20
 _USABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
@@ -52,6 +54,21 @@ class Told(TypedDict, total=False):
     head_width: int | None
     image_heads: int | None
     frames: int | None
+
+
+def weights_path(source: str | Path) -> Path:
+    """File of weights; `package:NAME` ships with the package. Raises CheckpointError, listing what there is."""
+    kind, _, name = str(source).partition(":")
+    if not isinstance(source, str) or kind != "package":
+        return Path(source)
+    path = PACKAGED / f"{name}.safetensors"
+    if Path(name).name == name and path.is_file():
+        return path
+    there = ", ".join(sorted(file.stem for file in PACKAGED.glob("*.safetensors")))
+    raise CheckpointError(
+        f"no weights called {name!r} ship with the package; there are: {there or 'none'}. "
+        "Give a path, or random:kubric90 to try things out with random weights"
+    )
 
 
 def load_weights(path: str | Path, **told: Unpack[Told]) -> LoadedWeights:

@@ -24,7 +24,7 @@ from gcd_model.networks import Networks
 from gcd_model.weights.card import Family
 from gcd_train.data.cache import CachedLatents, ClipPlace, EncodedRows, FrozenEncoders, PathKind, encoders_digest
 from gcd_train.data.latents import LatentClips
-from gcd_train.data.sample import Sample, SampleBatch, Samples, collate, to_network
+from gcd_train.data.sample import Sample, SampleBatch, Samples, collate, splat_of, to_network
 from gcd_train.errors import DataError, RecipeError, RunError, TrainError
 from gcd_train.parallel import one_thread_each
 from gcd_train.recipe import UNetRecipe
@@ -35,11 +35,13 @@ from gcd_train.training.setup import Conditioner, Draws, Precision
 
 
 @torch.no_grad()
-def encode_frames(networks: Networks, recipe: UNetRecipe, source: Tensor, target: Tensor, draws: Draws) -> EncodedRows:
-    """What the frozen networks make of frames [N, 3, H, W] in [-1, 1].
+def encode_frames(
+    networks: Networks, recipe: UNetRecipe, source: Tensor, target: Tensor, draws: Draws, splats: Tensor | None = None
+) -> EncodedRows:
+    """What the frozen networks make of frames [N, 3, H, W] in [-1, 1]. splats: see `splat_of`.
 
     The augmentation is noise on the pixels that the condition encoder sees, and on nothing else; the image tower sees
-    clean frames. Source: Generative Camera Dolly, as released.
+    clean frames, and a splat is clean. Source: Generative Camera Dolly, as released.
     """
     encoders = FrozenEncoders(networks=networks)
     noisy = source + recipe.augmentation * draws.normal(*source.shape)
@@ -51,6 +53,7 @@ def encode_frames(networks: Networks, recipe: UNetRecipe, source: Tensor, target
         target=latents,
         tokens=encoders.tokens(source),
         emphasis=class_emphasis(target, by_colour, size) if by_colour else None,
+        splat=encoders.splat(splats),
     )
 
 
@@ -78,7 +81,7 @@ class Batches(ABC):
     ) -> Batch:
         """B clips, with what the network is told of them. fps, motion, ids: of each."""
         device, per_clip = self._precision.device, len(rows.source) // len(fps)
-        source = self._precision.frames(rows.source)
+        source = self._precision.frames(rows.source if rows.splat is None else torch.cat([rows.source, rows.splat], 1))
         tokens = None if rows.tokens is None else rows.tokens.to(device)
         condition, tokens = drop_streams(source, tokens, per_clip, draws, self._recipe)
         return Batch(
@@ -271,7 +274,9 @@ class SampleBatches(Batches):
             self._precision.frames(to_network(clips.to(device, non_blocking=True).flatten(0, 1)))
             for clips in (loaded.source, loaded.target)
         )
-        rows = encode_frames(self._networks, recipe, source, target, draws)
+        clips = zip(loaded.samples, source.split(config.frames), strict=True)
+        splats = [each for sample, video in clips if (each := splat_of(sample, video, config.splat)) is not None]
+        rows = encode_frames(self._networks, recipe, source, target, draws, torch.cat(splats) if splats else None)
         paths = [sample.trajectory for sample in loaded.samples]
         cameras = [camera for path in paths if (camera := conditioner.camera(path)) is not None]
         motion = [recipe.motion_bucket if path.delta is None else conditioner.motion(path) for path in paths]
@@ -311,11 +316,13 @@ class CachedBatches(Batches):
         wait_s, by_class = time.perf_counter() - started, self._recipe.loss.class_weights != "none"
         tokens = [clip.tokens for clip in clips if clip.tokens is not None]
         emphasis = [clip.emphasis for clip in clips if clip.emphasis is not None]
+        splats = [clip.splat for clip in clips if clip.splat is not None]
         rows = EncodedRows(
             source=torch.cat([clip.source for clip in clips]),
             target=torch.cat([clip.target for clip in clips]),
             tokens=torch.cat(tokens) if tokens else None,
             emphasis=torch.cat(emphasis) if emphasis and by_class else None,
+            splat=torch.cat(splats) if splats else None,
         )
         fps = [self._cache.index.identity.fps / place.stride for _, place in places]
         names = [f"{scene} from {place.start} by {place.stride}" for scene, place in places]

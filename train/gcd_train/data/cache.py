@@ -9,6 +9,7 @@ tokens                f16    [N, D]               image tokens of the clean sour
 target_mean           f16    [R, C, h, w]         posterior of the target latents, not scaled
 target_log_variance   u8     [R, C, h, w]         of it, -30..20 in 255 steps: the deviation to 5 %
 emphasis              f16    [R, 1, h, w]         class emphasis of semantic targets; only for semantic targets
+splat                 f16    [R, C + 1, h, w]     the source's points from the target camera; only where asked for
 
 The source picture of a frame depends on its time t alone. With the fixed path of ParallelDomain-4D the target picture
 depends on t and on how far along the path the camera is, the position i = 0..13; stride and start do not matter beyond
@@ -32,7 +33,8 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from gcd_model.conditioning import clip_pixels
+from gcd_model.conditioning import clip_pixels, splat_channels
+from gcd_model.config import SplatDepth
 from gcd_model.errors import FileError
 from gcd_model.networks import Networks, weights_digest
 from gcd_model.small_files import read_json
@@ -139,6 +141,10 @@ class FrozenEncoders:
         """Condition latents [N, C, h, w] of frames with their noise, not scaled."""
         return torch.cat([part.mean.float() for part in self._parts(self.networks.condition_encoder, frames)])
 
+    def splat(self, splats: Tensor | None) -> Tensor | None:
+        """Condition channels [N, C + 1, h, w] of what `splat_of` gave; None for None."""
+        return None if splats is None else splat_channels(splats, self.condition)
+
     def tokens(self, frames: Tensor) -> Tensor | None:
         """Image tokens [N, D] of clean frames; None for a model without an image tower."""
         tower = self.networks.image_encoder
@@ -232,6 +238,7 @@ class CacheIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     copies: differently noised source latents a frame. augmentation: strength of that noise, on pixels in [-1, 1].
     height, width: pixels.
     scale: of target latents, applied when read. emphasis: whether class emphasis maps are kept (semantic targets).
+    splat: whether the source's points are, and where their depth is from.
     """
 
     encoders: str
@@ -246,6 +253,7 @@ class CacheIdentity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     width: int
     scale: float
     emphasis: bool = False
+    splat: SplatDepth = "none"
 
 
 class SceneShard(Shard, frozen=True, kw_only=True):
@@ -271,6 +279,7 @@ class EncodedRows:
 
     source: [N, C, h, w], not scaled. target: [N, C, h, w], scaled. tokens: [N, D] of the image tower. emphasis:
     [N, 1, h, w], see `class_emphasis`. motion: [N], how far the camera goes. camera: [N, K], what steers the model.
+    splat: [N, C + 1, h, w], see `splat_channels`.
     """
 
     source: Tensor
@@ -279,6 +288,7 @@ class EncodedRows:
     emphasis: Tensor | None = None
     motion: Tensor | None = None
     camera: Tensor | None = None
+    splat: Tensor | None = None
 
 
 class CachedLatents:
@@ -343,6 +353,7 @@ class CachedLatents:
             target=self._target(tensors, r, draws),
             tokens=tensors["tokens"][n].float() if "tokens" in tensors else None,
             emphasis=tensors["emphasis"][r].float() if "emphasis" in tensors else None,
+            splat=tensors["splat"][r].float() if "splat" in tensors else None,
         )
 
     def _read(self, scene: str) -> dict[str, Tensor]:

@@ -10,16 +10,18 @@ import logging
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 import torch
 from torch import Tensor
 from typer import Option
 
+from gcd_model.config import SplatDepth
 from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
 from gcd_model.loading import random_weights, weights_path
@@ -44,7 +46,7 @@ from gcd_train.data.files import Skips
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import Draw
 from gcd_train.data.pictures import PictureOptions, pictures_of, trained_picture
-from gcd_train.data.sample import Bytes, to_network
+from gcd_train.data.sample import Sample, splat_of, to_network
 from gcd_train.data.splits import Part, present, read_split
 from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.files import only_writer
@@ -78,6 +80,9 @@ class CacheOptions:
         Option(help="Clips to encode for: the camera moves (gradual), or is there at once (direct)."),
     ] = "both"
     semantic: Annotated[bool, Option("--semantic", help="Targets show the classes instead of colour.")] = False
+    splat: Annotated[SplatDepth, Option(help="Also the source's points from the target camera, see model.splat.")] = (
+        "none"
+    )
     exact: Annotated[bool, Option("--exact", help="Draw targets from geometry.npz, which generated scenes have.")] = (
         False
     )
@@ -128,8 +133,8 @@ class DrivingPictures:
         """Time steps of a scene. Raises FileFault."""
         return self.data.frames(scene)
 
-    def moment(self, scene: str, time: int, positions: Sequence[int], /) -> tuple[Bytes, Bytes]:
-        """Source [H, W, 3] and targets [P, H, W, 3] of a frame, whose files are read once. Raises FileFault."""
+    def moment(self, scene: str, time: int, positions: Sequence[int], /) -> Sample:
+        """A frame, whose files are read once, P times: the same source, targets of all positions. Raises FileFault."""
         world_from_source = self.data.pose(scene, self.data.source_camera, time)
         draw = Draw(
             frame_numbers=(time,) * len(positions),
@@ -139,9 +144,10 @@ class DrivingPictures:
         )
         made = self._pictures.sample(scene, draw)
         if not self._options.exact:
-            return made.source[0], made.target
+            return made
         view = self.data.views(scene, time, [self.data.source_camera])[0]
-        return trained_picture(view.rgb, *self._options.size), made.target
+        source = trained_picture(view.rgb, *self._options.size)
+        return replace(made, source=np.repeat(source[None], len(made.target), axis=0))
 
 
 def encode_scene(
@@ -162,14 +168,14 @@ def encode_scene(
     missing: dict[int, str] = {}
     for moment, wanted in sorted(positions.items()):
         try:
-            source, targets = pictures.moment(scene, moment, wanted)
+            sample = pictures.moment(scene, moment, wanted)
         except DataError as error:
             missing[moment] = str(error)
             continue
-        if {source.shape[:2], targets.shape[1:3]} != {(identity.height, identity.width)}:
+        if {sample.source.shape[1:3], sample.target.shape[1:3]} != {(identity.height, identity.width)}:
             wants = f"{identity.height} x {identity.width}"
-            raise DataError(f"{scene}: pictures must be {wants} for these weights, got {targets.shape}")
-        for name, values in encode_moment(encoders, identity, source, targets, f"{scene}/{moment}").items():
+            raise DataError(f"{scene}: pictures must be {wants} for these weights, got {sample.target.shape}")
+        for name, values in encode_moment(encoders, identity, sample, f"{scene}/{moment}").items():
             rows[name].append(values)
         times.append(moment)
     if not times:
@@ -184,11 +190,10 @@ def encode_scene(
 
 
 @torch.no_grad()
-def encode_moment(
-    encoders: FrozenEncoders, identity: CacheIdentity, source_picture: Bytes, target_pictures: Bytes, name: str
-) -> dict[str, Tensor]:
+def encode_moment(encoders: FrozenEncoders, identity: CacheIdentity, sample: Sample, name: str) -> dict[str, Tensor]:
     """The rows of one frame: source [1, ...], targets [P, ...]. name: of the frame, what its noise follows from."""
-    source, targets = to_network(source_picture[None]), to_network(target_pictures)
+    sources, targets = to_network(sample.source), to_network(sample.target)
+    source = sources[:1]
     draws = Draws(identity.seed, f"latent cache/{name}", 0, torch.device("cpu"))
     noise = draws.normal(identity.copies, *source.shape[1:])
     posterior = encoders.target(targets)
@@ -200,6 +205,9 @@ def encode_moment(
     tokens = encoders.tokens(source)
     if tokens is not None:
         rows["tokens"] = tokens.half()
+    splat = encoders.splat(splat_of(sample, sources, identity.splat))
+    if splat is not None:
+        rows["splat"] = splat.half()
     if identity.emphasis:
         size = (posterior.mean.shape[-2], posterior.mean.shape[-1])
         rows["emphasis"] = class_emphasis(targets, PARALLEL_DOMAIN_WEIGHTS, size).half()
@@ -253,7 +261,9 @@ def cache_job(data: Path, out: Path, options: CacheOptions) -> CacheJob:
         clip_frames=config.frames, paths=("gradual", "direct") if options.path == "both" else (options.path,)
     )
     modality = "classes" if options.semantic else "rgb"
-    drawn = PictureOptions(size=(config.width, config.height), modality=modality, exact=options.exact)
+    drawn = PictureOptions(
+        size=(config.width, config.height), modality=modality, depth=options.splat == "given", exact=options.exact
+    )
     pictures = DrivingPictures(whole.only(scenes[: options.limit]), config.frames, drawn)
     identity = CacheIdentity(
         encoders=digest,
@@ -268,6 +278,7 @@ def cache_job(data: Path, out: Path, options: CacheOptions) -> CacheJob:
         width=config.width,
         scale=config.vae.scale,
         emphasis=options.semantic,
+        splat=options.splat,
     )
     return CacheJob(folder=out, pictures=pictures, choice=options, identity=identity)
 

@@ -7,6 +7,7 @@ target      float16 [N, F, T, C, h, w]      target latents, as the U-Net works o
 motion      float32 [N]                     the number that says how far the camera goes
 control     float32 [N, F, T, K]            camera features, where the model is steered
 emphasis    float16 [N, T, 1, h, w]         how much more a class counts, see `class_emphasis`
+splat       float16 [N, F, T, C + 1, h, w]  the source's points from the target camera, where the model is shown them
 """
 
 import logging
@@ -21,6 +22,7 @@ import msgspec
 import torch
 from torch import Tensor
 
+from gcd_model.conditioning import splat_channels
 from gcd_model.config import ModelConfig
 from gcd_model.networks import Networks
 from gcd_model.vae import Posterior
@@ -36,7 +38,7 @@ from gcd_train.data.cache import (
     write_index,
     write_shard,
 )
-from gcd_train.data.sample import Clips, numbers_of, to_network
+from gcd_train.data.sample import Clips, numbers_of, splat_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
 from gcd_train.recipe import LatentsRecipe, Recipe
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
@@ -116,7 +118,7 @@ class LatentClips:
             return rows[order.to(rows.device)].to(device)
 
         side = mirrored.long()
-        source, target = at("source", side, frames), at("target", side, frames)
+        source, target, splat = (at(name, side, frames) for name in ("source", "target", "splat"))
         assert source is not None and target is not None  # noqa: PT018
         emphasis = at("emphasis", frames)
         if emphasis is not None:
@@ -128,6 +130,7 @@ class LatentClips:
             motion=at("motion"),
             camera=at("control", side, frames),
             emphasis=emphasis,
+            splat=None if splat is None else splat.float(),
         )
 
 
@@ -202,7 +205,8 @@ class Encodings:
         recipe, config, family = self.recipe, self.config, self.family
         by_path = family.motion_bucket is None and family.limits is not None
         motion = family.name if by_path else None  # families with the recipe's number write the same latents
-        steered = (config.camera, motion, recipe.unet.motion_bucket)
+        shown = () if config.splat == "none" else (config.splat,)  # without, latents of before are the same
+        steered = (config.camera, motion, recipe.unet.motion_bucket, *shown)
         options = digest_of(self._latents, self._seed, self.clips.origin, steered, recipe.unet.loss.class_weights)
         return f"{autoencoder_digest(networks)}-{options}"
 
@@ -244,14 +248,19 @@ class Encodings:
         def drawn(posterior: Posterior) -> Tensor:
             return posterior.sample(draws.normal(*posterior.mean.shape)) if recipe.sample else posterior.mean
 
+        splats = splat_of(sample, source, self.config.splat)
         with self.precision.arithmetic():
             conditions = [encoders.condition(noisy(frames)) for frames in sources]
             posteriors = [encoders.target(frames) for frames in targets]
+            sides = () if splats is None else (splats, splats.flip(-1))[:flips]
+            shown = [splat_channels(each, encoders.condition) for each in sides]
         rows = {
             "source": torch.stack(conditions).half(),
             "target": torch.stack([drawn(each) * self.config.vae.scale for each in posteriors]).half(),
             "motion": torch.tensor(conditioner.motion(path), dtype=torch.float32),
         }
+        if shown:
+            rows["splat"] = torch.stack(shown).half()
         features = [conditioner.camera(each) for each in (path, mirrored_path(path))[:flips]]
         steered = [each.float() for each in features if each is not None]
         if steered:

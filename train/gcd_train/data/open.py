@@ -57,6 +57,8 @@ def open_data(recipe: Recipe, config: ModelConfig, family: Family, data: Path, v
             f'data.task "image-to-video" makes a model without views, model.family is {recipe.model.family!r}: give '
             f'model.family "{_VIDEO_FAMILY}"'
         )
+    if config.splat == "given" and recipe.data.kind in ("lerobot", "videos"):
+        raise RecipeError(f'data.kind {recipe.data.kind!r} has no depth to splat with: set model.splat to "estimated"')
     opening = _Opening(recipe, config, family, data, valid)
     match recipe.data.kind:
         case "pairs":
@@ -83,6 +85,10 @@ class _Opening:
     def _data(self) -> DataRecipe:
         return self.recipe.data
 
+    @property
+    def _gives_depth(self) -> bool:
+        return self.config.splat == "given"
+
     def pairs(self) -> RunData:
         data, valid = self.folder, self._valid_folder("pairs have no split of their own")
         if self._data.task == "image-to-video":  # both sides of all pairs: the folders need not go the same way
@@ -91,7 +97,7 @@ class _Opening:
                 *({name: world for each in part for name, world in each.scenes.items()} for part in (learned, held))
             )
             return RunData(clips=video_clips(learned), valid=video_clips(held))
-        clips, held_out = PairedClips.open(data), PairedClips.open(valid)
+        clips, held_out = (replace(PairedClips.open(place), depth=self._gives_depth) for place in (data, valid))
         require_apart(clips.scenes, held_out.scenes)
         for each, folder in ((clips, data), (held_out, valid)):
             goal, reached = self._data.goal_frame(each.frames), each.trajectory(0).at_goal.index(True)
@@ -198,6 +204,7 @@ class _Opening:
             size=(self.config.width, self.config.height),
             modality="classes" if recipe.modality == "semantic" else "rgb",
             class_ids=class_ids,
+            depth=self._gives_depth,
             exact=recipe.exact,
             published=recipe.published,
             device=_splat_device(recipe),
@@ -255,6 +262,7 @@ class _Opening:
         wrong = {
             "model.camera": config.camera != "none",
             "model.frames": config.frames != kept.plan.clip_frames,
+            "model.splat": config.splat != kept.splat,
             "model.height and model.width": (config.height, config.width) != (kept.height, kept.width),
             "unet.augmentation": unet.augmentation != kept.augmentation,
             "unet.loss.class_weights": unet.loss.class_weights != "none" and not kept.emphasis,

@@ -17,6 +17,7 @@ from gcd_model.config import CameraControl
 from gcd_model.errors import FileError
 from gcd_model.geometry import (
     CameraMount,
+    Intrinsics,
     Spherical,
     SphericalDelta,
     Trajectory,
@@ -57,13 +58,14 @@ class PairedClips(Clips):
 
     One folder's clips are ordered by their number. Those of several alternate, so that the first ones are a fair mix.
     worlds: what each folder says about itself. places: shard and name of each clip. folders: in which folder it lies,
-    empty where there is but one. frames, height, width: T, H, W. hfov_deg: angle across the source pictures, and
-    across the targets of an orbit. mount: how the source camera really sits on the vehicle.
+    empty where there is but one. depth: whether samples have the source's. frames, height, width: T, H, W. hfov_deg:
+    angle across the pictures. mount: how the source camera really sits on the vehicle.
     """
 
     worlds: tuple[World, ...]
     places: tuple[tuple[Path, str], ...]
     folders: tuple[int, ...] = ()
+    depth: bool = False
 
     def __post_init__(self) -> None:
         world = self.world
@@ -122,8 +124,8 @@ class PairedClips(Clips):
         return PairedClip(
             source=self._colour(index, "source"),
             target=self._colour(index, "target"),
-            source_depth=self._strip(index, "source.depth").astype(np.float32) * np.float32(DEPTH_UNIT_M),
-            target_depth=self._strip(index, "target.depth").astype(np.float32) * np.float32(DEPTH_UNIT_M),
+            source_depth=self._depth(index, "source"),
+            target_depth=self._depth(index, "target"),
             source_classes=self._classes(index, "source"),
             target_classes=self._classes(index, "target"),
             source_instances=self._strip(index, "source.instances"),
@@ -144,6 +146,8 @@ class PairedClips(Clips):
             fps=self.fps,
             scene=str(self.scene(number)),
             frame_numbers=tuple(range(self.frames)),
+            lens=Intrinsics.from_hfov(self.hfov_deg, self.width, self.height),
+            source_depth=self._depth(number, "source") if self.depth else None,
         )
 
     def trajectory(self, index: int, /) -> Trajectory:
@@ -175,6 +179,9 @@ class PairedClips(Clips):
 
     def _colour(self, index: int, camera: str) -> Bytes:
         return np.ascontiguousarray(self._strip(index, f"{camera}.rgb")[..., ::-1])
+
+    def _depth(self, index: int, camera: str) -> NDArray[np.float32]:
+        return self._strip(index, f"{camera}.depth").astype(np.float32) * np.float32(DEPTH_UNIT_M)
 
     def _classes(self, index: int, camera: str) -> Bytes:
         if not self.classes:

@@ -23,7 +23,7 @@ from gcd_train.data.dataset4d import VOID, Dataset4D
 from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_manifest
 from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
-from gcd_train.data.splat import splat
+from gcd_train.data.splat import Number, splat
 from gcd_train.data.visibility import depth_visibility, published_picture, render_lens, visibility
 from gcd_train.errors import DataError, RenderError
 
@@ -44,15 +44,16 @@ class PictureOptions:
     """What is made of a draw.
 
     size: width and height, pixels. modality: the target in colour, or painted by class. class_ids: also the target's
-    classes. visible: also what of the target the source camera saw. exact: from the geometry our own scenes keep,
-    instead of from points. published: points as released, with its approximations; open Kubric-4D with `published` too
-    then. device: where points are drawn.
+    classes. visible: also what of the target the source camera saw. depth: also the source's. exact: from the geometry
+    our own scenes keep, instead of from points. published: points as released, with its approximations; open Kubric-4D
+    with `published` too then. device: where points are drawn.
     """
 
     size: tuple[int, int] = (384, 256)
     modality: Modality = "rgb"
     class_ids: bool = False
     visible: bool = False
+    depth: bool = field(default=False, repr=False)  # sets of clips are named by what changes their pictures
     exact: bool = False
     published: bool = False
     device: str | None = None
@@ -84,6 +85,8 @@ class Pictures(ABC):
             frame_numbers=draw.frame_numbers,
             visible=np.stack(made.visible) if self._options.visible else None,
             target_depth=np.stack(made.depth) if made.depth else None,
+            lens=render_lens(self._dataset.lens(scene), self._width, self._height),
+            source_depth=np.stack(made.source_depth) if self._options.depth else None,
         )
 
     @abstractmethod
@@ -101,6 +104,7 @@ class _Drawn:
     classes: list[Bytes] = field(default_factory=list[Bytes])
     visible: list[NDArray[np.bool_]] = field(default_factory=list[NDArray[np.bool_]])
     depth: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
+    source_depth: list[NDArray[np.float32]] = field(default_factory=list[NDArray[np.float32]])
 
 
 class SplatPictures(Pictures):
@@ -120,11 +124,14 @@ class SplatPictures(Pictures):
                 made.source.append(trained_picture(own.rgb, *options.size))
             else:
                 made.source.append(picture(views, draw.world_from_source))
-                if np.abs(own.world_from_camera - draw.world_from_source).max() >= SAME_POSE and options.visible:
+                apart = np.abs(own.world_from_camera - draw.world_from_source).max() >= SAME_POSE
+                if apart and (options.visible or options.depth):
                     # what a camera at the drawn pose would have seen, with depth, from the points of all
                     there = points(views, draw.world_from_source)
                     depth, smaller = there.depth.cpu().numpy(), render_lens(lens, *options.size)
                     seen = _view(there.picture, depth, draw.world_from_source, smaller)
+            if options.depth:
+                made.source_depth.append(nearest_resized(seen.depth, *options.size))
             painted = None
             if self._ontology is not None and options.modality == "classes":
                 painted = [self._ontology.encode(ids) for ids in self._ids(views)]
@@ -176,7 +183,8 @@ class ExactPictures(Pictures):
         for _, name, rendering in renderer.views(still, cameras):
             drawn[name].append(rendering)
         source, target = ([each.rgb for each in drawn[name]] for name in (_SOURCE, _TARGET))
-        made = _Drawn(world_from_source=draw.world_from_source, source=source, target=target)
+        depth = [each.depth for each in drawn[_SOURCE]]
+        made = _Drawn(world_from_source=draw.world_from_source, source=source, target=target, source_depth=depth)
         if self._ontology is not None:
             made.classes = [self._ontology.merge(published_ids(each.classes)) for each in drawn[_TARGET]]
             if self._options.modality == "classes":
@@ -272,6 +280,14 @@ def trained_picture(rgb: Bytes, width: int, height: int) -> Bytes:
     if (across, along) == (width, height):
         return np.ascontiguousarray(cropped)
     return cv2.resize(cropped, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+
+
+def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:
+    """What must not be averaged, in the size and crop of `trained_picture`: [H, W] -> [height, width]."""
+    left, top, across, along = center_crop_box(values.shape[1], values.shape[0], width / height)
+    rows = top + ((np.arange(height) + 0.5) * along / height).astype(np.intp)
+    columns = left + ((np.arange(width) + 0.5) * across / width).astype(np.intp)
+    return values[rows[:, None], columns]
 
 
 def trained_lens(lens: Intrinsics, width: int, height: int) -> Intrinsics:

@@ -12,9 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gcd_model.config import CameraControl, SemanticClass
+from gcd_model.conditioning import splatted
+from gcd_model.config import CameraControl, SemanticClass, SplatDepth
 from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, pose_trajectory
+from gcd_model.live.eyes import estimated_depth
 from gcd_train.data.files import FileFault, Skipped, Skips
 from gcd_train.data.paths import generator
 from gcd_train.errors import DataError, RecipeError, RenderError, TrainError
@@ -51,7 +53,8 @@ class Sample:
     metres, target minus source; None for paths that are not on the sphere. fps: of the clip, after the stride.
     scene: its name. frame_numbers: of the scene, T. visible: bool [T, H, W], target pixels that the source camera saw,
     None where not asked for. target_depth: f32 [T, H, W] metres, with `visible` of a target that was drawn exactly.
-    skipped: what was tried before and left out.
+    lens: of both sides' pictures. source_depth: f32 [T, H, W], metres along the axis, 0 where nothing is known or for
+    the sky; None where not asked for. skipped: what was tried before and left out.
     """
 
     source: Bytes
@@ -60,6 +63,8 @@ class Sample:
     fps: float
     scene: str
     frame_numbers: tuple[int, ...]
+    lens: Intrinsics
+    source_depth: NDArray[np.float32] | None = None
     target_classes: Bytes | None = None
     start: Spherical | None = None
     deltas: NDArray[np.float64] | None = None
@@ -72,6 +77,21 @@ class Sample:
         """The target camera's path, seen from the source camera."""
         path = pose_trajectory(torch.from_numpy(self.source_from_target))
         return path if self.deltas is None else replace(path, delta=torch.from_numpy(self.deltas), source=self.start)
+
+
+def splat_of(sample: Sample, video: Tensor, splat: SplatDepth) -> Tensor | None:
+    """What the target camera sees of the source's points, see `splatted`; None for a model that is not shown it.
+
+    video: the source as the networks take it, clean.
+    """
+    if splat == "none":
+        return None
+    if splat == "estimated":
+        metres = estimated_depth(video, sample.lens)
+    else:
+        assert sample.source_depth is not None, "data without depth are refused when they are opened"
+        metres = torch.from_numpy(sample.source_depth).to(video.device)
+    return splatted(video, metres, sample.lens, sample.trajectory)
 
 
 class Samples(Protocol):
@@ -96,7 +116,7 @@ class Samples(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SampleBatch:
-    """B samples of T frames. source, target: u8 [B, T, H, W, 3]. samples: the same, without pictures."""
+    """B samples of T frames. source, target: u8 [B, T, H, W, 3]. samples: the same, without these."""
 
     source: Tensor
     target: Tensor

@@ -26,6 +26,7 @@ from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose, require_rigid
 from gcd_model.small_files import read_json
 from gcd_train.data.files import MOST_PICTURE, FileFault
+from gcd_train.data.pictures import trained_lens
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample
 from gcd_train.errors import DataError, RecipeError
 
@@ -278,6 +279,7 @@ def sample_of(
         fps=fps,
         scene=scene,
         frame_numbers=frame_numbers,
+        lens=trained_lens(lens, *size),
     )
 
 

@@ -176,6 +176,8 @@ def benchmark_table(of: EvaluatedSet) -> Table:
     rows = [_row(method, label, part) for label, part in places for method in of.methods]
     out = [split for splits in of.note.groups.values() for split, keys in splits.items() if not keys]
     notes = [f"Unweighted means over frames, episodes, splits, {len(groups)} groups; black targets do not count."]
+    parts = [each.name for each in of.methods if any(record.crop is not None for record in each.records)]
+    notes += [f"†, a part of each frame alone, which is not the protocol's: {', '.join(parts)}."] if parts else []
     notes += [f"Left out, without pixels or not there: {', '.join(out)}."] if out else []
     title = "Means over groups, of a group and of a split"
     return Table(name="anyviewbench", title=title, headings=_HEADINGS, rows=tuple(rows), notes=tuple(notes))

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal, Self, TypeAlias, TypeVar
+from typing import Literal, Self, TypeAlias
 
 import msgspec
 import numpy as np
@@ -16,19 +16,17 @@ import torch
 from numpy.typing import NDArray
 
 from gcd_model.config import CameraControl, SemanticClass
-from gcd_model.geometry import CameraMount, center_crop_box, pose_trajectory, sphere_poses, to_pose
+from gcd_model.geometry import CameraMount, pose_trajectory, sphere_poses, to_pose
 from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.files import ZIP_FAULTS
 from gcd_train.data.pairs import PairedClip, PairedClips
-from gcd_train.data.pictures import SAME_POSE, ViewPairs, trained_lens, trained_picture
+from gcd_train.data.pictures import SAME_POSE, ViewPairs, nearest_resized, trained_lens, trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
-from gcd_train.data.splat import splat
+from gcd_train.data.splat import Number, splat
 from gcd_train.data.splits import SceneControls
 from gcd_train.data.visibility import depth_visibility, render_lens
 from gcd_train.errors import DataError
 from gcd_train.evaluation.predictors import FAR_M, CameraPair, SourceClip, own_views
-
-Number = TypeVar("Number", bound=np.generic)
 
 SetKind: TypeAlias = Literal["kubric", "driving", "orbit", "anyview"]
 """Which tables clips belong to: Kubric-4D and scenes in its layout, driving, pairs seen along orbits, or episodes of
@@ -276,7 +274,9 @@ class SceneSet(EvaluationSet):
         apart = (cameras.ground_from_source - torch.from_numpy(views[0].world_from_camera)).abs().max()
         own = float(apart) < SAME_POSE
         ids = [view.classes for view in views if own and view.classes is not None]
-        if own:
+        if sample.source_depth is not None:  # drawn with the picture, exactly
+            depth = sample.source_depth
+        elif own:
             depth = self._stacked([view.depth for view in views])
         else:  # from the points of all cameras
             pose, lens = cameras.ground_from_source.numpy(), cameras.source
@@ -366,11 +366,3 @@ def further_poses() -> NDArray[np.float64]:
     elevations = np.rad2deg(np.arcsin(np.sin(np.deg2rad(50.0)) * (numbers * _SILVER % 1.0)))
     views = np.stack([azimuths, elevations, np.full(FURTHER_CAMERAS, 15.0)], axis=-1)
     return sphere_poses(torch.from_numpy(views)).numpy()
-
-
-def nearest_resized(values: NDArray[Number], width: int, height: int) -> NDArray[Number]:
-    """What must not be averaged, in the size and crop of `trained_picture`: [H, W] -> [height, width]."""
-    left, top, across, along = center_crop_box(values.shape[1], values.shape[0], width / height)
-    rows = top + ((np.arange(height) + 0.5) * along / height).astype(np.intp)
-    columns = left + ((np.arange(width) + 0.5) * across / width).astype(np.intp)
-    return values[rows[:, None], columns]

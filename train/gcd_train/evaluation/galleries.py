@@ -129,7 +129,13 @@ def strips(methods: Sequence[MethodRecords], key: str) -> tuple[Strip, ...]:
         rows += [(method.name, "sample_0", [at]), (f"{method.name}: classes", "classes_0", [at])]
     rows += [("true classes", "target_classes", folders), ("target", "target", folders)]
     every = [(name, next(filter(None, (_read(at / kind) for at in places)), {})) for name, kind, places in rows]
-    return tuple(Strip(name=name, frames=frames) for name, frames in every if frames)
+    sizes = [frame.shape[:2] for _, frames in every for frame in frames.values()]
+    height, width = np.max(sizes, axis=0) if sizes else (0, 0)
+    return tuple(
+        Strip(name=name, frames={number: _centred(frame, height, width) for number, frame in frames.items()})
+        for name, frames in every
+        if frames
+    )
 
 
 def write_sheet(clips: Sequence[tuple[str, Sequence[Strip]]], out: Path) -> None:
@@ -196,6 +202,12 @@ def _padded(picture: Pictures, height: int, width: int) -> Pictures:
     """With white below and to the right."""
     rows, columns = picture.shape[:2]
     return np.pad(picture, ((0, height - rows), (0, width - columns), (0, 0)), constant_values=255)
+
+
+def _centred(picture: Pictures, height: int, width: int) -> Pictures:
+    """With white all round, where a method shows the middle of a frame alone."""
+    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    return _padded(np.pad(picture, ((top, 0), (left, 0), (0, 0)), constant_values=255), height, width)
 
 
 def beside(rows: Sequence[Strip], moment: int) -> Pictures:

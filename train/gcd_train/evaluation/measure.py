@@ -21,7 +21,7 @@ from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
 from gcd_train.evaluation.galleries import FEW_CLIPS, KeptViews, has_views, write_views
 from gcd_train.evaluation.predictors import Prediction, Predictor, to_labels, to_pictures
 from gcd_train.evaluation.statistics import FIRST_MEASURED
-from gcd_train.evaluation.store import ClipRecord, Counted, Frames, Region, RegionRecord, RunKeeper
+from gcd_train.evaluation.store import Box, ClipRecord, Counted, Frames, Region, RegionRecord, RunKeeper
 from gcd_train.parallel import Outcome, map_items, one_thread_each
 
 
@@ -35,7 +35,8 @@ def predicted_and_measured(
 ) -> tuple[Prediction, ClipRecord]:
     """What a method makes of a clip, and all figures of that, of every frame from the first on.
 
-    Visible and occluded pixels are measured apart, too, where it is known which those are.
+    Visible and occluded pixels are measured apart, too, where it is known which those are. A method that shows a part
+    of the target, see `Prediction.crop`, is measured on that part of it and of its regions.
 
     Args:
         classes: the ontology, empty for none. Those that stand for no class, see `void_ids`, are not counted where they
@@ -52,6 +53,7 @@ def predicted_and_measured(
     if painted:
         first, *more = (replace(draw, video=None, more=()) for draw in prediction.draws)
         prediction = replace(first, more=tuple(more))
+    clip = clip if prediction.crop is None else _part(clip, prediction.crop)
     target, draws = to_pictures(clip.target), _alike([draw.video for draw in prediction.draws], "pictures")
     if draws is not None and not draws.isfinite().all():
         raise NonFiniteError(f"pictures must be finite to be measured; {predictor.name} on {clip.key} gave NaN or Inf")
@@ -74,6 +76,19 @@ def predicted_and_measured(
         lpips=None if lpips is None or draws is None else tuple(map(_frames, _counting(lpips(draws, target), clip))),
         step=None if draws is None else tuple(tuple(metrics.frame_change(each).tolist()) for each in draws),
         step_target=tuple(metrics.frame_change(target).tolist()),
+        crop=prediction.crop,
+    )
+
+
+def _part(clip: HeldOutClip, crop: Box) -> HeldOutClip:
+    """The clip with a part of its target alone."""
+    left, top, width, height = crop
+    part = (slice(None), slice(top, top + height), slice(left, left + width))
+    return replace(
+        clip,
+        target=clip.target[part],
+        target_classes=None if clip.target_classes is None else clip.target_classes[part],
+        visible=None if clip.visible is None else clip.visible[part],
     )
 
 

@@ -1,6 +1,7 @@
 """What is measured, and on what: from the options of a user to clips and methods, and what the run says of itself."""
 
 import difflib
+import math
 import platform
 import re
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from typer import Option
 from gcd_model import RenderOptions, inspect_weights, weights_path
 from gcd_model.config import SemanticClass
 from gcd_model.diffusion import SolverName
+from gcd_model.weights.load import digest
 from gcd_train.data.files import package_version
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.anyview import EpisodeSet
@@ -40,6 +42,7 @@ from gcd_train.evaluation.predictors import (
 )
 from gcd_train.evaluation.store import LPIPS, RunNote
 from gcd_train.evaluation.synthesized import VANILLA_SVD, SynthesizedViews, VanillaSVD
+from gcd_train.evaluation.zeronvs import ETA, GUIDANCE, STEPS, ZERONVS, ZeroNVS, best_scale, open_zeronvs
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -62,6 +65,10 @@ class EvaluateOptions(ClipOptions):
         list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")
     ] = None
     svd: Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")] = None
+    zeronvs: Annotated[str | None, Option(help="Weights for zeronvs: zeronvs.ckpt.")] = None
+    zeronvs_scale: Annotated[
+        str | None, Option(help="Metres that count as one in zeronvs; or RUN, on validation clips: its best scale.")
+    ] = None
     predictions: Annotated[
         list[str] | None, Option(help="NAME=FOLDER with frames of another method; may be repeated.")
     ] = None
@@ -86,8 +93,15 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
     named = options.methods and [name.strip() for name in ",".join(options.methods).split(",") if name.strip()]
     if options.methods is not None and not options.baselines:
         raise RecipeError("--methods names baselines and --no-baselines wants none; leave one of the two out")
-    if options.svd is not None and VANILLA_SVD not in (named or ()):
-        raise RecipeError(f"--svd is for {VANILLA_SVD}, which --methods does not name; name it, or leave out --svd")
+    for option, given, method in (
+        ("--svd", options.svd, VANILLA_SVD),
+        ("--zeronvs", options.zeronvs, ZERONVS),
+        ("--zeronvs-scale", options.zeronvs_scale, ZERONVS),
+    ):
+        if given is not None and method not in (named or ()):
+            raise RecipeError(
+                f"{option} is for {method}, which --methods does not name; name it, or leave out {option}"
+            )
     weights, given = None, options.weights or []
     if len(given) > 1:
         raise RecipeError(
@@ -118,6 +132,12 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
             raise RecipeError(
                 f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
             )
+    beside = ((each, each.beside(clips.keys)) for each in methods if isinstance(each, SavedFrames))
+    notes += tuple(
+        f"{each.folder} holds frames of {len(names)} clips more than the set, which are not measured, first {names[0]}"
+        for each, names in beside
+        if names
+    )
     return clips, tuple(methods), notes
 
 
@@ -249,20 +269,55 @@ def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> 
         raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
     kind, _, name = options.svd.partition(":")
     if kind == "random":
-        family, digest = name, options.svd
+        family, weights_digest = name, options.svd
     else:
         inspected = inspect_weights(weights_path(options.svd))
-        family, digest = inspected.family and inspected.family.name, inspected.digest[:12]
+        family, weights_digest = inspected.family and inspected.family.name, inspected.digest[:12]
     if family not in ("svd", None):
         raise RecipeError(
             f"{VANILLA_SVD} wants weights that make a video out of a picture, {options.svd} is of the family "
             f"{family}; give svd.safetensors"
         )
     samples, seed = options.samples or 1, options.seed
-    details = {"baseline": VANILLA_SVD, "samples": str(samples), "seed": str(seed), "weights": digest}
+    details = {
+        "baseline": VANILLA_SVD,
+        "crop": "centre",
+        "samples": str(samples),
+        "seed": str(seed),
+        "weights": weights_digest,
+    }
     weights = partial(open_weights, _resolved(options.svd), options.device, options.dtype, None if family else "svd")
     shared = isinstance(clips, EpisodeSet)  # its protocol draws one noise for all episodes
     return VanillaSVD(weights=weights, samples=samples, seed=seed, shared_noise=shared, details=details)
+
+
+def _zeronvs(clips: EvaluationSet, options: EvaluateOptions, views: int) -> ZeroNVS:
+    """Opened at once, so that a file of another method is refused before anything is measured."""
+    if options.zeronvs is None or options.zeronvs_scale is None:
+        raise RecipeError(
+            f"{ZERONVS} wants its weights, --zeronvs zeronvs.ckpt, and --zeronvs-scale: metres that count as one, or a "
+            "run on validation clips in which several were measured"
+        )
+    try:
+        scale, chosen = float(options.zeronvs_scale), "as given"
+    except ValueError:
+        scale, chosen = best_scale(Path(options.zeronvs_scale), clips)
+    if not (math.isfinite(scale) and scale > 0):
+        raise RecipeError(f"--zeronvs-scale must be metres above 0, got {options.zeronvs_scale}")
+    networks = partial(open_zeronvs, _resolved(options.zeronvs), options.device, options.dtype)
+    networks()
+    details = {
+        "baseline": ZERONVS,
+        "scale": f"{scale:g}",
+        "scale chosen": chosen,
+        "steps": str(STEPS),
+        "guidance": f"{GUIDANCE:g}",
+        "eta": f"{ETA:g}",
+        "samples": str(options.samples or 1),
+        "seed": str(options.seed),
+        "weights": digest((Path(options.zeronvs),))[:12],
+    }
+    return ZeroNVS(networks=networks, scale=scale, samples=options.samples or 1, seed=options.seed, details=details)
 
 
 METHODS: dict[str, MethodKind] = {
@@ -273,6 +328,7 @@ METHODS: dict[str, MethodKind] = {
     REPROJECT_RGBD: MethodKind(make=_reproject_rgbd, usual=True, geometry=True),
     REPROJECT_SEMD: MethodKind(make=_reproject_semd, makes="classes", usual=True, geometry=True),
     VANILLA_SVD: MethodKind(make=_vanilla_svd),
+    ZERONVS: MethodKind(make=_zeronvs),
     "hexplane": MethodKind(make=_hexplane, views=True),
 }
 """What can be measured beside weights and saved frames; a new method is one entry, and a `Predictor` of its own."""

@@ -4,11 +4,10 @@ Pictures are float [T, 3, H, W] in [0, 1]; masks are bool [T, H, W]; class maps 
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import shorten
-from typing import Self, cast
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -211,10 +210,14 @@ def _require_known(predicted: Tensor, target: Tensor, count: int) -> None:
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, RGB in [0, 1]
 _LEAST_NORM = 1e-10
-_SHOWN = 120  # letters of torch's own words in a message
-_WANTED = (
-    "wanted torchvision's vgg16-*.pth and the linear weights vgg.pth, or alexnet-*.pth and alex.pth, in one folder"
-)
+PUBLISHED = {
+    "vgg16-397923af.pth": "397923af",
+    "alexnet-owt-7be5be79.pth": "7be5be79",
+    "vgg.pth": "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+    "alex.pth": "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+}
+"""How the SHA-256 of the published files begins. Source: torchvision, whose files are named after it; the linear
+weights of version 0.1 as lpips 0.1.4 on PyPI holds them."""
 
 
 def _vgg16() -> nn.Sequential:
@@ -240,19 +243,18 @@ def _alexnet() -> nn.Sequential:
 @dataclass(frozen=True, slots=True)
 class _Kind:
     """How a network is found and used: files of its features and of its linear weights, places of the features that are
-    compared among torchvision's, their channels, and a side of the smallest picture."""
+    compared among torchvision's, and a side of the smallest picture."""
 
     made: Callable[[], nn.Sequential]
     features: str
     linear: str
     compared: tuple[int, ...]
-    channels: tuple[int, ...]
     least_pixels: int
 
 
 _KINDS = {
-    "vgg": _Kind(_vgg16, "vgg16-*.pth", "vgg.pth", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), 16),
-    "alex": _Kind(_alexnet, "alexnet-*.pth", "alex.pth", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), 31),
+    "vgg": _Kind(_vgg16, "vgg16-397923af.pth", "vgg.pth", (3, 8, 15, 22, 29), 16),
+    "alex": _Kind(_alexnet, "alexnet-owt-7be5be79.pth", "alex.pth", (1, 4, 7, 9, 11), 31),
 }
 
 
@@ -275,17 +277,16 @@ class Lpips:
     def open(cls, folder: Path | str) -> Self:
         """Read the weights that lie in a folder.
 
-        The folder holds torchvision's `vgg16-*.pth` and the published linear weights `vgg.pth`, or `alexnet-*.pth` and
-        `alex.pth`; of both pairs VGG16 is taken. Nothing but tensors is read from them.
+        The folder holds torchvision's `vgg16-397923af.pth` and the published linear weights `vgg.pth`, or
+        `alexnet-owt-7be5be79.pth` and `alex.pth`; of both pairs VGG16 is taken. Nothing but tensors is read from them.
 
         Raises:
-            DataError: a file is missing, damaged or another one than wanted.
+            DataError: a file is missing, or its digest is not that of the published one, see `PUBLISHED`.
         """
         name, path, linear = _files(Path(folder))
         features, digest = _KINDS[name].made(), hashlib.sha256()
-        names = {f"features.{key}": blank.shape for key, blank in features.state_dict().items()}
-        state = _read(path, names)
-        heads = _read(linear, {f"lin{n}.model.1.weight": (1, c, 1, 1) for n, c in enumerate(_KINDS[name].channels)})
+        state = _read(path, [f"features.{key}" for key in features.state_dict()])
+        heads = _read(linear, [f"lin{stage}.model.1.weight" for stage in range(len(_KINDS[name].compared))])
         for tensor in (*state, *heads):
             digest.update(tensor.contiguous().numpy().tobytes())
         features.load_state_dict(dict(zip(features.state_dict(), state, strict=True)))
@@ -329,33 +330,25 @@ class Lpips:
 def _files(folder: Path) -> tuple[str, Path, Path]:
     """The network to use and its two files: the first of which both are there."""
     for name, kind in _KINDS.items():
-        features, linear = sorted(folder.glob(kind.features)), folder / kind.linear
-        if features and linear.is_file():
-            if len(features) > 1:
-                raise DataError(f"{folder} holds {len(features)} files {kind.features}; leave one of them")
-            return name, features[0], linear
+        features, linear = folder / kind.features, folder / kind.linear
+        if features.is_file() and linear.is_file():
+            return name, features, linear
     held = ", ".join(sorted(path.name for path in folder.glob("*.pth"))) or "no .pth file"
-    raise DataError(f"no LPIPS weights in {folder}: {_WANTED}, got {held}")
+    wanted = " or ".join(f"{kind.features} and {kind.linear}" for kind in _KINDS.values())
+    raise DataError(f"no LPIPS weights in {folder}: wanted {wanted}, got {held}")
 
 
-def _read(path: Path, wanted: Mapping[str, Sequence[int]]) -> list[Tensor]:
-    """The tensors of these names and shapes that a file holds; code in it is never run. Raises DataError."""
+def _read(path: Path, names: Sequence[str]) -> list[Tensor]:
+    """Tensors of a published file by their names. Raises DataError where it is another file or damaged."""
     try:
-        if not path.is_file():
-            raise ValueError("it is no regular file")
-        held: object = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # what a damaged pickle raises depends on which byte is wrong
-        cause = shorten(str(error).strip().split("\n")[0].split(". ")[0], _SHOWN, placeholder=" ...")
-        raise DataError(f"cannot read the LPIPS weights {path}: {cause}; fetch the file again") from error
-    if not isinstance(held, Mapping):
-        raise DataError(f"the LPIPS weights {path} must be named tensors, got {type(held).__name__}; {_WANTED}")
-    taken: list[Tensor] = []
-    for name, shape in wanted.items():
-        tensor = cast("Mapping[str, object]", held).get(name)
-        if not isinstance(tensor, Tensor) or tuple(tensor.shape) != tuple(shape):
-            got = list(tensor.shape) if isinstance(tensor, Tensor) else "none"
-            raise DataError(f"{path} must hold {name} of {list(shape)}, got {got}; {_WANTED}")
-        if not tensor.isfinite().all():
-            raise DataError(f"{name} in {path} holds values that are not finite; fetch the file again")
-        taken.append(tensor.detach().float())
-    return taken
+        with path.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"cannot read the LPIPS weights {path}: {error}") from error
+    if not found.startswith(PUBLISHED[path.name]):
+        raise DataError(
+            f"{path} is not the published file: its SHA-256 begins with {found[:8]}, wanted "
+            f"{PUBLISHED[path.name][:8]}; fetch it again"
+        )
+    held: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
+    return [held[name].detach().float() for name in names]

@@ -247,6 +247,7 @@ def _open_scenes(
         modality="classes" if painted else "rgb",
         class_ids=painted,
         visible=True,
+        depth=options.exact,
         exact=options.exact,
         published=released,
     )

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,12 +17,12 @@ from torch import Tensor
 from gcd_model import ViewSynthesizer, load_synthesizer
 from gcd_model.clip import nearest_classes
 from gcd_model.config import SemanticClass
-from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, driving_trajectory, to_pose
+from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, center_crop_box, driving_trajectory, to_pose
 from gcd_train.data.encodings import read_colour
 from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.data.splat import tangents
 from gcd_train.errors import DataError
-from gcd_train.evaluation.store import FRAMES_IN
+from gcd_train.evaluation.store import FRAMES_IN, Box
 from gcd_train.pictures import video_frames
 
 
@@ -145,12 +145,14 @@ class Prediction:
     """A view as it is measured.
 
     video: float32 [T, 3, H, W] in [0, 1], or None. classes: uint8 [T, H, W], 255 for no class, or None. more: further
-    draws of the same view, of methods that draw.
+    draws of the same view, of methods that draw. crop: the part of the target that it shows, in the target's own
+    pixels; H and W are then the part's, and nothing else of the target is measured. None for all of it.
     """
 
     video: Tensor | None = None
     classes: Tensor | None = None
     more: "tuple[Prediction, ...]" = ()
+    crop: Box | None = None
 
     @property
     def draws(self) -> "tuple[Prediction, ...]":
@@ -191,6 +193,26 @@ def to_pictures(frames: Bytes) -> Tensor:
 def to_labels(classes: Bytes | None) -> Tensor | None:
     """A class map as a tensor, uint8 [T, H, W]."""
     return None if classes is None else torch.from_numpy(np.ascontiguousarray(classes))
+
+
+def middle(lens: Intrinsics, aspect: float) -> Box | None:
+    """The largest centred part of a camera's picture with this width / height; None where that is all of it."""
+    crop = center_crop_box(lens.width, lens.height, aspect)
+    return None if crop[2:] == (lens.width, lens.height) else crop
+
+
+def fitted(pictures: Tensor, height: int, width: int) -> Tensor:
+    """The middle of pictures [T, 3, ...] in [-1, 1] that has the shape of a network's size, resized to it."""
+    left, top, across, down = center_crop_box(pictures.shape[-1], pictures.shape[-2], width / height)
+    return resized(pictures[..., top : top + down, left : left + across], height, width, low=-1.0)
+
+
+def resized(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> Tensor:
+    """[T, 3, ...] at another size, bicubic, within low..1."""
+    if pictures.shape[-2:] == (height, width):
+        return pictures
+    new = F.interpolate(pictures, size=(height, width), mode="bicubic", align_corners=False, antialias=True)
+    return new.clamp(low, 1.0)
 
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp")
@@ -288,6 +310,15 @@ class SavedFrames:
             raise DataError(f"{self.folder} cannot be read ({error}); give NAME=FOLDER") from error
         more = {"privileged": "yes"} if self.privileged else {}
         return {FRAMES_IN: str(self.folder), "digest": digest.hexdigest()[:12], **more}
+
+    def beside(self, keys: Collection[str]) -> list[str]:
+        """Names of clips that lie in the folder and are not among these; outputs of the paper's script aside."""
+        named = {path.stem if path.suffix == _VIDEO else path.name: path for path in self.folder.iterdir()}
+        return sorted(
+            name
+            for name, path in named.items()
+            if name not in keys and not _RELEASED.fullmatch(name) and (_is_draw(path) or any(_draws_in(path, _SAMPLE)))
+        )
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor; each sample that was saved is a draw.

@@ -10,7 +10,7 @@ import numpy as np
 
 from gcd_train.errors import RunError
 from gcd_train.evaluation.statistics import FRAMES_OF, ClipTable, Span, Sums
-from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, ClipRecord, Region, Run, RunNote
+from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, Box, ClipRecord, Region, Run, RunNote
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +28,14 @@ class MethodRecords:
 
     @property
     def starred(self) -> str:
-        """Its name, with a star where it was given more than the source video: exact depth, or further cameras."""
-        return f"{self.name} *" if self.records[0].privileged else self.name
+        """Its name, with a star where it was given more than the source video: exact depth, or further cameras; and a
+        dagger where only a part of each frame was measured."""
+        return self.name + " *" * self.records[0].privileged + " †" * (self.crop is not None)
+
+    @property
+    def crop(self) -> Box | None:
+        """The part of each frame that was measured; None for all of it."""
+        return self.records[0].crop
 
     @property
     def makes_pictures(self) -> bool:
@@ -78,9 +84,11 @@ class EvaluatedSet:
 
     @cached_property
     def clips(self) -> dict[str, ClipRecord]:
-        """All clips that any method was measured on by name, each with its first record."""
+        """All clips that any method was measured on by name, each with its first record, of whole frames if there is
+        one."""
         found: dict[str, ClipRecord] = {}
-        for record in (record for method in self.methods for record in method.records):
+        whole_first = sorted(self.methods, key=lambda method: method.crop is not None)
+        for record in (record for method in whole_first for record in method.records):
             found.setdefault(record.key, record)
         return found
 
@@ -151,6 +159,8 @@ def targets_apart(one: ClipRecord, other: ClipRecord, frames: Span = "last") -> 
 
     Known by where the camera goes and how sharp the target is, frame by frame.
     """
+    if one.crop != other.crop:
+        return "one is measured on a part of each frame, the other on another part or all of it"
     changes = [np.array(each.change if each.change is not None else (np.nan,) * 3) for each in (one, other)]
     if not np.allclose(*changes, rtol=0.0, atol=_SAME_CHANGE, equal_nan=True):
         ways = [

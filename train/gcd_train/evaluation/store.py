@@ -31,6 +31,9 @@ REGIONS: tuple[Region, ...] = get_args(Region)
 FRAMES_IN, LPIPS = "frames in", "lpips"
 """In what a note says of a method: where another method's frames lie, and which LPIPS it was measured with."""
 
+Box: TypeAlias = tuple[int, int, int, int]
+"""A part of a picture: left and top edge, width and height, pixels."""
+
 Frames: TypeAlias = tuple[float | None, ...]
 """A value of each frame, from the first; None where there is no pixel to measure."""
 
@@ -41,9 +44,9 @@ Counted: TypeAlias = tuple[tuple[int, int, int], ...]
 class RegionRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One method's figures on some pixels of one clip.
 
-    pixels: share of the frame that they are, T. psnr_db, ssim: [S][T]. diversity: T, None for fewer than two draws.
-    gradient, gradient_target: [S][T] and T, mean length of the gradient. confusion: [T], summed over draws; None where
-    there are no classes. What is of the method's pictures is None where it makes none.
+    pixels: share of the frame, or of the part of it that is measured, T. psnr_db, ssim: [S][T]. diversity: T, None for
+    fewer than two draws. gradient, gradient_target: [S][T] and T, mean length of the gradient. confusion: [T], summed
+    over draws; None where there are no classes. What is of the method's pictures is None where it makes none.
     """
 
     pixels: tuple[float, ...]
@@ -63,7 +66,8 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     to goal; None for the fixed path of driving. fps: of the clip. seconds: that the method took. regions: by name;
     "visible" and "occluded" are missing where nobody knows what the source camera saw.
     lpips: [S][T], None where no weights were given. step, step_target: [S][T-1] and T-1, mean change from frame to
-    frame; step is None where the method makes no pictures.
+    frame; step is None where the method makes no pictures. crop: the part of the target that the method covers; all
+    figures, the target's too, are of that part alone. None for all of it.
     """
 
     method: str
@@ -79,6 +83,7 @@ class ClipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     lpips: tuple[Frames, ...] | None = None
     step: tuple[tuple[float, ...], ...] | None = None
     step_target: tuple[float, ...]
+    crop: Box | None = None
 
 
 class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from gcd_model import Augmentation, Clip, RenderOptions, SourceFeatures, Trajectory, View, ViewSynthesizer
@@ -24,7 +23,10 @@ from gcd_train.evaluation.predictors import (
     OpenedWeights,
     Prediction,
     SourceClip,
+    fitted,
+    middle,
     require_one_lens,
+    resized,
     through_lens,
 )
 from gcd_train.evaluation.tables import counted
@@ -60,8 +62,9 @@ class SynthesizedViews:
     def of(cls, weights: OpenedWeights, clips: EvaluationSet, options: RenderOptions = _AS_SHIPPED) -> Self:
         """A model that is measured on these clips. Raises DataError where they do not fit together."""
         _require_fit(weights(), clips)
-        free, traits = isinstance(clips, EpisodeSet), weights().traits
-        made = cls(weights=weights, options=options, classes=len(clips.classes) or None, stretched=free)
+        free, traits, count = isinstance(clips, EpisodeSet), weights().traits, len(clips.classes) or None
+        privileged = traits.splat == "given"
+        made = cls(weights=weights, options=options, classes=count, stretched=free, privileged=privileged)
         if not made.paints_classes or traits.classes:
             return made
         if not clips.classes:
@@ -119,13 +122,17 @@ class SynthesizedViews:
         if self.stretched:
             require_one_lens(clip, self.name)
             video, lens = (
-                _stretched(video, config.height, config.width, low=-1.0),
+                resized(video, config.height, config.width, low=-1.0),
                 lens.resized(config.width, config.height),
             )
             odometry = cameras.ground_from_source
         own = Clip(video=video, fps=clip.fps)
         if synthesizer.traits.live:
             own = replace(own, mount=cameras.mount, lens=lens, odometry=odometry)
+        elif synthesizer.traits.splat != "none":
+            own = replace(own, lens=cameras.source)
+        if self.privileged:
+            own = replace(own, depth=torch.from_numpy(clip.source_depth))
         features = synthesizer.encode(own)
         return lambda options: synthesizer.render(features, [path], options)[0]
 
@@ -183,13 +190,14 @@ def _require_fit(synthesizer: ViewSynthesizer, clips: EvaluationSet) -> None:
 class VanillaSVD:
     """A video out of the first frame, for each draw from noise of its own.
 
-    The frame is stretched to the size the network was trained at, and what comes out is stretched back: nothing is
-    cropped, so that all of the target is measured.
+    The middle of the frame, of the shape the network was trained at, is resized to that size, as in the paper. What
+    comes out is resized to the same part of the target and measured there, in the target's own pixels; the paper
+    resized its targets to 576 x 1024 instead.
 
     weights: without camera control. size: height and width it works at, None for the weights' own (576 x 1024 of
         the published). steps: None as the weights say. samples: draws of each clip. seed: all noise comes from it and
         the clip's key, or, `shared_noise`, from it alone. details: see Predictor.
-    Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD". Stretching is ours.
+    Source: Blattmann et al. 2023 (SVD); Van Hoorick et al. 2024 (GCD), section 5, "Vanilla SVD".
     """
 
     weights: OpenedWeights
@@ -210,20 +218,21 @@ class VanillaSVD:
                 f"{traits.name} makes {traits.config.frames} frames, {clip.key or 'a clip'} has {frames}; evaluate on "
                 "shorter clips"
             )
-        height, width = clip.cameras.target.height, clip.cameras.target.width
+        height, width = self.size or (traits.config.height, traits.config.width)
         key = "" if self.shared_noise else clip.key
-        features = self._features(clip, key)
+        features, lens = self._features(clip, key, height, width), clip.cameras.target
+        crop = middle(lens, width / height)
+        size = (lens.height, lens.width) if crop is None else (crop[3], crop[2])
         draws = [
-            Prediction(video=_stretched(self._draw(features, key, number), height, width)[:frames])
+            Prediction(video=resized(self._draw(features, key, number), *size)[:frames], crop=crop)
             for number in range(self.samples)
         ]
         return replace(draws[0], more=tuple(draws[1:]))
 
-    def _features(self, clip: SourceClip, key: str) -> SourceFeatures:
-        """Of the first frame, encoded once, for all frames."""
+    def _features(self, clip: SourceClip, key: str, height: int, width: int) -> SourceFeatures:
+        """Of the first frame at this size, encoded once, for all frames."""
         config = self.weights().traits.config
-        height, width = self.size or (config.height, config.width)
-        first = _stretched(to_network(clip.source[:1]), height, width, low=-1.0)
+        first = fitted(to_network(clip.source[:1]), height, width)
         noise = Augmentation(noise=unit_noise(tuple(first.shape), self._seed(key)))
         made = self.weights().encode(Clip(video=first, fps=clip.fps), noise)
         tokens = None if made.tokens is None else made.tokens.repeat(config.frames, 1)
@@ -239,11 +248,3 @@ class VanillaSVD:
 
     def _seed(self, name: str) -> int:
         return int.from_bytes(hashlib.sha256(f"{self.seed}:{name}".encode()).digest()[:6])
-
-
-def _stretched(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> Tensor:
-    """[T, 3, ...] at another size, within low..1."""
-    if pictures.shape[-2:] == (height, width):
-        return pictures
-    resized = F.interpolate(pictures, size=(height, width), mode="bicubic", align_corners=False, antialias=True)
-    return resized.clamp(low, 1.0)

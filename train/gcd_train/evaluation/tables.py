@@ -13,12 +13,17 @@ from gcd_train.evaluation.baselines import FROM_EXACT_CLASSES
 from gcd_train.evaluation.paper import CLASS_COLUMNS, PICTURE_COLUMNS, Column, row_label, tables_for
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
 from gcd_train.evaluation.statistics import FIGURE_NAMES, SPANS, FigureName, Interval, Span
-from gcd_train.evaluation.store import REGIONS, Region
+from gcd_train.evaluation.store import FRAMES_IN, REGIONS, Region
 
 NOT_RUN, NO_WEIGHTS, NOTHING = "not run", "no weights given", "-"
 _LINE = "———"
 _OWN_NAMES: dict[Span, str] = {"2-last": "main", "last": "last_frame", "all": "all_frames"}
 _BRACKETS = "In brackets: 95 % interval, bootstrap over scenes. * is given more than the source video."
+_CROPPED = (
+    "† Measured on the middle {} x {} of a frame's {} x {} pixels, which is all that is shown: {}. These are other "
+    "pixels than those of other rows, so no difference to them is drawn."
+)
+_ELSEWHERE = "{}: made elsewhere, read from {} (digest {})."
 _COPIED = "mIoU of {}: these class maps are made from the source's exact ones, which no model is given."
 
 
@@ -162,11 +167,12 @@ def main_tables(of: EvaluatedSet, spans: Sequence[Span] = ("2-last", "last")) ->
 
 
 def region_table(of: EvaluatedSet, frames: Span = "2-last") -> Table:
-    """Every method on all, visible and occluded pixels side by side, with its diversity and sharpness on all."""
-    title = f"Visible and occluded pixels, diversity, sharpness: {frames_told(of, frames)}"
+    """Every method on all, visible and occluded pixels; its diversity, sharpness and flicker on all."""
+    title = f"Visible and occluded pixels, diversity, sharpness, flicker: {frames_told(of, frames)}"
     notes = {
         "diversity": "Diversity: standard deviation over the draws of one view; of two draws or more.",
         "gradient energy": "Gradient energy: view over target, 1 is as sharp as the target.",
+        "flicker": "Flicker: change from frame to frame, view over target; above 1 it changes more than the scene.",
     }
     table = _own_table(of, _REGION_COLUMNS, frames, "regions", title)
     return replace(table, notes=(*table.notes, *(notes[name] for name in table.headings if name in notes)))
@@ -233,6 +239,11 @@ def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[s
     """What stands below a table: its frames and clips, what brackets and stars mean, what is not known."""
     span = frames_told(of, frames)
     notes = [f"{span[0].upper()}{span[1:]} of {len(of.clips)} clips of {of.scenes} scenes. {_BRACKETS}"]
+    for crop in dict.fromkeys(each.crop for each in of.methods if each.crop is not None):
+        daggers = " and ".join(each.name for each in of.methods if each.crop == crop)
+        notes.append(_CROPPED.format(crop[2], crop[3], of.note.width, of.note.height, daggers))
+    for name, details in ((each.name, each.details) for each in of.methods if FRAMES_IN in each.details):
+        notes.append(_ELSEWHERE.format(name, details[FRAMES_IN], details.get("digest", "unknown")))
     copied = [each.name for each in of.methods if each.details.get("baseline") in FROM_EXACT_CLASSES]
     if copied and any(isinstance(column.figure, int) or column.figure == "miou_common" for column in columns):
         notes.append(_COPIED.format(" and ".join(copied)))
@@ -256,6 +267,7 @@ _REGION_COLUMNS = (
     ),
     Column(heading="diversity", figure="diversity", digits=4),
     Column(heading="gradient energy", figure="gradient_energy"),
+    Column(heading="flicker", figure="flicker"),
 )
 
 
@@ -320,12 +332,14 @@ def differences(
     keys: Sequence[str] | None = None,
     columns: Sequence[Column] = (*PICTURE_COLUMNS, *CLASS_COLUMNS),
 ) -> tuple[Difference, ...]:
-    """One method against another, in the columns that both have figures in.
+    """One method against another, in the columns that both have figures in; none if they are of different pixels.
 
     Args:
         keys: of the clips; by default all that both were measured on.
     """
     keys, found = first.common_keys(other) if keys is None else keys, list[Difference]()
+    if first.crop != other.crop:
+        return ()
     for column in columns if keys else ():
         ours, theirs = (each.sums(frames, column.region, keys) for each in (first, other))
         apart = ours.interval(column.figure, theirs)

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.dataset4d import Ontology
-from gcd_train.data.pictures import trained_picture
+from gcd_train.data.pictures import nearest_resized, trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
 from gcd_train.data.splat import splat
-from gcd_train.evaluation.clips import nearest_resized
 from gcd_train.evaluation.galleries import HOLD_S, Strip, beside
 from gcd_train.evaluation.galleries import write_sheet as write_rows
 from gcd_train.evaluation.predictors import pixel_rays

@@ -47,7 +47,8 @@ class Validation:
         for number in range(self._count):
             sample = self._clips.sample(number)
             source, target = to_network(sample.source), to_network(sample.target)
-            clip = Clip(video=source, fps=self._clips.fps)
+            depth = None if sample.source_depth is None else torch.from_numpy(sample.source_depth)
+            clip = Clip(video=source, fps=self._clips.fps, lens=sample.lens, depth=depth)
             view = synthesizer.render(synthesizer.encode(clip), [sample.trajectory])[0]
             scores.append(psnr(view.video, (target + 1) / 2)[1:])
             rows = [source, view.video * 2 - 1, target]

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from gcd_model import weights_path
 from gcd_model.conditioning import relative_pose_features, spherical_features
-from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, ModelConfig
+from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, SMALL, SVD_14, ModelConfig, with_splat
 from gcd_model.errors import CheckpointError, OptionError
 from gcd_model.geometry import Trajectory, motion_bucket
 from gcd_model.layers import sinusoid
 from gcd_model.networks import LoadedWeights, Networks, empty_networks
-from gcd_model.weights.adapter import DIFFUSION, carried_over
+from gcd_model.weights.adapter import DIFFUSION, carried_over, widened
 from gcd_model.weights.card import FAMILIES, Family
 from gcd_model.weights.load import load_weights
 from gcd_model.weights.save import gcd_state
@@ -64,6 +64,7 @@ def model_config(recipe: ModelRecipe) -> ModelConfig:
             width=recipe.width or base.width,
             semantic_classes=DRIVING_CLASSES if recipe.base == "plain-small" and paints else (),
         )
+        changed = with_splat(changed, recipe.splat)
         # msgspec does not check what `replace` makes; a round trip does
         config = msgspec.json.decode(msgspec.json.encode(changed), type=ModelConfig)
     except (OptionError, msgspec.ValidationError) as error:
@@ -266,10 +267,16 @@ class Precision:
 
 
 def fresh_networks(config: ModelConfig, seed: int) -> Networks:
-    """Networks as training starts with them: zero-initialised layers are zero."""
+    """Networks as training starts with them: zero-initialised layers are zero, and so is what reads a splat, beside the
+    same random numbers as without one."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return Networks(config)
+        plain = Networks(with_splat(config, "none"))
+    if config.splat == "none":
+        return plain
+    networks = empty_networks(config)
+    networks.load_state_dict(widened(plain.state_dict(), config), assign=True)
+    return networks
 
 
 def start_networks(recipe: ModelRecipe, config: ModelConfig, seed: int) -> Networks:
