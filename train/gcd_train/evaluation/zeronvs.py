@@ -33,7 +33,7 @@ from gcd_model.weights.read import read_file
 from gcd_train.data.sample import to_network
 from gcd_train.errors import RecipeError
 from gcd_train.evaluation.clips import EvaluationSet
-from gcd_train.evaluation.predictors import Prediction, SourceClip, fitted, middle, resized
+from gcd_train.evaluation.predictors import Prediction, SourceClip, fitted, middle, require_one_lens, resized
 from gcd_train.evaluation.runs import gather
 from gcd_train.evaluation.store import Run
 
@@ -146,7 +146,8 @@ class ZeroNVS:
         return f"{ZERONVS} (scale {self.scale:g})"
 
     def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor. No class map."""
+        """See Predictor. No class map. Raises DataError where a lens changes."""
+        require_one_lens(clip, self.name)
         lens, networks = clip.cameras.target, self.networks()
         crop = middle(lens, 1.0)
         square = lens if crop is None else lens.cropped(*crop)
