@@ -11,23 +11,16 @@ from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
 from gcd_train.data.sample import SceneView
-from gcd_train.evaluation.baselines import HexPlane
-from gcd_train.evaluation.hexplane import (
-    SPACE,
-    TIME,
-    HexPlanes,
-    HexPlaneSettings,
-    SceneBounds,
-    resampled,
-)
+from gcd_train.evaluation.hexplane import SPACE, TIME, HexPlane, HexPlanes, resampled
+from gcd_train.evaluation.per_scene import SceneBounds
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)
 FRAMES = 2
 BOX_X = (-2.0, 2.0)
 """Where the box stands in the first and in the last frame."""
-TINY = HexPlaneSettings(
-    updates=60, rays=256, coarse=16, fine=12, features=6, hidden=24, sides=(12, 24), smoothness=1e-4
+TINY = HexPlane(
+    updates=60, rays=256, coarse=16, fine=12, features=6, hidden=24, sides=(12, 24), smoothness=1e-4, device="cpu"
 )
 SOURCE, HELD_OUT = (15.0, 20.0), (60.0, 20.0)
 RING = [(105.0, 20.0), (330.0, 20.0), (50.0, 50.0), (30.0, 5.0)]
@@ -111,7 +104,7 @@ def test_the_cube_stands_where_cameras_of_an_orbit_look() -> None:
 
 def made(**options: object) -> Tensor:
     """The held-out view, [T, 3, H, W]."""
-    return HexPlane(**{"settings": TINY, "device": "cpu", **options}).predict(source_clip()).video
+    return replace(TINY, **options).predict(source_clip()).video
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +129,6 @@ def test_what_moves_is_where_it_is_at_each_moment(learnt: Tensor) -> None:
 
 
 def test_the_same_seed_learns_the_same_and_another_seed_something_else() -> None:
-    first, again, other = (made(settings=replace(TINY, updates=3), seed=seed) for seed in (0, 0, 1))
+    first, again, other = (made(updates=3, seed=seed) for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)

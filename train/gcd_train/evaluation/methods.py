@@ -24,12 +24,11 @@ from gcd_train.evaluation.baselines import (
     REPROJECT_SEMD,
     CopySource,
     GroundHomography,
-    HexPlane,
     ReprojectRgbd,
     ReprojectSemd,
 )
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet
-from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.hexplane import HexPlane
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import SAMPLES, ClipOptions, open_clips, scene_layout
 from gcd_train.evaluation.predictors import (
@@ -227,8 +226,8 @@ def _reproject_semd(clips: EvaluationSet, options: EvaluateOptions, views: int) 
 
 
 def _hexplane(clips: EvaluationSet, options: EvaluateOptions, views: int) -> HexPlane:
-    settings = HexPlaneSettings(updates=options.hexplane_updates, rays=options.hexplane_rays)
-    return HexPlane(views=views, settings=settings, seed=options.seed, device=options.device)
+    learnt = {"updates": options.hexplane_updates, "rays": options.hexplane_rays}
+    return HexPlane(views=views, seed=options.seed, device=options.device, **learnt)
 
 
 def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> VanillaSVD:

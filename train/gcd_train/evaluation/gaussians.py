@@ -1,0 +1,163 @@
+"""A dynamic scene as Gaussians that six planes of features move, learnt from videos.
+
+After Wu et al. 2024, "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering".
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gcd_train.evaluation.hexplane import HexPlanes
+from gcd_train.evaluation.per_scene import Background, Camera, Drawing, PerScene, SceneBounds, Shown, head, linear
+from gcd_train.evaluation.rasteriser import Gaussians, Picture, has_gsplat, rasterised
+
+_DEPTHS = 64  # tried along a ray for a first point
+_UNSEEN = 0.3  # difference of colours that a place counts as which no other view sees
+_FIRST_OPACITY = 0.1  # as in 3DGS
+
+
+def first_points(
+    pictures: Sequence[Shown], bounds: SceneBounds, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Points [N, 3], metres, with colours [N, 3]: for pixels at random, where the other views look most alike.
+
+    Of several places along a ray that is the one whose colour, in the pictures of the same moment that see it, differs
+    least from the pixel's; one at random where no other picture does. It stands in for structure from motion.
+    """
+    points, colours, each = list[Tensor](), list[Tensor](), -(-count // len(pictures))
+    for picture, camera in pictures:
+        chosen = torch.randint(picture[0].numel(), (each,), generator=generator)
+        rays, own = camera.rays()[chosen], picture.flatten(1).T[chosen]
+        steps = (torch.arange(_DEPTHS) + torch.rand(each, _DEPTHS, generator=generator)) / _DEPTHS
+        distances = bounds.half_m * (bounds.begin + (bounds.reach - bounds.begin) * steps)
+        places = rays[:, None, :3] + distances[..., None] * rays[:, None, 3:6]
+        unlike, seen = torch.zeros_like(distances), torch.zeros_like(distances)
+        for other, its in pictures:
+            if its.time == camera.time and its is not camera:
+                there, colour = _looked_up(places, other, its)
+                seen += there
+                unlike += there * (colour - own[:, None]).abs().mean(dim=-1)
+        noise = 1e-3 * torch.rand(unlike.shape, generator=generator)
+        best = torch.where(seen > 0, unlike / seen.clamp(min=1.0), _UNSEEN).add(noise).argmin(dim=1)
+        points.append(places[torch.arange(each), best])
+        colours.append(own)
+    kept = torch.randperm(each * len(pictures), generator=generator)[:count]
+    return torch.cat(points)[kept], torch.cat(colours)[kept]
+
+
+def _looked_up(places: Tensor, picture: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Whether a picture shows the places [P, D, 3], and its colours there, [P, D, 3]."""
+    pose, lens = camera.world_from_camera.float(), camera.lens
+    x, y, z = ((places - pose[:3, 3]) @ pose[:3, :3]).unbind(dim=-1)
+    ahead = z.clamp(min=1e-3)
+    u, v = lens.fx * x / ahead + lens.cx, lens.fy * y / ahead + lens.cy
+    at = torch.stack([2.0 * u / lens.width - 1.0, 2.0 * v / lens.height - 1.0], dim=-1)
+    there = (z > 1e-3) & (at.abs() < 1.0).all(dim=-1)
+    return there, F.grid_sample(picture[None], at[None], align_corners=False)[0].permute(1, 2, 0)
+
+
+class MovedGaussians(nn.Module):
+    """Gaussians as they are at no particular time, and what moves, turns and stretches them.
+
+    rest: means [N, 3], metres, quaternions [N, 4], logarithms of the scales [N, 3], logits of opacities [N, 1] and of
+    colours [N, 3], which do not depend on the direction they are seen from. Before training nothing moves.
+    Source: Wu et al. 2024 (4D-GS), section 4.
+    """
+
+    def __init__(
+        self,
+        points: Tensor,
+        colours: Tensor,
+        bounds: SceneBounds,
+        *,
+        frames: int,
+        features: int,
+        side: int,
+        hidden: int,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.bounds = bounds
+        apart = torch.cdist(points, points).topk(4, largest=False).values[:, 1:].mean(dim=1)
+        ones = points.new_ones(len(points), 1)
+        rest = {
+            "means": points,
+            "quaternions": ones * points.new_tensor([1.0, 0.0, 0.0, 0.0]),
+            "scales": apart.clamp(min=1e-3 * bounds.half_m).log()[:, None].expand(-1, 3),
+            "opacities": ones * torch.tensor(_FIRST_OPACITY).logit(),
+            "colours": colours.clamp(0.02, 0.98).logit(),
+        }
+        self.rest = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in rest.items()})
+        self.planes = HexPlanes(features=features, side=side, moments=frames, generator=generator)
+        self.trunk = linear(3 * features, hidden, generator)
+        self.heads = nn.ModuleList(head(hidden, hidden, outputs, generator) for outputs in (3, 4, 3))
+        for each in self.heads:
+            nn.init.zeros_(each[-1].weight)
+        self.background = Background(generator)
+
+    def forward(self, time: float | None) -> Gaussians:
+        """At a time, -1 first frame, 1 last; None for as they are at rest."""
+        rest = self.rest
+        means, quaternions, scales = rest["means"], rest["quaternions"], rest["scales"]
+        if time is not None:
+            place = self.bounds.to_planes(means.detach())
+            features = self.trunk(self.planes(torch.cat([place, place.new_full((len(place), 1), time)], dim=1))).relu()
+            moved, turned, stretched = (each(features) for each in self.heads)
+            means, quaternions = means + self.bounds.half_m * moved, quaternions + turned
+            scales = scales + stretched
+        return Gaussians(
+            means=means,
+            quaternions=quaternions,
+            scales=scales.exp(),
+            opacities=rest["opacities"][:, 0].sigmoid(),
+            colours=rest["colours"].sigmoid(),
+        )
+
+    def seen(self, camera: Camera, time: float | None) -> tuple[Tensor, Picture]:
+        """The picture of a camera, [3, H, W], before its background; and what it is made of."""
+        drawn = rasterised(self(time), camera)
+        behind = self.background(camera.rays().to(drawn.passed.device)[:, 3:6]).view_as(drawn.colours)
+        return (drawn.colours + drawn.passed[..., None] * behind).permute(2, 0, 1), drawn
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianSplatting(PerScene):
+    """4D-GS with so many input views; see PerScene.
+
+    updates: steps of the optimiser, a picture each. still: share of them before anything moves.
+    points, most: Gaussians at first and at the end. every: updates from one densification to the next, until `dense`,
+    a share of all. thinnest: opacity below which one is taken away.
+    features, side: channels and cells of the planes. hidden: width of the heads.
+    smoothness: weight of the planes' squared differences between neighbouring cells.
+    Source: Wu et al. 2024 (4D-GS); as a baseline, Van Hoorick et al. 2024 (GCD), section 5.
+    """
+
+    stem = "4dgs"
+    updates: int = 1000
+    still: float = 0.25
+    points: int = 3000
+    most: int = 6000
+    every: int = 100
+    dense: float = 0.6
+    thinnest: float = 0.02
+    features: int = 8
+    side: int = 24
+    hidden: int = 32
+    smoothness: float = 0.03
+
+    @property
+    def details(self) -> dict[str, str]:
+        """See Predictor; with what draws."""
+        return {**super().details, "rasteriser": "gsplat" if has_gsplat(self.place) else "torch"}
+
+    def learn(self, pictures: Sequence[Shown], bounds: SceneBounds, frames: int) -> Drawing:
+        """See PerScene."""
+        generator = torch.Generator().manual_seed(self.seed)
+        points, colours = first_points(pictures, bounds, self.points, generator)
+        scene = MovedGaussians(points, colours, bounds, frames=frames, features=self.features, side=self.side,
+                               hidden=self.hidden, generator=generator).to(self.place)  # fmt: skip
+        ...
