@@ -105,7 +105,7 @@ def test_its_gradient_is_that_of_its_picture() -> None:
 def test_gsplat_is_given_what_its_documentation_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, object] = {}
 
-    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):  # noqa: ANN001, ANN003, ANN202
+    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
         given.update(viewmats=viewmats, Ks=Ks, **options)
         drawn = rasteriser.rasterised_plainly(
             Gaussians(means=means, quaternions=quats, scales=scales, opacities=opacities, colours=colors), CAMERA

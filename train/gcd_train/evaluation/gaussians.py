@@ -13,11 +13,13 @@ from torch import Tensor, nn
 
 from gcd_train.evaluation.hexplane import HexPlanes
 from gcd_train.evaluation.per_scene import Background, Camera, Drawing, PerScene, SceneBounds, Shown, head, linear
-from gcd_train.evaluation.rasteriser import Gaussians, Picture, has_gsplat, rasterised
+from gcd_train.evaluation.rasteriser import Gaussians, Picture, has_gsplat, rasterised, rotations
 
 _DEPTHS = 64  # tried along a ray for a first point
 _UNSEEN = 0.3  # difference of colours that a place counts as which no other view sees
 _FIRST_OPACITY = 0.1  # as in 3DGS
+_LARGEST = 0.3  # deviation of a Gaussian, as a share of how far it is from the middle of the scene
+_SHRUNK = 0.47  # logarithm of 1.6, by which halves are smaller, as in 3DGS
 
 
 def first_points(
@@ -87,7 +89,7 @@ class MovedGaussians(nn.Module):
         rest = {
             "means": points,
             "quaternions": ones * points.new_tensor([1.0, 0.0, 0.0, 0.0]),
-            "scales": apart.clamp(min=1e-3 * bounds.half_m).log()[:, None].expand(-1, 3),
+            "scales": (0.5 * apart.clamp(min=1e-3 * bounds.half_m)).log()[:, None].expand(-1, 3),
             "opacities": ones * torch.tensor(_FIRST_OPACITY).logit(),
             "colours": colours.clamp(0.02, 0.98).logit(),
         }
@@ -158,6 +160,71 @@ class GaussianSplatting(PerScene):
         """See PerScene."""
         generator = torch.Generator().manual_seed(self.seed)
         points, colours = first_points(pictures, bounds, self.points, generator)
-        scene = MovedGaussians(points, colours, bounds, frames=frames, features=self.features, side=self.side,
-                               hidden=self.hidden, generator=generator).to(self.place)  # fmt: skip
-        ...
+        planes = {"features": self.features, "side": self.side, "hidden": self.hidden}
+        scene = MovedGaussians(points, colours, bounds, frames=frames, generator=generator, **planes).to(self.place)
+        optimiser, falling = self._optimiser(scene), {"means", "planes"}
+        pulled, times = (torch.zeros(len(points), device=self.place) for _ in range(2))
+        for number in range(self.updates):
+            done = number / self.updates
+            for group in optimiser.param_groups:
+                group["lr"] = group["first"] * (0.01**done if group["name"] in falling else 1.0)
+            picture, camera = pictures[int(torch.randint(len(pictures), (), generator=generator))]
+            made, drawn = scene.seen(camera, None if done < self.still else camera.time)
+            drawn.centres.retain_grad()
+            error = F.l1_loss(made, picture.to(self.place))
+            optimiser.zero_grad(set_to_none=True)
+            (error + self.smoothness * scene.planes.roughness()).backward()
+            optimiser.step()
+            pull = drawn.centres.grad.view(-1, 2).norm(dim=1)
+            pulled, times = pulled + pull, times + (pull > 0)
+            if (number + 1) % self.every == 0 and done < self.dense:
+                self._renew(scene, optimiser, pulled / times.clamp(min=1.0), generator)
+                pulled, times = (torch.zeros(len(scene.rest["means"]), device=self.place) for _ in range(2))
+        return partial(self._draw, scene.eval())
+
+    def _draw(self, scene: MovedGaussians, camera: Camera) -> Tensor:
+        return scene.seen(camera, camera.time)[0].clamp(0.0, 1.0)
+
+    def _optimiser(self, scene: MovedGaussians) -> torch.optim.Adam:
+        """Rates as in 3DGS, times ten as there are a tenth or less of its updates."""
+        rates = {"means": 1e-3 * scene.bounds.half_m, "quaternions": 0.005, "scales": 0.02, "opacities": 0.05}
+        groups = [{"name": name, "params": [value], "first": (rates | {"colours": 0.02})[name]}
+                  for name, value in scene.rest.items()]  # fmt: skip
+        groups.append({"name": "planes", "params": list(scene.planes.parameters()), "first": 0.02})
+        others = [scene.trunk, scene.heads, scene.background]
+        weights = [weight for module in others for weight in module.parameters()]
+        groups.append({"name": "heads", "params": weights, "first": 0.002})
+        return torch.optim.Adam(groups, lr=0.0, eps=1e-15, betas=(0.9, 0.99))
+
+    @torch.no_grad()
+    def _renew(
+        self, scene: MovedGaussians, optimiser: torch.optim.Adam, pull: Tensor, generator: torch.Generator
+    ) -> None:
+        """Take away what is too thin or too large; double what pictures pull at most, of large ones as two halves.
+
+        pull: [N], mean length of the gradient of a Gaussian's place in the pictures.
+        Source: Kerbl et al. 2023 (3DGS), section 5.2. That an eighth is doubled, in place of a threshold, is ours.
+        """
+        rest, scales = scene.rest, scene.rest["scales"].exp()
+        far = (rest["means"] - scene.bounds.centre.to(self.place)).norm(dim=1).clamp(min=scene.bounds.half_m)
+        stay = (rest["opacities"][:, 0].sigmoid() > self.thinnest) & (scales.amax(dim=1) < _LARGEST * far)
+        kept = stay.nonzero()[:, 0]
+        doubled = kept[pull[kept].topk(min(len(kept) // 8, max(self.most - len(kept), 0))).indices]
+        large = torch.zeros_like(stay).index_fill(0, doubled, True) & (scales.amax(dim=1) > scales.amax(dim=1).median())
+        aside = (
+            torch.randn(len(stay), 3, 1, generator=generator).to(self.place) * scales[..., None] * large[:, None, None]
+        )
+        aside = (rotations(rest["quaternions"]) @ aside)[..., 0]
+        rest["scales"][large] -= _SHRUNK
+        rows, side = torch.cat([kept, doubled]), torch.ones(len(kept) + len(doubled), 1, device=self.place)
+        side[len(kept) :] = -1.0
+        for group in optimiser.param_groups:
+            if group["name"] in rest:
+                old = rest[group["name"]]
+                value = old[rows] + (side * aside[rows] if group["name"] == "means" else 0.0)
+                group["params"] = [nn.Parameter(value)]
+                rest[group["name"]] = group["params"][0]
+                moments = optimiser.state.pop(old)
+                for name in ("exp_avg", "exp_avg_sq"):
+                    moments[name] = moments[name][rows] * (side > 0)  # a twin begins anew
+                optimiser.state[group["params"][0]] = moments

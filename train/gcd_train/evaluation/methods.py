@@ -28,6 +28,7 @@ from gcd_train.evaluation.baselines import (
     ReprojectSemd,
 )
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet
+from gcd_train.evaluation.gaussians import GaussianSplatting
 from gcd_train.evaluation.hexplane import HexPlane
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import SAMPLES, ClipOptions, open_clips, scene_layout
@@ -68,6 +69,7 @@ class EvaluateOptions(ClipOptions):
     ] = None
     hexplane_updates: Annotated[int, Option(min=1, help="hexplane_K: steps of learning a clip.")] = 1000
     hexplane_rays: Annotated[int, Option(min=1, help="hexplane_K: rays in each of these steps.")] = 1024
+    gaussian_updates: Annotated[int, Option(min=1, help="4dgs_K: steps of learning a clip, a picture each.")] = 1000
     lpips: Annotated[Path | None, Option(help="Folder with LPIPS weights; without, no such figure.")] = None
     device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
     dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; by default as stored.")] = None
@@ -230,6 +232,10 @@ def _hexplane(clips: EvaluationSet, options: EvaluateOptions, views: int) -> Hex
     return HexPlane(views=views, seed=options.seed, device=options.device, **learnt)
 
 
+def _gaussians(clips: EvaluationSet, options: EvaluateOptions, views: int) -> GaussianSplatting:
+    return GaussianSplatting(views=views, seed=options.seed, device=options.device, updates=options.gaussian_updates)
+
+
 def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> VanillaSVD:
     """With weights that are opened where they are used: the published file `svd.safetensors`, its diffusers folder, or
     our own of the same task. A published file is taken to be SVD, whatever it is called."""
@@ -259,5 +265,6 @@ METHODS: dict[str, MethodKind] = {
     REPROJECT_SEMD: MethodKind(make=_reproject_semd, makes="classes", usual=True),
     VANILLA_SVD: MethodKind(make=_vanilla_svd),
     "hexplane": MethodKind(make=_hexplane, views=True),
+    "4dgs": MethodKind(make=_gaussians, views=True),
 }
 """What can be measured beside weights and saved frames; a new method is one entry, and a `Predictor` of its own."""

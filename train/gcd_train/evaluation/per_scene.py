@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from gcd_model.geometry import Intrinsics
 from gcd_train.evaluation.predictors import Prediction, SourceClip, to_pictures
 
-
 _INNER = 0.5  # half a side of the box drawn to scale, as a share of the farthest camera's distance from its middle
 # Where rays begin, as a share of the nearest camera's distance from the middle: pictures painted on the air in front of
 # each camera explain all inputs and no other view.

@@ -192,7 +192,7 @@ class _Mixed(torch.autograd.Function):
     def forward(ctx: Any, log_alpha: Tensor, colours: Tensor) -> tuple[Tensor, Tensor]:
         alpha = log_alpha.clamp(min=_NOTHING).exp_().clamp_(max=DENSEST)
         alpha *= alpha >= FAINTEST
-        passed = (1.0 - alpha).cumprod(dim=1)
+        passed = (1.0 - alpha).cumprod_(dim=1)
         share = alpha.clone()
         share[:, 1:] *= passed[:, :-1]
         ctx.save_for_backward(alpha, passed[:, -1:], share, colours)
@@ -201,7 +201,7 @@ class _Mixed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *wanted: Tensor) -> tuple[Tensor, Tensor]:
         alpha, passed, share, colours = ctx.saved_tensors
-        own = share * (colours @ wanted[0].mT)  # [n, K, P]
-        behind = own.sum(dim=1, keepdim=True) - own.cumsum(dim=1) + passed * wanted[1].mT
-        own -= behind * alpha / (1.0 - alpha)
-        return own * (alpha < DENSEST), share @ wanted[0]
+        own = (colours @ wanted[0].mT).mul_(share)  # [n, K, P]
+        behind = own.sum(dim=1, keepdim=True).addcmul_(passed, wanted[1].mT) - own.cumsum(dim=1)
+        own -= behind.mul_(alpha).div_(1.0 - alpha)
+        return own.mul_(alpha < DENSEST), share @ wanted[0]
