@@ -50,7 +50,7 @@ def by_loops(of: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
             u, v = (min(max(each, -0.15 * size), 1.15 * size) for each, size in ((u, lens.width), (v, lens.height)))
             rows = [[lens.fx / z, 0, (lens.cx - u) / z], [0, lens.fy / z, (lens.cy - v) / z]]
             jacobian = torch.tensor(rows, dtype=torch.float64) @ at[:3, :3] @ turn
-            flat = jacobian @ torch.diag(scale**2) @ jacobian.T + LOW_PASS * torch.eye(2)
+            flat = jacobian @ torch.diag(scale**2) @ jacobian.T + LOW_PASS * torch.eye(2, dtype=torch.float64)
             middle = torch.stack([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy])
             found.append((float(z), middle, torch.linalg.inv(flat), opacity, colour))
     colours = torch.zeros(lens.height, lens.width, 3, dtype=torch.float64)

@@ -146,6 +146,7 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
     [
         ("hexplane_4", {}, 3, "HexPlane"),
         ("4D-GS", {}, 3, "4D-GS"),
+        ("4dgs_8", {}, 3, "4D-GS"),
         ("Zero-NVS", {}, 3, "ZeroNVS"),
         ("vanilla_svd", {}, 3, "Vanilla SVD"),
         ("reproject_rgbd", {}, 4, "Reproject RGB-D"),

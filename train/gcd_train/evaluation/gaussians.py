@@ -96,7 +96,7 @@ class MovedGaussians(nn.Module):
         self.rest = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in rest.items()})
         self.planes = HexPlanes(features=features, side=side, moments=frames, generator=generator)
         self.trunk = linear(3 * features, hidden, generator)
-        self.heads = nn.ModuleList(head(hidden, hidden, outputs, generator) for outputs in (3, 4, 3))
+        self.heads = nn.ModuleList(head(hidden, hidden, outputs, generator) for outputs in (3, 4, 3, 1))
         for each in self.heads:
             nn.init.zeros_(each[-1].weight)
         self.background = Background(generator)
@@ -104,18 +104,18 @@ class MovedGaussians(nn.Module):
     def forward(self, time: float | None) -> Gaussians:
         """At a time, -1 first frame, 1 last; None for as they are at rest."""
         rest = self.rest
-        means, quaternions, scales = rest["means"], rest["quaternions"], rest["scales"]
+        means, quaternions, scales, opacities = (rest[name] for name in ("means", "quaternions", "scales", "opacities"))
         if time is not None:
             place = self.bounds.to_planes(means.detach())
             features = self.trunk(self.planes(torch.cat([place, place.new_full((len(place), 1), time)], dim=1))).relu()
-            moved, turned, stretched = (each(features) for each in self.heads)
+            moved, turned, stretched, thickened = (each(features) for each in self.heads)
             means, quaternions = means + self.bounds.half_m * moved, quaternions + turned
-            scales = scales + stretched
+            scales, opacities = scales + stretched, opacities + thickened
         return Gaussians(
             means=means,
             quaternions=quaternions,
             scales=scales.exp(),
-            opacities=rest["opacities"][:, 0].sigmoid(),
+            opacities=opacities[:, 0].sigmoid(),
             colours=rest["colours"].sigmoid(),
         )
 
