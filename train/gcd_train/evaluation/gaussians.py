@@ -12,13 +12,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_train.evaluation.hexplane import HexPlanes
-from gcd_train.evaluation.per_scene import Background, Camera, Drawing, PerScene, SceneBounds, Shown, head, linear
+from gcd_train.evaluation.per_scene import Background, Camera, Drawing, PerScene, SceneBounds, Shown, linear
 from gcd_train.evaluation.rasteriser import Gaussians, Picture, has_gsplat, rasterised, rotations
 
 _DEPTHS = 64  # tried along a ray for a first point
 _UNSEEN = 0.3  # difference of colours that a place counts as which no other view sees
 _FIRST_OPACITY = 0.1  # as in 3DGS
 _LARGEST = 0.3  # deviation of a Gaussian, as a share of how far it is from the middle of the scene
+_FALLING = {"means": 0.01, "planes": 0.1, "heads": 0.1}  # learning rates at the end, as shares of the first
 _SHRUNK = 0.47  # logarithm of 1.6, by which halves are smaller, as in 3DGS
 
 
@@ -67,7 +68,8 @@ class MovedGaussians(nn.Module):
 
     rest: means [N, 3], metres, quaternions [N, 4], logarithms of the scales [N, 3], logits of opacities [N, 1] and of
     colours [N, 3], which do not depend on the direction they are seen from. Before training nothing moves.
-    Source: Wu et al. 2024 (4D-GS), section 4.
+    Source: Wu et al. 2024 (4D-GS), section 4. Opacities change, too, so that what moves far from one frame to the next can
+    fade here and appear there; that is ours.
     """
 
     def __init__(
@@ -96,9 +98,9 @@ class MovedGaussians(nn.Module):
         self.rest = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in rest.items()})
         self.planes = HexPlanes(features=features, side=side, moments=frames, generator=generator)
         self.trunk = linear(3 * features, hidden, generator)
-        self.heads = nn.ModuleList(head(hidden, hidden, outputs, generator) for outputs in (3, 4, 3, 1))
+        self.heads = nn.ModuleList(linear(hidden, outputs, generator) for outputs in (3, 4, 3, 1))
         for each in self.heads:
-            nn.init.zeros_(each[-1].weight)
+            nn.init.zeros_(each.weight)
         self.background = Background(generator)
 
     def forward(self, time: float | None) -> Gaussians:
@@ -130,7 +132,7 @@ class MovedGaussians(nn.Module):
 class GaussianSplatting(PerScene):
     """4D-GS with so many input views; see PerScene.
 
-    updates: steps of the optimiser, a picture each. still: share of them before anything moves.
+    updates: steps of the optimiser, a picture each. still: share of them before anything moves (warm-up).
     points, most: Gaussians at first and at the end. every: updates from one densification to the next, until `dense`,
     a share of all. thinnest: opacity below which one is taken away.
     features, side: channels and cells of the planes. hidden: width of the heads.
@@ -139,7 +141,7 @@ class GaussianSplatting(PerScene):
     """
 
     stem = "4dgs"
-    updates: int = 1000
+    updates: int = 1500
     still: float = 0.25
     points: int = 3000
     most: int = 6000
@@ -149,7 +151,7 @@ class GaussianSplatting(PerScene):
     features: int = 8
     side: int = 24
     hidden: int = 32
-    smoothness: float = 0.03
+    smoothness: float = 0.001
 
     @property
     def details(self) -> dict[str, str]:
@@ -162,21 +164,24 @@ class GaussianSplatting(PerScene):
         points, colours = first_points(pictures, bounds, self.points, generator)
         planes = {"features": self.features, "side": self.side, "hidden": self.hidden}
         scene = MovedGaussians(points, colours, bounds, frames=frames, generator=generator, **planes).to(self.place)
-        optimiser, falling = self._optimiser(scene), {"means", "planes"}
+        optimiser = self._optimiser(scene)
         pulled, times = (torch.zeros(len(points), device=self.place) for _ in range(2))
         for number in range(self.updates):
             done = number / self.updates
             for group in optimiser.param_groups:
-                group["lr"] = group["first"] * (0.01**done if group["name"] in falling else 1.0)
+                group["lr"] = group["first"] * _FALLING.get(group["name"], 1.0) ** done
             picture, camera = pictures[int(torch.randint(len(pictures), (), generator=generator))]
             made, drawn = scene.seen(camera, None if done < self.still else camera.time)
             drawn.centres.retain_grad()
-            error = F.l1_loss(made, picture.to(self.place))
+            loss = F.l1_loss(made, picture.to(self.place))
+            if done >= self.still:  # before, the planes are to stay as they are
+                loss = loss + self.smoothness * scene.planes.roughness()
             optimiser.zero_grad(set_to_none=True)
-            (error + self.smoothness * scene.planes.roughness()).backward()
+            loss.backward()
             optimiser.step()
-            pull = drawn.centres.grad.view(-1, 2).norm(dim=1)
-            pulled, times = pulled + pull, times + (pull > 0)
+            if drawn.centres.grad is not None:  # some are in the picture
+                pull = drawn.centres.grad.view(-1, 2).norm(dim=1)
+                pulled, times = pulled + pull, times + (pull > 0)
             if (number + 1) % self.every == 0 and done < self.dense:
                 self._renew(scene, optimiser, pulled / times.clamp(min=1.0), generator)
                 pulled, times = (torch.zeros(len(scene.rest["means"]), device=self.place) for _ in range(2))
@@ -190,10 +195,10 @@ class GaussianSplatting(PerScene):
         rates = {"means": 1e-3 * scene.bounds.half_m, "quaternions": 0.005, "scales": 0.02, "opacities": 0.05}
         groups = [{"name": name, "params": [value], "first": (rates | {"colours": 0.02})[name]}
                   for name, value in scene.rest.items()]  # fmt: skip
-        groups.append({"name": "planes", "params": list(scene.planes.parameters()), "first": 0.02})
+        groups.append({"name": "planes", "params": list(scene.planes.parameters()), "first": 0.2})
         others = [scene.trunk, scene.heads, scene.background]
         weights = [weight for module in others for weight in module.parameters()]
-        groups.append({"name": "heads", "params": weights, "first": 0.002})
+        groups.append({"name": "heads", "params": weights, "first": 0.03})
         return torch.optim.Adam(groups, lr=0.0, eps=1e-15, betas=(0.9, 0.99))
 
     @torch.no_grad()

@@ -69,7 +69,7 @@ class EvaluateOptions(ClipOptions):
     ] = None
     hexplane_updates: Annotated[int, Option(min=1, help="hexplane_K: steps of learning a clip.")] = 1000
     hexplane_rays: Annotated[int, Option(min=1, help="hexplane_K: rays in each of these steps.")] = 1024
-    gaussian_updates: Annotated[int, Option(min=1, help="4dgs_K: steps of learning a clip, a picture each.")] = 1000
+    gaussian_updates: Annotated[int, Option(min=1, help="4dgs_K: steps of learning a clip, a picture each.")] = 1500
     lpips: Annotated[Path | None, Option(help="Folder with LPIPS weights; without, no such figure.")] = None
     device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
     dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; by default as stored.")] = None

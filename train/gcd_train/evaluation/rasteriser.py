@@ -98,7 +98,9 @@ def rasterised_plainly(gaussians: Gaussians, camera: Camera) -> Picture:
         members, counts = near_first[members], torch.bincount(tiles, minlength=across * down)
         starts = counts.cumsum(0) - counts
     inverse = torch.linalg.inv(covariances).flatten(1)[:, [0, 1, 3]]
-    table = torch.cat([centres, inverse, gaussians.opacities.log()[:, None], gaussians.colours], dim=1)  # [N, 9]
+    table = torch.cat(
+        [centres, inverse, gaussians.opacities.clamp(min=FAINTEST).log()[:, None], gaussians.colours], dim=1
+    )  # [N, 9]
     light = centres.new_tensor([0.0, 0.0, 0.0, 1.0]).repeat(across * down, _TILE * _TILE, 1)  # of tiles without any
     # lists of a tile differ in length: those of similar lengths are worked out together
     for most in sorted({1 << (count - 1).bit_length() for count in counts.unique().tolist() if count}):
