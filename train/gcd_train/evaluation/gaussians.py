@@ -68,7 +68,7 @@ class MovedGaussians(nn.Module):
 
     rest: means [N, 3], metres, quaternions [N, 4], logarithms of the scales [N, 3], logits of opacities [N, 1] and of
     colours [N, 3], which do not depend on the direction they are seen from. Before training nothing moves.
-    Source: Wu et al. 2024 (4D-GS), section 4. Opacities change, too, so that what moves far from one frame to the next can
+    Source: Wu et al. 2024 (4D-GS), section 4. Opacities change, too, so that what moves far between two frames can
     fade here and appear there; that is ours.
     """
 
