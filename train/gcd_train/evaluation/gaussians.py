@@ -16,6 +16,7 @@ from gcd_train.evaluation.per_scene import Background, Camera, Drawing, PerScene
 from gcd_train.evaluation.rasteriser import Gaussians, Picture, has_gsplat, rasterised, rotations
 
 _DEPTHS = 64  # tried along a ray for a first point
+_ALIKE = 0.05  # difference of colours, in [0, 1], that is none
 _UNSEEN = 0.3  # difference of colours that a place counts as which no other view sees
 _FIRST_OPACITY = 0.1  # as in 3DGS
 _LARGEST = 0.3  # deviation of a Gaussian, as a share of how far it is from the middle of the scene
@@ -29,9 +30,11 @@ def first_points(
     """Points [N, 3], metres, with colours [N, 3]: for pixels at random, where the other views look most alike.
 
     Of several places along a ray that is the one whose colour, in the pictures of the same moment that see it, differs
-    least from the pixel's; one at random where no other picture does. It stands in for structure from motion.
+    least from the pixel's; one at random where no other picture does. Of twice as many pixels those stay that are alike
+    in the fewest places: the sky is so everywhere, and would fill the air. It stands in for structure from motion.
     """
-    points, colours, each = list[Tensor](), list[Tensor](), -(-count // len(pictures))
+    points, colours, unsure = list[Tensor](), list[Tensor](), list[Tensor]()
+    each = -(-2 * count // len(pictures))
     for picture, camera in pictures:
         chosen = torch.randint(picture[0].numel(), (each,), generator=generator)
         rays, own = camera.rays()[chosen], picture.flatten(1).T[chosen]
@@ -45,10 +48,12 @@ def first_points(
                 seen += there
                 unlike += there * (colour - own[:, None]).abs().mean(dim=-1)
         noise = 1e-3 * torch.rand(unlike.shape, generator=generator)
-        best = torch.where(seen > 0, unlike / seen.clamp(min=1.0), _UNSEEN).add(noise).argmin(dim=1)
+        least, best = (torch.where(seen > 0, unlike / seen.clamp(min=1.0), _UNSEEN) + noise).min(dim=1)
         points.append(places[torch.arange(each), best])
         colours.append(own)
-    kept = torch.randperm(each * len(pictures), generator=generator)[:count]
+        alike = ((unlike <= (least[:, None] + _ALIKE) * seen) & (seen > 0)).float().mean(dim=1)
+        unsure.append(alike + noise[:, 0])  # at random where they are alike in as many
+    kept = torch.cat(unsure).argsort()[:count]
     return torch.cat(points)[kept], torch.cat(colours)[kept]
 
 
