@@ -103,9 +103,10 @@ class MovedGaussians(nn.Module):
         self.rest = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in rest.items()})
         self.planes = HexPlanes(features=features, side=side, moments=frames, generator=generator)
         self.trunk = linear(3 * features, hidden, generator)
-        self.heads = nn.ModuleList(linear(hidden, outputs, generator) for outputs in (3, 4, 3, 1))
-        for each in self.heads:
+        heads = [linear(hidden, outputs, generator) for outputs in (3, 4, 3, 1)]
+        for each in heads:
             nn.init.zeros_(each.weight)
+        self.heads = nn.ModuleList(heads)
         self.background = Background(generator)
 
     def forward(self, time: float | None) -> Gaussians:

@@ -228,8 +228,13 @@ def _reproject_semd(clips: EvaluationSet, options: EvaluateOptions, views: int) 
 
 
 def _hexplane(clips: EvaluationSet, options: EvaluateOptions, views: int) -> HexPlane:
-    learnt = {"updates": options.hexplane_updates, "rays": options.hexplane_rays}
-    return HexPlane(views=views, seed=options.seed, device=options.device, **learnt)
+    return HexPlane(
+        views=views,
+        seed=options.seed,
+        device=options.device,
+        updates=options.hexplane_updates,
+        rays=options.hexplane_rays,
+    )
 
 
 def _gaussians(clips: EvaluationSet, options: EvaluateOptions, views: int) -> GaussianSplatting:
