@@ -51,8 +51,8 @@ def first_points(
         least, best = (torch.where(seen > 0, unlike / seen.clamp(min=1.0), _UNSEEN) + noise).min(dim=1)
         points.append(places[torch.arange(each), best])
         colours.append(own)
-        alike = ((unlike <= (least[:, None] + _ALIKE) * seen) & (seen > 0)).float().mean(dim=1)
-        unsure.append(alike + noise[:, 0])  # at random where they are alike in as many
+        alike = unlike <= (least[:, None] + _ALIKE) * seen  # and so is what no other picture shows
+        unsure.append(alike.float().mean(dim=1) + noise[:, 0])  # at random where as many are alike
     kept = torch.cat(unsure).argsort()[:count]
     return torch.cat(points)[kept], torch.cat(colours)[kept]
 
