@@ -26,11 +26,11 @@ from gcd_train.data.files import MANIFEST, Matrix, SceneManifest
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.errors import DataError, RecipeError, TrainError
 from gcd_train.evaluation.anyview import benchmark_table, grid_size, published_table
-from gcd_train.evaluation.baselines import HexPlane
-from gcd_train.evaluation.hexplane import Camera
+from gcd_train.evaluation.hexplane import HexPlane
 from gcd_train.evaluation.methods import EvaluateOptions, run_note
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import ClipOptions, open_clips
+from gcd_train.evaluation.per_scene import Shown
 from gcd_train.evaluation.predictors import pixel_rays, through_lens
 from gcd_train.evaluation.runs import gather, on_the_same_goals
 from gcd_train.evaluation.store import Run
@@ -255,11 +255,11 @@ def test_both_cameras_may_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     torch.testing.assert_close(cameras.ground_from_source, poses[1])
     assert (cameras.source.fx, cameras.source.cy) == (50 * 4, 7 * 4)
 
-    def learn(pictures: Sequence[tuple[torch.Tensor, Camera]], *rest: object, **more: object) -> None:
+    def learn(self: HexPlane, pictures: Sequence[Shown], *rest: object) -> None:
         given = torch.stack([camera.world_from_camera for _, camera in pictures])
         raise DataError(f"learns from {(given - poses[1]).abs().max():.3f}")
 
-    monkeypatch.setattr("gcd_train.evaluation.baselines.learn", learn)
+    monkeypatch.setattr(HexPlane, "learn", learn)
     with pytest.raises(DataError, match=r"learns from 0\.000"):
         HexPlane().predict(seen)
 

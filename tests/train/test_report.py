@@ -150,6 +150,7 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
         ("4D-GS", {}, 3, "4D-GS"),
         ("zeronvs (scale 5)", {}, 3, "ZeroNVS"),
         ("dynibar", {"frames in": "/frames"}, 3, "DynIBaR"),
+        ("4dgs_8", {}, 3, "4D-GS"),
         ("vanilla_svd", {}, 3, "Vanilla SVD"),
         ("reproject_rgbd", {}, 4, "Reproject RGB-D"),
         ("reproject_semd", {}, 5, "Reproject Sem-D"),

@@ -1,7 +1,7 @@
-"""Baselines without weights: copies, reprojections, HexPlane."""
+"""Baselines without weights that learn nothing: copies and reprojections."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,7 +13,6 @@ from gcd_model.config import SemanticClass
 from gcd_train.data.sample import Bytes, SceneView
 from gcd_train.data.visibility import NARROW, published_tensor
 from gcd_train.errors import DataError
-from gcd_train.evaluation.hexplane import Camera, HexPlaneSettings, SceneBounds, draw, learn
 from gcd_train.evaluation.metrics import NO_CLASS
 from gcd_train.evaluation.predictors import (
     CameraPair,
@@ -21,7 +20,6 @@ from gcd_train.evaluation.predictors import (
     SourceClip,
     own_views,
     pixel_rays,
-    require_one_lens,
     to_labels,
     to_pictures,
     to_pixels,
@@ -186,55 +184,3 @@ def _ids(view: SceneView, count: int, key: str) -> Bytes:
             f"{key or 'a clip'} has class {int(view.classes.max())} of {count}; are the ontologies the same?"
         )
     return view.classes
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HexPlane:
-    """HexPlane with so many input views: the source clip, and further cameras of the scene from two on.
-
-    views: K. settings: what is learnt of each clip, and how long. seed, device: of the learning, see `learn`.
-    With two views or more it is given more than the others, so `privileged`. It makes no class maps.
-    Source: Cao and Johnson 2023 (HexPlane); as a baseline, Van Hoorick et al. 2024 (GCD), section 5.
-    """
-
-    views: int = 1
-    settings: HexPlaneSettings = HexPlaneSettings()  # noqa: RUF009  it is frozen
-    seed: int = 0
-    device: str = "auto"
-
-    @property
-    def name(self) -> str:
-        return f"hexplane_{self.views}"
-
-    @property
-    def privileged(self) -> bool:
-        return self.views > 1
-
-    @property
-    def details(self) -> dict[str, str]:
-        learnt = {key: str(value) for key, value in asdict(self.settings).items()}
-        return {"baseline": self.name, "seed": str(self.seed), **learnt}
-
-    def predict(self, clip: SourceClip) -> Prediction:
-        """See Predictor. Raises DataError where the clip's scene has fewer cameras, or a lens changes."""
-        own, frames = clip.cameras, len(clip.source)
-        require_one_lens(clip, self.name)
-        times = [2.0 * number / max(frames - 1, 1) - 1.0 for number in range(frames)]
-        pictures = [
-            (colours, Camera(lens=own.source, world_from_camera=pose, time=time))
-            for colours, pose, time in zip(
-                to_pictures(clip.source), own.ground_from_source.expand(frames, 4, 4), times, strict=True
-            )
-        ]
-        for video in clip.others(self.views - 1) if clip.others is not None and self.views > 1 else ():
-            for view, time in zip(video, times, strict=True):
-                camera = Camera(lens=view.lens, world_from_camera=torch.from_numpy(view.world_from_camera), time=time)
-                pictures.append((to_pictures(view.rgb[None])[0], camera))
-        wanted = own.ground_from_source @ own.source_from_target  # [T, 4, 4]
-        bounds = SceneBounds.around(torch.stack([*(camera.world_from_camera for _, camera in pictures), *wanted]))
-        field = learn(pictures, bounds, self.settings, frames=frames, seed=self.seed, device=self.device)
-        drawn = [
-            draw(field, Camera(lens=own.target, world_from_camera=pose, time=time), self.settings)
-            for pose, time in zip(wanted, times, strict=True)
-        ]
-        return Prediction(video=torch.stack(drawn))

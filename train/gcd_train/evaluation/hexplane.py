@@ -4,95 +4,14 @@ After Cao and Johnson 2023, "HexPlane: A Fast Representation for Dynamic Scenes"
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gcd_model.geometry import Intrinsics
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HexPlaneSettings:
-    """Everything that decides what is learnt of one clip, and what it costs.
-
-    updates, rays: steps of the optimiser, and rays in each; the time of a clip is about their product.
-    coarse, fine: samples along a ray that look for surfaces, and that are learnt from.
-    features: channels of each plane. hidden: width of the heads.
-    sides: cells along each axis of space, coarse to fine; each has its equal share of the updates.
-    plane_rate, head_rate: learning rates of the first update; both fall to a tenth.
-    smoothness: weight of the squared differences between neighbouring cells.
-    picture_width: pictures are made this narrow, in pixels, before learning and drawing; views are scaled back up.
-    """
-
-    updates: int = 1000
-    rays: int = 1024
-    coarse: int = 48
-    fine: int = 24
-    features: int = 16
-    hidden: int = 64
-    sides: tuple[int, ...] = (24, 48, 96)
-    plane_rate: float = 0.06
-    head_rate: float = 0.01
-    smoothness: float = 0.03
-    picture_width: int = 192
-
-
-_INNER = 0.5  # half a side of the box drawn to scale, as a share of the farthest camera's distance from its middle
-# Where rays begin, as a share of the nearest camera's distance from the middle: pictures painted on the air in front of
-# each camera explain all inputs and no other view.
-_BEGIN = 0.3
-# Where rays end, in halves of the cube beyond the middle as the farthest camera sees it: what lies farther off is seen
-# by one camera only, and each would paint its whole picture there.
-_END = 0.5
-_PULL, _GUESS_M = 1e-3, 10.0  # for cameras with parallel axes: weight of a guess, and how far ahead it lies
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneBounds:
-    """A cube that is drawn to scale; all of space around it is squeezed into a shell of its own thickness.
-
-    centre: float32 [3], world, metres. half_m: half a side of the cube. begin, reach: distances along a ray, in halves,
-    between which there is something to see; beyond there is a background.
-    """
-
-    centre: Tensor
-    half_m: float
-    begin: float
-    reach: float
-
-    @classmethod
-    def around(cls, world_from_camera: Tensor) -> "SceneBounds":
-        """The cube about the point with the least summed squared distance to the cameras' optical axes.
-
-        Where all axes are parallel, that is the point on them 10 m ahead.
-
-        Args:
-            world_from_camera: float [M, 4, 4], input and wanted cameras, metres.
-        """
-        poses = world_from_camera.double()
-        position, ahead = poses[:, :3, 3], poses[:, :3, 2]
-        across = torch.eye(3, dtype=torch.float64) - ahead[:, :, None] * ahead[:, None, :]  # [M, 3, 3]
-        guess = (position + _GUESS_M * ahead).mean(dim=0)
-        left = across.sum(dim=0) + _PULL * torch.eye(3, dtype=torch.float64)
-        centre = torch.linalg.solve(left, torch.einsum("mij,mj->i", across, position) + _PULL * guess)
-        distances = (position - centre).norm(dim=-1)
-        half_m = max(float(distances.max()) * _INNER, 1e-3)
-        nearest, farthest = (float(distance) / half_m for distance in (distances.min(), distances.max()))
-        return cls(centre=centre.float(), half_m=half_m, begin=nearest * _BEGIN, reach=farthest + _END)
-
-    def to_planes(self, points: Tensor) -> Tensor:
-        """World points [..., 3], metres, in the planes' coordinates, within [-1, 1].
-
-            x within the cube, (2 - 1 / |x|) x / |x| outside, |x| the largest coordinate; then halved
-
-        Source: Barron et al. 2022 (Mip-NeRF 360), equation 10, with the largest norm so that the result fills a cube.
-        """
-        scaled = (points - self.centre.to(points.device)) / self.half_m
-        size = scaled.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
-        return scaled * (2.0 - 1.0 / size) / size / 2.0
-
+from gcd_train.evaluation.per_scene import Background, Camera, Drawing, PerScene, SceneBounds, Shown, head, linear
 
 SPACE = ((0, 1), (0, 2), (1, 2))
 TIME = ((2, 3), (1, 3), (0, 3))
@@ -144,9 +63,6 @@ def sampled(planes: Tensor, at: Tensor) -> Tensor:
 
 
 _THIN = -1.0  # added to the density, so that space is a fog at first that lets half of the light pass
-_HARMONICS = 9
-_HEIGHT_WAVES = (2.0, 4.0, 8.0, 16.0)  # over the vertical part of a direction, radians, for a sharp horizon all around
-_BACKGROUND_WIDTH = 32
 
 
 class HexField(nn.Module):
@@ -159,15 +75,15 @@ class HexField(nn.Module):
     """
 
     def __init__(
-        self, bounds: SceneBounds, frames: int, settings: HexPlaneSettings, generator: torch.Generator
+        self, bounds: SceneBounds, frames: int, *, features: int, side: int, hidden: int, generator: torch.Generator
     ) -> None:
         super().__init__()
         self.bounds = bounds
-        self.planes = HexPlanes(features=settings.features, side=settings.sides[0], moments=frames, generator=generator)
-        self.trunk = _linear(3 * settings.features, settings.hidden, generator)
-        self.density_head = _linear(settings.hidden, 1, generator)
-        self.colour_head = _colour_head(settings.hidden, settings.hidden, generator)
-        self.background_head = _colour_head(_HARMONICS + 2 * len(_HEIGHT_WAVES), _BACKGROUND_WIDTH, generator)
+        self.planes = HexPlanes(features=features, side=side, moments=frames, generator=generator)
+        self.trunk = linear(3 * features, hidden, generator)
+        self.density_head = linear(hidden, 1, generator)
+        self.colour_head = head(hidden, hidden, 3, generator)
+        self.background = Background(generator)
 
     def forward(self, points: Tensor, times: Tensor) -> Tensor:
         """What the heads read. points: [P, 3], world, metres; times: [P], -1 first frame, 1 last -> [P, D]."""
@@ -182,26 +98,6 @@ class HexField(nn.Module):
     def colour(self, features: Tensor) -> Tensor:
         """[P, D] -> [P, 3], RGB in [0, 1]."""
         return self.colour_head(features).sigmoid()
-
-    def background(self, directions: Tensor) -> Tensor:
-        """RGB in [0, 1] of what lies behind everything, by the direction [P, 3] of length 1, z up in the world."""
-        x, y, z = directions.unbind(dim=-1)
-        harmonics = [torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
-        heights = [wave(rate * z) for rate in _HEIGHT_WAVES for wave in (torch.sin, torch.cos)]
-        return self.background_head(torch.stack([*harmonics, *heights], dim=-1)).sigmoid()
-
-
-def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    """A layer whose first weights depend on the generator alone."""
-    layer = nn.Linear(inputs, outputs)
-    with torch.no_grad():
-        nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
-        layer.bias.zero_()
-    return layer
-
-
-def _colour_head(inputs: int, width: int, generator: torch.Generator) -> nn.Sequential:
-    return nn.Sequential(_linear(inputs, width, generator), nn.ReLU(), _linear(width, 3, generator))
 
 
 # Weight that every stretch of a ray gets before samples are drawn, so that no surface is missed for good.
@@ -278,91 +174,60 @@ def _jittered(edges: Tensor, generator: torch.Generator | None) -> Tensor:
 _RAYS_AT_ONCE = 4096  # drawn together without gradients: 4096 rays of 48 samples with 48 features are 38 MB
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Camera:
-    """Where and when a picture is taken.
+@dataclass(frozen=True, kw_only=True)
+class HexPlane(PerScene):
+    """HexPlane with so many input views; see PerScene.
 
-    world_from_camera: float [4, 4], metres. time: -1 for the first frame of the clip, 1 for the last.
+    updates, rays: steps of the optimiser, and rays in each; the time of a clip is about their product.
+    coarse, fine: samples along a ray that look for surfaces, and that are learnt from.
+    features: channels of each plane. hidden: width of the heads.
+    sides: cells along each axis of space, coarse to fine; each has its equal share of the updates.
+    plane_rate, head_rate: learning rates of the first update; both fall to a tenth.
+    smoothness: weight of the squared differences between neighbouring cells.
+    Source: Cao and Johnson 2023 (HexPlane); as a baseline, Van Hoorick et al. 2024 (GCD), section 5.
     """
 
-    lens: Intrinsics
-    world_from_camera: Tensor
-    time: float
+    stem = "hexplane"
+    updates: int = 1000
+    rays: int = 1024
+    coarse: int = 48
+    fine: int = 24
+    features: int = 16
+    hidden: int = 64
+    sides: tuple[int, ...] = (24, 48, 96)
+    plane_rate: float = 0.06
+    head_rate: float = 0.01
+    smoothness: float = 0.03
 
-    def rays(self) -> Tensor:
-        """Through the middle of every pixel, row by row, as `render` wants them."""
-        u = (torch.arange(self.lens.width) + 0.5 - self.lens.cx) / self.lens.fx
-        v = (torch.arange(self.lens.height) + 0.5 - self.lens.cy) / self.lens.fy
-        down, right = torch.meshgrid(v, u, indexing="ij")
-        ahead = F.normalize(torch.stack([right, down, torch.ones_like(right)], dim=-1).view(-1, 3), dim=-1)
-        pose = self.world_from_camera.float()
-        time = ahead.new_full((len(ahead), 1), self.time)
-        return torch.cat([pose[:3, 3].expand(len(ahead), 3), ahead @ pose[:3, :3].T, time], dim=1)
+    def learn(self, pictures: Sequence[Shown], bounds: SceneBounds, frames: int) -> Drawing:
+        """See PerScene."""
+        generator = torch.Generator().manual_seed(self.seed)
+        rays = torch.cat([camera.rays() for _, camera in pictures]).to(self.place)
+        colours = torch.cat([picture.flatten(1).T for picture, _ in pictures]).to(self.place)
+        field = HexField(
+            bounds, frames, features=self.features, side=self.sides[0], hidden=self.hidden, generator=generator
+        ).to(self.place)
+        heads = [weight for name, weight in field.named_parameters() if not name.startswith("planes.")]
+        done = 0
+        for stage, side in enumerate(self.sides, start=1):
+            field.planes.refine(side)
+            rates = (self.plane_rate, self.head_rate)
+            groups = [{"params": list(field.planes.parameters())}, {"params": heads}]
+            optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
+            end = self.updates * stage // len(self.sides)
+            for number in range(done, end):
+                for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                    group["lr"] = rate * 0.1 ** (number / self.updates)  # to a tenth at the end
+                chosen = torch.randint(len(colours), (self.rays,), generator=generator).to(self.place)
+                made = render(field, rays[chosen], coarse=self.coarse, fine=self.fine, generator=generator)
+                error = F.mse_loss(made, colours[chosen])
+                optimiser.zero_grad(set_to_none=True)
+                (error + self.smoothness * field.planes.roughness()).backward()
+                optimiser.step()
+            done = end
+        return partial(self._draw, field.eval())
 
-    def narrowed(self, width: int) -> "Camera":
-        """The camera of the same picture at most this wide."""
-        if self.lens.width <= width:
-            return self
-        height = max(1, round(self.lens.height * width / self.lens.width))
-        return replace(self, lens=self.lens.resized(width, height))
-
-
-def learn(
-    pictures: Sequence[tuple[Tensor, Camera]],
-    bounds: SceneBounds,
-    settings: HexPlaneSettings,
-    *,
-    frames: int,
-    seed: int = 0,
-    device: str = "auto",
-) -> HexField:
-    """The field that shows the pictures again.
-
-    Args:
-        pictures: of one scene, float32 [3, H, W] in [0, 1], with their cameras.
-        frames: T of the clip. seed: of weights, rays and samples.
-        device: "auto" (CUDA where there is one), or as torch names it; the field stays there.
-    Returns:
-        On the CPU the same field for the same pictures, settings, seed and number of threads.
-    """
-    auto = "cuda" if torch.cuda.is_available() else "cpu"
-    place, generator = torch.device(auto if device == "auto" else device), torch.Generator().manual_seed(seed)
-    narrow = [camera.narrowed(settings.picture_width) for _, camera in pictures]  # so that learning costs less
-    rays = torch.cat([camera.rays() for camera in narrow]).to(place)
-    sizes = [(camera.lens.height, camera.lens.width) for camera in narrow]
-    shown = [F.interpolate(of[None], size=size, mode="area") for (of, _), size in zip(pictures, sizes, strict=True)]
-    colours = torch.cat([each[0].flatten(1).T for each in shown]).to(place)
-    field = HexField(bounds, frames, settings, generator).to(place)
-    heads = [weight for name, weight in field.named_parameters() if not name.startswith("planes.")]
-    done = 0
-    for stage, side in enumerate(settings.sides, start=1):
-        field.planes.refine(side)
-        rates = (settings.plane_rate, settings.head_rate)
-        groups = [{"params": list(field.planes.parameters())}, {"params": heads}]
-        optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99))
-        end = settings.updates * stage // len(settings.sides)
-        for number in range(done, end):
-            for group, rate in zip(optimiser.param_groups, rates, strict=True):
-                group["lr"] = rate * 0.1 ** (number / settings.updates)  # to a tenth at the end
-            chosen = torch.randint(len(colours), (settings.rays,), generator=generator).to(place)
-            made = render(field, rays[chosen], coarse=settings.coarse, fine=settings.fine, generator=generator)
-            error = F.mse_loss(made, colours[chosen])
-            optimiser.zero_grad(set_to_none=True)
-            (error + settings.smoothness * field.planes.roughness()).backward()
-            optimiser.step()
-        done = end
-    return field.eval()
-
-
-@torch.no_grad()
-def draw(field: HexField, camera: Camera, settings: HexPlaneSettings) -> Tensor:
-    """The picture of a camera, float32 [3, H, W] on the CPU, in [0, 1], in the size of its lens."""
-    narrow = camera.narrowed(settings.picture_width)
-    rays, rows = narrow.rays(), list[Tensor]()
-    for start in range(0, len(rays), _RAYS_AT_ONCE):
-        some = rays[start : start + _RAYS_AT_ONCE].to(field.planes.space.device)
-        rows.append(render(field, some, coarse=settings.coarse, fine=settings.fine).cpu())
-    picture, size = torch.cat(rows).T.reshape(3, narrow.lens.height, -1), (camera.lens.height, camera.lens.width)
-    if narrow is camera:
-        return picture
-    return F.interpolate(picture[None], size=size, mode="bicubic", align_corners=False)[0].clamp(0.0, 1.0)
+    def _draw(self, field: HexField, camera: Camera) -> Tensor:
+        some = camera.rays().split(_RAYS_AT_ONCE)
+        rows = [render(field, rays.to(self.place), coarse=self.coarse, fine=self.fine) for rays in some]
+        return torch.cat(rows).T.unflatten(1, (camera.lens.height, camera.lens.width))

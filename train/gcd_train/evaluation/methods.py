@@ -27,12 +27,12 @@ from gcd_train.evaluation.baselines import (
     REPROJECT_SEMD,
     CopySource,
     GroundHomography,
-    HexPlane,
     ReprojectRgbd,
     ReprojectSemd,
 )
 from gcd_train.evaluation.clips import EvaluationSet, PairedSet
-from gcd_train.evaluation.hexplane import HexPlaneSettings
+from gcd_train.evaluation.gaussians import GaussianSplatting
+from gcd_train.evaluation.hexplane import HexPlane
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import SAMPLES, ClipOptions, open_clips, scene_layout
 from gcd_train.evaluation.predictors import (
@@ -77,6 +77,7 @@ class EvaluateOptions(ClipOptions):
     ] = None
     hexplane_updates: Annotated[int, Option(min=1, help="hexplane_K: steps of learning a clip.")] = 1000
     hexplane_rays: Annotated[int, Option(min=1, help="hexplane_K: rays in each of these steps.")] = 1024
+    gaussian_updates: Annotated[int, Option(min=1, help="4dgs_K: steps of learning a clip, a picture each.")] = 1500
     lpips: Annotated[Path | None, Option(help="Folder with LPIPS weights; without, no such figure.")] = None
     device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
     dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; by default as stored.")] = None
@@ -258,8 +259,17 @@ def _reproject_semd(clips: EvaluationSet, options: EvaluateOptions, views: int) 
 
 
 def _hexplane(clips: EvaluationSet, options: EvaluateOptions, views: int) -> HexPlane:
-    settings = HexPlaneSettings(updates=options.hexplane_updates, rays=options.hexplane_rays)
-    return HexPlane(views=views, settings=settings, seed=options.seed, device=options.device)
+    return HexPlane(
+        views=views,
+        seed=options.seed,
+        device=options.device,
+        updates=options.hexplane_updates,
+        rays=options.hexplane_rays,
+    )
+
+
+def _gaussians(clips: EvaluationSet, options: EvaluateOptions, views: int) -> GaussianSplatting:
+    return GaussianSplatting(views=views, seed=options.seed, device=options.device, updates=options.gaussian_updates)
 
 
 def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> VanillaSVD:
@@ -330,5 +340,6 @@ METHODS: dict[str, MethodKind] = {
     VANILLA_SVD: MethodKind(make=_vanilla_svd),
     ZERONVS: MethodKind(make=_zeronvs),
     "hexplane": MethodKind(make=_hexplane, views=True),
+    "4dgs": MethodKind(make=_gaussians, views=True),
 }
 """What can be measured beside weights and saved frames; a new method is one entry, and a `Predictor` of its own."""

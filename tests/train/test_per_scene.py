@@ -11,24 +11,19 @@ from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
 from gcd_train.data.sample import SceneView
-from gcd_train.evaluation.baselines import HexPlane
-from gcd_train.evaluation.hexplane import (
-    SPACE,
-    TIME,
-    HexPlanes,
-    HexPlaneSettings,
-    SceneBounds,
-    resampled,
-)
+from gcd_train.evaluation.gaussians import GaussianSplatting, first_points
+from gcd_train.evaluation.hexplane import SPACE, TIME, HexPlane, HexPlanes, resampled
+from gcd_train.evaluation.per_scene import Camera, PerScene, SceneBounds
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)
 FRAMES = 2
 BOX_X = (-2.0, 2.0)
 """Where the box stands in the first and in the last frame."""
-TINY = HexPlaneSettings(
-    updates=60, rays=256, coarse=16, fine=12, features=6, hidden=24, sides=(12, 24), smoothness=1e-4
+TINY = HexPlane(
+    updates=60, rays=256, coarse=16, fine=12, features=6, hidden=24, sides=(12, 24), smoothness=1e-4, device="cpu"
 )
+TINY_GAUSSIANS = GaussianSplatting(updates=150, points=300, most=500, every=30, features=4, side=12, device="cpu")
 SOURCE, HELD_OUT = (15.0, 20.0), (60.0, 20.0)
 RING = [(105.0, 20.0), (330.0, 20.0), (50.0, 50.0), (30.0, 5.0)]
 
@@ -109,15 +104,18 @@ def test_the_cube_stands_where_cameras_of_an_orbit_look() -> None:
     assert found.reach == pytest.approx(2.5, abs=0.01)
 
 
-def made(**options: object) -> Tensor:
+def made(method: PerScene, **options: object) -> Tensor:
     """The held-out view, [T, 3, H, W]."""
-    return HexPlane(**{"settings": TINY, "device": "cpu", **options}).predict(source_clip()).video
+    return replace(method, **options).predict(source_clip()).video
 
 
-@pytest.fixture(scope="module")
-def learnt() -> Tensor:
+both = pytest.mark.parametrize("method", [TINY, TINY_GAUSSIANS], ids=lambda each: each.stem)
+
+
+@pytest.fixture(scope="module", params=[TINY, TINY_GAUSSIANS], ids=lambda each: each.stem)
+def learnt(request: pytest.FixtureRequest) -> Tensor:
     """From the source and four more cameras."""
-    return made(views=5)
+    return made(request.param, views=5)
 
 
 def test_several_views_tell_what_another_camera_sees(learnt: Tensor) -> None:
@@ -135,7 +133,26 @@ def test_what_moves_is_where_it_is_at_each_moment(learnt: Tensor) -> None:
     assert psnr_db(learnt[moved], target[moved]) > psnr_db(learnt[moved], swapped[moved]) + 2.0
 
 
-def test_the_same_seed_learns_the_same_and_another_seed_something_else() -> None:
-    first, again, other = (made(settings=replace(TINY, updates=3), seed=seed) for seed in (0, 0, 1))
+@both
+def test_the_same_seed_learns_the_same_and_another_seed_something_else(method: PerScene) -> None:
+    first, again, other = (made(method, updates=3, seed=seed) for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+def test_first_points_lie_where_other_cameras_see_the_same() -> None:
+    poses = [pose_of((azimuth_deg, 50.0)) for azimuth_deg in (0.0, 90.0, 200.0)]
+    pictures = []
+    for pose in poses:
+        camera = Camera(lens=LENS, world_from_camera=pose, time=-1.0)
+        rays = camera.rays()
+        ground = rays[:, :2] - rays[:, 2:3] / rays[:, 5:6] * rays[:, 3:5]  # no two places have the same colour
+        shown = torch.cat([0.5 + ground / 30.0, torch.full_like(rays[:, :1], 0.5)], dim=1)
+        pictures.append((shown.T.reshape(3, LENS.height, LENS.width), camera))
+    points, shown = first_points(
+        pictures, SceneBounds.around(torch.stack(poses)), 200, torch.Generator().manual_seed(0)
+    )
+    near = points[:, :2].norm(dim=1) < 2.0  # which all three see
+    assert near.sum() > 20
+    assert float((points[near, 2].abs() < 0.3).float().mean()) > 0.9
+    assert_close(shown[near, :2], 0.5 + points[near, :2] / 30.0, rtol=0, atol=0.02)
