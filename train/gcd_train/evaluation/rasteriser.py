@@ -63,8 +63,7 @@ def rasterised(gaussians: Gaussians, camera: Camera) -> Picture:
     """By gsplat where the Gaussians are on a CUDA device and it is there, else by `rasterised_plainly`."""
     if not has_gsplat(gaussians.means.device):
         return rasterised_plainly(gaussians, camera)
-    import gsplat
-
+    gsplat = importlib.import_module("gsplat")
     colours, covered, more = gsplat.rasterization(
         gaussians.means,
         gaussians.quaternions,
