@@ -28,6 +28,7 @@ def test_it_refuses_what_it_does_not_know(words: tuple[str, ...]) -> None:
     assert "takes check, bench or train" in run.stderr
 
 
+@pytest.mark.slow
 def test_its_options_and_engines_exist() -> None:
     command = [sys.executable, str(ROOT / "tools" / "bench_model.py"), "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -145,7 +145,8 @@ def test_a_cache_holds_it_for_every_place_on_the_path(tmp_path: Path) -> None:
     assert_close(clip.splat, torch.cat([each for each in shown if each is not None]), atol=1e-3, rtol=2e-3)
 
 
-@pytest.mark.parametrize("splat", ["given", pytest.param("estimated", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("splat", ["given", "estimated"])
 def test_from_a_recipe_to_figures_which_are_marked_where_depth_is_given(tmp_path: Path, splat: str) -> None:
     """The study's recipe, on clips of a plane."""
     data, valid = (PlaneClips.make(1, width=64).write(tmp_path / f"from-{seed}", seed) for seed in (0, 9))
