@@ -134,7 +134,7 @@ def _hfov_deg(request: ClipRequest, traits: Traits) -> float | None:
         raise UsageError(f"{traits.name} takes no depth; leave --depth out")
     if request.unit_m != 1.0 and (not measured or traits.live):
         raise UsageError("--unit-m is about depth beside a published checkpoint; leave it out")
-    if not measured and not traits.live:
+    if not measured and not traits.live and traits.splat == "none":
         if request.hfov_deg is not None:
             raise UsageError(f"{traits.name} has no use for --hfov-deg; leave it out")
         return None

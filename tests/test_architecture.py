@@ -22,12 +22,12 @@ OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  #
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
     ("client/gcd_client", 7, 1_383),
-    ("model/gcd_model", 41, 9_498),
+    ("model/gcd_model", 41, 9_501),
     ("tests/model", 27, 6_206),
     ("gcd_node", 59, 13_508),
-    ("tests/node", 37, 10_724),
-    ("train/gcd_train", 115, 26_688),
-    ("tests/train", 72, 14_575),
+    ("tests/node", 37, 10_733),
+    ("train/gcd_train", 115, 26_771),
+    ("tests/train", 72, 14_621),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is
 new alone: lately the paper's other methods, AnyViewBench and the splat as a condition."""

@@ -6,9 +6,10 @@ The claims are those of Van Hoorick et al. 2024 (GCD), section 5: gradual views 
 on image-to-video helps, training on goals up to 90 degrees is better there than up to 180, and the model beats what it
 is compared with; and ours, that it helps to be shown the source's points. A training is there once for each seed:
 NAME-s1, NAME-s2 and so on. The figure is the mean paired difference over scenes and seeds; its 95 % interval draws both
-anew, scenes and seeds (bootstrap, 10 000 draws). A claim holds where the interval lies above zero. Three seeds are few
-to draw from, so each one's own difference stands beside. Clips are paired by name where both show the same in the
-frames that count: models of two paths share the last frame alone. Writes findings.md and findings.csv.
+anew, scenes and seeds (bootstrap, 10 000 draws), and what seeds differ by is widened by sqrt(S / (S - 1)), as S of them
+drawn from S differ by less. A claim holds where the interval lies on the better side of zero and so does every seed's
+own difference, which stands beside. Clips are paired by name where both show the same in the frames that count: models
+of two paths share the last frame alone. Writes findings.md and findings.csv.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import numpy as np
 
 from gcd_train.evaluation.paper import PICTURE_COLUMNS
 from gcd_train.evaluation.runs import Run, gather, targets_apart
-from gcd_train.evaluation.statistics import COVERAGE, DRAWS, SEED, Interval, scene_weights
+from gcd_train.evaluation.statistics import COVERAGE, DRAWS, FEW_SCENES, SEED, Interval, scene_weights
 from gcd_train.evaluation.tables import Difference, differences_csv, markdown_rows
 
 GRADUAL, DROP = "study-gradual-pretrained", "study-drop-gradual-90-pretrained"
@@ -51,6 +52,7 @@ def main():
     options = parser.parse_args()
     methods = by_name(gather([Run.read(run) for run in options.runs]))
     rows, notes, found = [], [], []
+    seeds = sorted({seed for name in methods for seed in re.findall(r"-(s\d+)$", name)})
     for text, first, other, frames in CLAIMS:
         head, pairs = [text, first, other, frames], seeds_of(methods, first, other)
         if not pairs:
@@ -62,6 +64,13 @@ def main():
             notes += [note] if note else []
             each_keys.append(keys)
         keys = [key for key in each_keys[0] if all(key in others for others in each_keys)]
+        most, lacking = max(map(len, each_keys)), [seed for seed in seeds if seed not in pairs]
+        if len(keys) < most:
+            notes.append(
+                f"{first} and {other}: {len(keys)} of {most} clips, as not every seed has been measured whole."
+            )
+        if lacking:
+            notes.append(f"{first} and {other}: without {', '.join(lacking)}, which is not there on both sides.")
         apart = [of for column in PICTURE_COLUMNS if (of := difference(pairs, column, frames, keys))] if keys else []
         rows += [[*head, *figures(*each)] for each in apart] or [[*head, "-", "no clips in common", "-", "-", "-"]]
         found += [each for each, _ in apart]
@@ -83,11 +92,14 @@ def by_name(sets):
 def seeds_of(methods, first, other):
     """Both methods of each seed that both were trained with; what is not trained stands beside every seed."""
     pairs = {}
-    for name, (ours, *_) in sorted(methods.items()):
+    for name, (ours, *again) in sorted(methods.items()):
         if re.fullmatch(rf"{re.escape(first)}-s\d+", name):
-            named = methods.get(other + name.removeprefix(first)) or methods.get(other, [])
+            if again:
+                raise SystemExit(f"{name} was measured on two sets of clips; name the runs of one of them")
+            seed = name.removeprefix(f"{first}-")
+            named = methods.get(f"{other}-{seed}") or methods.get(other, [])
             theirs = next((each for each in named if ours.common_keys(each)), None)
-            pairs |= {name: (ours, theirs)} if theirs is not None else {}
+            pairs |= {seed: (ours, theirs)} if theirs is not None else {}
     return pairs
 
 
@@ -119,6 +131,8 @@ def difference(pairs, column, frames, keys):
     if not scenes:
         return None
     drawn = np.random.default_rng(SEED).multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS) / seeds
+    if seeds > 1:
+        drawn = 1 / seeds + (drawn - 1 / seeds) * np.sqrt(seeds / (seeds - 1))
     means = np.einsum("ds,sn,dn->d", drawn, apart, scene_weights(scenes) / scenes, optimize=True)
     low, high = np.quantile(means, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2]) if scenes > 1 else (np.nan, np.nan)
     (first, other), *_ = pairs.values()
@@ -131,7 +145,8 @@ def figures(each, seeds):
     form = f"+.{each.column.digits}f"
     numbers = (format(number, form) for number in (each.apart.value, each.apart.low, each.apart.high))
     apart = ", ".join(format(number, form) for number in seeds)
-    return [each.column.heading, "{} [{}, {}]".format(*numbers), apart, str(each.clips), VERDICTS[each.verdict]]
+    verdict = each.verdict if len({number > 0 for number in seeds}) == 1 and each.clips >= FEW_SCENES else "open"
+    return [each.column.heading, "{} [{}, {}]".format(*numbers), apart, str(each.clips), VERDICTS[verdict]]
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from gcd_model.engines.torch import Engine, arrange
 from gcd_model.errors import DeviceMemoryError, NonFiniteError, OptionError, ShapeError
 from gcd_model.geometry import Intrinsics, Trajectory
 from gcd_model.layers import prepare
-from gcd_model.live.eyes import PlacedFrame, SeenFrame, estimated_depth
+from gcd_model.live.eyes import PlacedFrame, SeenFrame, estimated_depth, packaged_eyes
 from gcd_model.networks import Networks
 from gcd_model.traits import Traits
 from gcd_model.vae import to_pixels
@@ -154,6 +154,8 @@ class Synthesizer:
         if engine is None and next(networks.unet.parameters()).device.type == "cpu":
             arrange(networks)
         self._engine = engine or Engine(networks)
+        if traits.splat == "estimated":
+            packaged_eyes(self._engine.like.device)  # now, not when the first clip comes
 
     @out_of_memory_is_our_error
     @torch.inference_mode()

@@ -32,7 +32,7 @@ from gcd_client.protocol import to_json
 from gcd_model import Clip, RenderOptions, SourceFeatures, Traits, Trajectory, View
 from gcd_model.config import SplatDepth, with_splat
 from gcd_node.cli.main import run_app
-from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError
+from gcd_node.errors import ConfigError, DepthError, SourceError, TooShortError, UsageError
 from gcd_node.frame import Frame, Image
 from gcd_node.image_io import write_video
 from gcd_node.messages import ontology
@@ -233,6 +233,15 @@ def test_of_weights_that_are_shown_points_a_node_runs_those_that_estimate_depth(
     else:
         assert played(model, frames=28).of("win")
         assert model.clips[-1].lens is not None
+
+
+def test_the_field_of_view_can_be_stated_to_weights_that_estimate_depth(video: Path) -> None:
+    shown = replace(traits(), config=with_splat(traits().diffusion, "estimated"))
+    clip = read_clip(video, ClipRequest(hfov_deg=90.0), shown)
+    assert clip.lens is not None
+    assert clip.lens.hfov_deg == pytest.approx(53.13, abs=0.01)  # across the middle half of the picture
+    with pytest.raises(UsageError):
+        read_clip(video, ClipRequest(hfov_deg=90.0), traits())
 
 
 class Telling(FakeSynthesizer):

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -122,6 +123,8 @@ def test_a_sweep_goes_to_the_right_from_ten_degrees_up_whatever_scenes_there_are
         assert {(control.goal.elevation_deg, control.goal.radius_m) for control in controls} == {(10.0, 15.0)}
         to_the_right = to_pose(start).inverse() @ to_pose(controls[1].goal)
         assert to_the_right[0, 3] > 0  # x of the source camera is right
+    assert write_sweep(path, ["scn00009"], step_deg=100.0) == 3
+    assert read_controls(path)["scn00009"][-1] == replace(swept["scn00009"][-1], name="sample_02")  # 180 always
     write_sweep(path, ["scn00009"], step_deg=45.0)
     assert read_controls(path)["scn00009"] == swept["scn00009"]
 

@@ -1,8 +1,10 @@
 """Reports: from made-up records to tables, stars, intervals, curves, galleries; and from the command line."""
 
 import csv
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -157,6 +159,7 @@ def test_a_released_run_also_has_its_own_figures_over_all_frames(tmp_path: Path)
         ("kubric_direct_max180", WEIGHTS, 0, "GCD (direct, max 180, finetuned)"),
         ("mine", {"weights": "ab", "family": "kubric90"}, 3, "GCD (gradual, max 90, finetuned)"),
         ("mine", {"weights": "sha 1902", "steps": "25"}, 3, None),
+        ("kubric-gradual-max90-splat", {**WEIGHTS, "splat": "given depth"}, 3, None),
         ("study-direct-scratch", WEIGHTS, 1, "GCD (direct, scratch)"),
         ("pardom_gradual_semantic", WEIGHTS, 2, "GCD (gradual, finetuned)"),
         ("copy_source", {}, 4, None),
@@ -332,12 +335,12 @@ def test_last_frames_of_two_ways_to_the_same_goals_are_compared(tmp_path: Path) 
 # --- the whole report ---------------------------------------------------------------------------------------------
 
 
-def shown(folder: Path) -> Path:
-    """A run of two methods on the disk, with frames of the first clip of each scene."""
+def shown(folder: Path, *, clips: int = 1) -> Path:
+    """A run of two methods on the disk, with frames of the first clips of each scene."""
     both = "gradual (1 step)", "copy_source"
     kept(folder, *(records(method, -number) for number, method in enumerate(both)))
-    for method, scene in ((method, scene) for method in both for scene in range(SCENES)):
-        at = RunKeeper(folder).views(method, f"scn{scene:05d}.sample_00")
+    for method, scene, clip in product(both, range(SCENES), range(clips)):
+        at = RunKeeper(folder).views(method, f"scn{scene:05d}.sample_{clip:02d}")
         for name, shade in (("source", 10), ("target", 200), ("sample_0", 60 + 60 * both.index(method))):
             (at / name).mkdir(parents=True)
             for number in range(FRAMES):
@@ -377,7 +380,7 @@ def test_a_report_is_written_from_records_and_kept_frames(tmp_path: Path) -> Non
 @pytest.mark.parametrize(("kind", "columns"), [("failures", 3), ("ablation", 3), ("angles", 0)])
 def test_a_figure_is_one_picture_of_what_was_measured(tmp_path: Path, kind: str, columns: int) -> None:
     out = tmp_path / "figure.png"
-    given = ["figure", kind, str(shown(tmp_path / "run")), "--out", str(out), "--clips", "2"]
+    given = ["figure", kind, str(shown(tmp_path / "run", clips=2)), "--out", str(out), "--clips", "2"]
     done = CliRunner().invoke(app, given)
     assert done.exit_code == 0, done.output
     picture = cv2.imread(str(out))
@@ -388,8 +391,33 @@ def test_a_figure_is_one_picture_of_what_was_measured(tmp_path: Path, kind: str,
         assert min(picture.shape[:2]) > 300
 
 
+def test_curves_are_of_the_clips_that_all_methods_were_measured_on_and_of_whole_frames() -> None:
+    few, box = records("few")[:6], (0, 0, 8, 8)
+    cut = [msgspec.structs.replace(each, crop=box) for each in records("zeronvs (scale 2)")]
+    plot = next(plot for plot in all_plots(measured(records("a"), few, cut)) if plot.name == "psnr_by_angle")
+    assert set(plot.curves) == {"a", "few"}
+    assert [[point.clips for point in curve] for curve in plot.curves.values()] == [[2, 2, 2]] * 2
+    assert f"6 of {2 * SCENES} clips" in plot.title
+
+
+def test_the_worst_clip_is_asked_for_even_where_its_frames_were_not_kept(tmp_path: Path) -> None:
+    run = shown(tmp_path / "run")
+    shutil.rmtree(RunKeeper(run).views("gradual (1 step)", "scn00000.sample_00"))
+    with pytest.raises(RunError, match=r"scn00000\.sample_00; evaluate with --views last"):
+        make_figure("failures", [run], tmp_path / "figure.png", clips=1)
+
+
+def test_a_figure_is_of_one_set_of_clips(tmp_path: Path) -> None:
+    runs = [
+        shown(tmp_path / "one"),
+        kept(tmp_path / "other", records("gradual (1 step)"), data_identity="ab", seed=4, kind="driving"),
+    ]
+    with pytest.raises(RunError, match="2 sets"):
+        make_figure("failures", runs, tmp_path / "figure.png")
+
+
 def test_the_clips_that_a_model_misses_most_come_first(tmp_path: Path) -> None:
-    run, drawn = shown(tmp_path / "run"), [0, 0]
+    run, drawn = shown(tmp_path / "run", clips=2), [0, 0]
     for place, clips in enumerate((1, SCENES)):
         make_figure("failures", [run], tmp_path / "figure.png", clips=clips)
         drawn[place] = len(cv2.imread(str(tmp_path / "figure.png")))

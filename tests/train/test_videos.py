@@ -104,11 +104,18 @@ def test_of_two_lenses_both_sides_have_the_narrower_one(tmp_path: Path) -> None:
     assert white[:, 2:-2, 2:-2].min() > 200
 
 
-def opened(data: Path, valid: Path | None = None, **changes: Any) -> RunData:
+def opened(data: Path, valid: Path | None = None, seed: int = 0, **changes: Any) -> RunData:
     told = {"kind": "videos", "held_out": 1, "repeats": 3, **changes}
     recipe = tiny_recipe(data=DataRecipe(**told), unet=msgspec.structs.replace(tiny_recipe().unet, fps=FPS / 2))
+    recipe = msgspec.structs.replace(recipe, seed=seed)
     config = ModelConfig(frames=CLIP, height=32, width=48)
     return open_data(recipe, config, FAMILIES["manipulation"], data, valid)
+
+
+def test_runs_that_draw_other_clips_share_no_latents(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "set" / "second")
+    first, again, other = (opened(tmp_path / "set", seed=seed).clips.origin for seed in (1, 1, 2))
+    assert first == again != other
 
 
 def test_the_last_scene_is_held_out_and_none_is_on_both_sides(folder: Path, tmp_path: Path) -> None:

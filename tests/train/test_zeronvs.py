@@ -299,6 +299,7 @@ def without(part: str) -> dict[str, Tensor]:
         (without("model_ema.diffusion_modelout2bias") | {"model.diffusion_model.out.2.bias": torch.zeros(5)}, "U-Net"),
         (without("cond_stage_model.model.visual.ln_post.bias"), "ln_post.bias"),
         ({"state": torch.zeros(2)}, "another method"),
+        (without("cc_projection.weight"), "no matrix"),
     ],
 )
 def test_files_of_other_methods_and_broken_ones_are_refused(
@@ -326,19 +327,25 @@ def test_it_is_built_from_its_options_and_says_what_it_is(weights: Path) -> None
 
 def test_the_scale_is_the_best_of_a_run_on_other_clips_of_the_kind(tmp_path: Path) -> None:
     clips = plane()
-    named = {f"zeronvs (scale {scale})": {"baseline": "zeronvs", "scale": scale} for scale in ("2", "5", "10")}
+    told = {"baseline": "zeronvs", "weights": "ab"}
+    named = {f"zeronvs (scale {scale})": {**told, "scale": scale} for scale in ("2", "5", "10")}
     keeper = RunKeeper(tmp_path)
     keeper.begin(note(methods=named, kind=clips.kind))
     for (name, _), psnr_db in zip(named.items(), (11.0, 14.0, 13.0), strict=True):
         keeper.keep(record(name, "a", psnr_db=psnr_db))
     keeper.keep(record("zeronvs (scale 10)", "b", psnr_db=90.0))  # no other scale has this clip
-    scale, told = best_scale(tmp_path, clips)
-    assert (scale, "14.00" in told) == (5.0, True)
+    scale, chosen = best_scale(tmp_path, clips, "ab")
+    assert (scale, "14.00" in chosen) == (5.0, True)
     for other in (replace(clips, kind="orbit"), replace(clips, identity=note().data_identity)):
         with pytest.raises(RecipeError):
-            best_scale(tmp_path, other)
+            best_scale(tmp_path, other, "ab")
+    with pytest.raises(RecipeError, match="these weights"):
+        best_scale(tmp_path, clips, "cd")
+    keeper.keep(record("zeronvs (scale 2)", clips.keys[0]))
+    with pytest.raises(RecipeError, match="other scenes"):
+        best_scale(tmp_path, clips, "ab")
     alone = RunKeeper(tmp_path / "alone")
     alone.begin(msgspec.structs.replace(note(kind=clips.kind), methods=dict(list(named.items())[:1])))
     alone.keep(record("zeronvs (scale 2)", "a"))
     with pytest.raises(RecipeError, match="two scales"):
-        best_scale(tmp_path / "alone", clips)
+        best_scale(tmp_path / "alone", clips, "ab")

@@ -183,7 +183,8 @@ def _taken(depth: Tensor, learned: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=2)
-def _packaged_eyes(device: torch.device) -> Eyes:
+def packaged_eyes(device: torch.device) -> Eyes:
+    """The depth network of the model that ships, loaded once."""
     networks = load_weights(weights_path("package:live-small")).networks
     assert isinstance(networks, LiveNetworks)
     return Eyes(networks.to(device, torch.float32))
@@ -202,7 +203,7 @@ def estimated_depth(video: Tensor, lens: Intrinsics) -> Tensor:
     if video.shape[-2] % SIZE_FACTOR or video.shape[-1] % SIZE_FACTOR:
         size = f"{video.shape[-2]} x {video.shape[-1]}"
         raise OptionError(f"depth is estimated for heights and widths that are multiples of {SIZE_FACTOR}, got {size}")
-    metres = torch.stack([_packaged_eyes(video.device).look(frame, lens).metres for frame in video])
+    metres = torch.stack([packaged_eyes(video.device).look(frame, lens).metres for frame in video])
     return torch.where(metres < SKY_M, metres, 0.0)
 
 

@@ -18,7 +18,10 @@ COMMANDS = {
         "Measure weights, baselines and others' frames on held-out clips, and say what is reached.",
     ),
     "export": ("data:export", "Write data in other programs' formats."),
-    "figure": ("evaluate:figure_command", "Draw one figure of the paper from what was measured; nothing is measured again."),
+    "figure": (
+        "evaluate:figure_command",
+        "Draw one figure of the paper from what was measured; nothing is measured again.",
+    ),
     "gallery": (
         "look:gallery_command",
         "View real videos from other cameras: sheets, videos, and a page of them all. A bad video is one line.",

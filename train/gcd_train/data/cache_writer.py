@@ -24,6 +24,7 @@ from typer import Option
 from gcd_model.config import SplatDepth
 from gcd_model.engines.torch import arrange
 from gcd_model.geometry import driving_trajectory
+from gcd_model.live.eyes import estimated_depth
 from gcd_model.loading import random_weights, weights_path
 from gcd_model.weights.card import precision
 from gcd_model.weights.load import load_weights
@@ -205,7 +206,10 @@ def encode_moment(encoders: FrozenEncoders, identity: CacheIdentity, sample: Sam
     tokens = encoders.tokens(source)
     if tokens is not None:
         rows["tokens"] = tokens.half()
-    splat = encoders.splat(splat_of(sample, sources, identity.splat))
+    if identity.splat == "estimated":  # of the one source picture, not of each copy
+        metres = estimated_depth(source, sample.lens).numpy()
+        sample = replace(sample, source_depth=np.repeat(metres, len(sources), axis=0))
+    splat = encoders.splat(splat_of(sample, sources, "none" if identity.splat == "none" else "given"))
     if splat is not None:
         rows["splat"] = splat.half()
     if identity.emphasis:

@@ -40,6 +40,7 @@ from gcd_train.data.cache import (
 )
 from gcd_train.data.sample import Clips, numbers_of, splat_of, to_network
 from gcd_train.errors import DataError, Interrupted, RunError
+from gcd_train.files import only_writer
 from gcd_train.recipe import LatentsRecipe, Recipe
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
 from gcd_train.training.setup import Conditioner, Draws, Precision, digest_of, mirrored_path
@@ -160,6 +161,10 @@ class Encodings:
         """
         identity = self._identity(networks)
         folder = self._place(identity)
+        with only_writer(folder):
+            self._write(networks, folder, identity)
+
+    def _write(self, networks: Networks, folder: Path, identity: str) -> None:
         meta = read_index(folder, LatentsMeta) or self._description(identity)
         _require_identity(folder, meta, identity)
         if meta.sensitivity:

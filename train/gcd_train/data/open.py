@@ -150,7 +150,10 @@ class _Opening:
 
     def _run(self, learned: Samples, held: Samples, count: int, fps: float) -> RunData:
         """count: of the clips that are measured on."""
-        clips, valid = self._clips(learned, len(learned), fps), self._clips(held, count, fps)
+        drawn_by = (self.recipe.seed, fps, self.config.frames, self.config.height, self.config.width)
+        clips, valid = (
+            self._clips(each, n, fps, drawn_by=drawn_by) for each, n in ((learned, len(learned)), (held, count))
+        )
         return RunData(clips=clips, valid=valid, drawn=self._sides(learned))
 
     def cache(self) -> RunData:
@@ -222,14 +225,22 @@ class _Opening:
         pairs = self._pairs(data, sampling, _FIXED_SEED, repeats, class_ids=semantic)
         return self._clips(pairs, len(pairs), wanted, data.ontology if semantic else None)
 
-    def _clips(self, samples: Samples, count: int, fps: float, ontology: Ontology | None = None) -> Clips:
+    def _clips(
+        self,
+        samples: Samples,
+        count: int,
+        fps: float,
+        ontology: Ontology | None = None,
+        drawn_by: tuple[float, ...] = (),
+    ) -> Clips:
+        """drawn_by: what else than [data] decides which frames a clip has; two sets of one origin are the same."""
         sides = self._sides(samples)
         return MadeClips(
             make=sides.sample if ontology is None else partial(_placed, sides, ontology.places),
             seeds=range(count if sides is samples else 2 * count),
             camera=self.config.camera,
             fps=fps,
-            origin=digest_of(self._data, str(self.folder)),
+            origin=digest_of(self._data, str(self.folder), *drawn_by),
             classes=() if ontology is None else ontology.classes,
         )
 

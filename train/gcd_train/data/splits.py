@@ -231,7 +231,7 @@ def write_sweep(path: Path, scenes: Sequence[str], *, step_deg: float, seed: int
     the camera goes 0, `step_deg` and so on to 180 degrees to its right, for which `read_controls` has a sample each.
     Source: Van Hoorick et al. 2024 (GCD), appendix B.2.
     """
-    turns = np.arange(0.0, 180.0 + 1e-6, step_deg)
+    turns = np.append(np.arange(0.0, 180.0, step_deg), 180.0)
     listed: dict[str, dict[str, _Entry]] = {}
     for scene in scenes:
         azimuth_deg = float(generator(seed, scene_number(scene)).uniform(0.0, 360.0))

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from gcd_train.errors import RunError
-from gcd_train.evaluation.galleries import Strip, beside, shown_clips, stacked_sheet, strips
+from gcd_train.evaluation.galleries import Pictures, Strip, beside, shown_clips, stacked_sheet, strips
 from gcd_train.evaluation.paper import is_model
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords, gather, on_the_same_goals
 from gcd_train.evaluation.statistics import Interval
@@ -37,7 +37,8 @@ def make_figure(
         RunError: the runs do not hold what the figure is of. RenderError: a plot is wanted without matplotlib.
     """
     sets = gather([Run.read(folder) for folder in folders])
-    sets = on_the_same_goals(sets)[0] or sets
+    if kind != "views":  # last frames alone, which models of two paths share
+        sets = on_the_same_goals(sets)[0] or sets
     known = dict.fromkeys(method.name for each in sets for method in each.methods)
     if unknown := [name for name in methods if name not in known]:
         raise RunError(f"no method is called {unknown[0]!r} in these runs; there are {', '.join(known)}")
@@ -50,18 +51,48 @@ def make_figure(
             raise RunError(f"a figure of {kind} wants runs of one set of clips with {what}, got {len(plots)} such sets")
         draw(plots[0], out)
         return
-    of = next((of for of in each if of.methods), None)
-    if of is None or (kind == "failures" and len(of.methods) != 1):
-        named = ", ".join(known)
-        wanted = "a model" if kind == "ablation" else "one model: name it with --method"
-        raise RunError(f"a figure of {kind} is of {wanted}; in these runs there are {named}")
-    keys = shown_clips(of, of.methods, clips if kind == "ablation" else len(of.clips))
-    if not keys:
-        raise RunError("no frames were kept; evaluate with --views last")
-    if kind == "failures":
-        keys = sorted(keys, key=lambda key: _last_psnr_db(of.methods[0], key))[:clips]
-    rows = [beside(told := _told(of, key), max(set.intersection(*(set(row.frames) for row in told)))) for key in keys]
-    write_whole(out, png(stacked_sheet(rows)))
+    shown = [of for of in each if of.methods]
+    if len(shown) != 1 or (kind == "failures" and len(shown[0].methods) != 1):
+        wanted = "models" if kind == "ablation" else "one model, named with --method,"
+        raise RunError(
+            f"a figure of {kind} is of {wanted} on one set of clips; these runs hold {len(sets)} sets, and "
+            f"{', '.join(known)}"
+        )
+    (of,) = shown
+    keys = _worst(of.methods[0])[:clips] if kind == "failures" else _shown_by_all(of, clips)
+    write_whole(out, png(stacked_sheet([_at_the_end(_told(of, key), key) for key in keys])))
+
+
+def _worst(method: MethodRecords) -> list[str]:
+    """Clips by the PSNR of their last frame, worst first; those without one are no pictures."""
+    each = {key: method.sums("last", keys=[key]).value("psnr_db") for key in method.places}
+    known = [key for key in each if not isnan(each[key])]
+    if not known:
+        raise RunError(f"{method.name} has no PSNR, so it has no worst clips; name another --method")
+    return sorted(known, key=lambda key: each[key])
+
+
+def _shown_by_all(of: EvaluatedSet, count: int) -> list[str]:
+    """So many clips of which every method kept frames."""
+    common = _common(of.methods)
+    kept = [key for key in shown_clips(of, of.methods, len(of.clips)) if key in common]
+    whole = [key for key in kept if {each.name for each in of.methods} <= {row.name for row in strips(of.methods, key)}]
+    if not whole:
+        raise RunError("no clip has frames of every method; evaluate with --views last")
+    return whole[:count]
+
+
+def _common(methods: Sequence[MethodRecords]) -> set[str]:
+    """The clips that all of them were measured on."""
+    return set.intersection(*(set(method.places) for method in methods)) if methods else set()
+
+
+def _at_the_end(rows: Sequence[Strip], key: str) -> Pictures:
+    """The last frame that all rows have."""
+    moments = set.intersection(*(set(row.frames) for row in rows)) if rows else set[int]()
+    if not moments:
+        raise RunError(f"no frames were kept of {key}; evaluate with --views last")
+    return beside(rows, max(moments))
 
 
 def _chosen(of: EvaluatedSet, names: Sequence[str], *, models: bool) -> tuple[MethodRecords, ...]:
@@ -69,10 +100,6 @@ def _chosen(of: EvaluatedSet, names: Sequence[str], *, models: bool) -> tuple[Me
     if names or not models:
         return named if names else of.methods
     return tuple(method for method in of.methods if is_model(method.name, method.details))
-
-
-def _last_psnr_db(method: MethodRecords, key: str) -> float:
-    return method.sums("last", keys=[key]).value("psnr_db")
 
 
 def _told(of: EvaluatedSet, key: str) -> list[Strip]:
@@ -83,13 +110,14 @@ def _told(of: EvaluatedSet, key: str) -> list[Strip]:
     for row in strips(of.methods, key):
         name = f"{key}{change}" if row.name == "source" else row.name
         if row.name in names and key in names[row.name].places:
-            name = f"{name} {_last_psnr_db(names[row.name], key):.1f} dB"
+            psnr_db = names[row.name].sums("last", keys=[key]).value("psnr_db")
+            name = name if isnan(psnr_db) else f"{names[row.name].starred} {psnr_db:.1f} dB"
         found.append(replace(row, name=name))
     return found
 
 
 ANGLE_STEP_DEG = 15.0
-_MOST_ANGLES = 13  # so many different ones are shown as they are
+_MOST_ANGLES = 20  # so many different ones are shown as they are
 _HEXPLANE = re.compile(r"hexplane[ _-]?(\d+)", re.IGNORECASE)
 
 
@@ -121,11 +149,14 @@ def all_plots(of: EvaluatedSet) -> tuple[Plot, ...]:
 def error_by_angle(of: EvaluatedSet) -> Plot:
     """PSNR of the last frame over the angle that the camera has turned by, |azimuth|; no curve on one path for all.
 
+    Of the clips that all methods were measured on; methods that show a part of the target alone are left out.
+
     Source: GCD, the study of angles in appendix B.2: error against the rotation about the scene.
     """
-    curves: dict[str, list[Point]] = {}
-    for method in of.methods:
-        turned = {each.key: abs(each.change[0]) for each in method.records if each.change is not None}
+    curves, methods, common, told = dict[str, list[Point]](), *_compared(of)
+    for method in methods:
+        records = [each for each in method.records if each.key in common]
+        turned = {each.key: abs(each.change[0]) for each in records if each.change is not None}
         many, groups = len({round(angle, 1) for angle in turned.values()}) > _MOST_ANGLES, dict[float, list[str]]()
         for key, angle in turned.items():  # as it is or, where many differ, in the middle of its step
             middle = (min(angle, 179.999) // ANGLE_STEP_DEG + 0.5) * ANGLE_STEP_DEG
@@ -135,29 +166,42 @@ def error_by_angle(of: EvaluatedSet) -> Plot:
             for x, keys in sorted(groups.items())
         ]
         known = [point for point in points if point.y.known]
-        curves |= {method.name: known} if len(known) > 1 else {}
+        curves |= {method.starred: known} if len(known) > 1 else {}
     across = "azimuth turned by, degrees"
-    return Plot(name="psnr_by_angle", title="Last frame, all pixels", across=across, up="PSNR, dB", curves=curves)
+    return Plot(
+        name="psnr_by_angle", title=f"Last frame, all pixels{told}", across=across, up="PSNR, dB", curves=curves
+    )
 
 
 def ssim_by_views(of: EvaluatedSet) -> Plot:
     """SSIM over the number of views that HexPlane is given; every other method as a level. No curve without HexPlane.
 
+    Of clips and methods as `error_by_angle`.
+
     Source: GCD, section 5: how many input views a reconstruction needs to come near.
     """
-    views = {method.name: int(m[1]) for method in of.methods if (m := _HEXPLANE.search(method.name))}
+    methods, common, told = _compared(of)
+    views = {method.name: int(m[1]) for method in methods if (m := _HEXPLANE.search(method.name))}
     regions: tuple[Region, ...] = ("all", "occluded")
     curves: dict[str, list[Point]] = {}
-    for region, method in product(regions, sorted(of.methods, key=lambda m: views.get(m.name, inf))):
-        name = "HexPlane" if method.name in views else method.name
-        y = method.sums(region=region).interval("ssim")
+    for region, method in product(regions, sorted(methods, key=lambda m: views.get(m.name, inf))):
+        name = "HexPlane" if method.name in views else method.starred
+        y = method.sums(region=region, keys=common).interval("ssim")
         if y.known and views and (name == "HexPlane" or region == "all"):
-            point = Point(x=views.get(method.name, nan), y=y, clips=len(method.records))
+            point = Point(x=views.get(method.name, nan), y=y, clips=len(common))
             curves.setdefault(f"{name}, {region}", []).append(point)
     if all(isnan(curve[0].x) for curve in curves.values()):  # levels alone
         curves = {}
-    title = "HexPlane, frames 2 to the last"
+    title = f"HexPlane, frames 2 to the last{told}"
     return Plot(name="ssim_by_views", title=title, across="views given", up="SSIM", curves=curves)
+
+
+def _compared(of: EvaluatedSet) -> tuple[list[MethodRecords], list[str], str]:
+    """Methods that show whole frames, the clips that all of them were measured on, and what to say where some lack."""
+    methods = [method for method in of.methods if method.crop is None]
+    common = _common(methods)
+    told = "" if len(common) == len(of.clips) else f", {len(common)} of {len(of.clips)} clips"
+    return methods, [key for key in of.clips if key in common], told
 
 
 _SIZE_IN = (7.2, 4.4)

@@ -42,6 +42,7 @@ from gcd_train.evaluation.predictors import (
 )
 from gcd_train.evaluation.store import LPIPS, RunNote
 from gcd_train.evaluation.synthesized import VANILLA_SVD, SynthesizedViews, VanillaSVD
+from gcd_train.evaluation.tables import counted
 from gcd_train.evaluation.zeronvs import ETA, GUIDANCE, STEPS, ZERONVS, ZeroNVS, best_scale, open_zeronvs
 
 
@@ -135,7 +136,7 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
             )
     beside = ((each, each.beside(clips.keys)) for each in methods if isinstance(each, SavedFrames))
     notes += tuple(
-        f"{each.folder} holds frames of {len(names)} clips more than the set, which are not measured, first {names[0]}"
+        f"{each.folder} holds frames of {counted(len(names), 'clip')} outside the set, not measured, first {names[0]}"
         for each, names in beside
         if names
     )
@@ -311,7 +312,7 @@ def _zeronvs(clips: EvaluationSet, options: EvaluateOptions, views: int) -> Zero
     try:
         scale, chosen = float(options.zeronvs_scale), "as given"
     except ValueError:
-        scale, chosen = best_scale(Path(options.zeronvs_scale), clips)
+        scale, chosen = best_scale(Path(options.zeronvs_scale), clips, digest((Path(options.zeronvs),))[:12])
     if not (math.isfinite(scale) and scale > 0):
         raise RecipeError(f"--zeronvs-scale must be metres above 0, got {options.zeronvs_scale}")
     networks = partial(open_zeronvs, _resolved(options.zeronvs), options.device, options.dtype)

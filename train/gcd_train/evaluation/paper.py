@@ -168,8 +168,10 @@ def row_label(method: str, details: Mapping[str, str], table: PaperTable) -> str
     """The row of a table that a method belongs in; None for a method that the paper does not have.
 
     A baseline is known by its name. A model is known by the words of its name and of its family: gradual or direct, 90
-    or 180, scratch; without "direct" it is gradual, without "scratch" finetuned.
+    or 180, scratch; without "direct" it is gradual, without "scratch" finetuned. The paper's are shown no points.
     """
+    if "splat" in details:
+        return None
     known = _baseline(method)
     if known is not None:
         return known

@@ -96,6 +96,7 @@ class SynthesizedViews:
             "samples": str(options.samples),
             "seed": str(options.seed),
             "precision": traits.precision,
+            **({} if traits.splat == "none" else {"splat": f"{traits.splat} depth"}),
         }
 
     @property

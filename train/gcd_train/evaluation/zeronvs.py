@@ -166,27 +166,36 @@ class ZeroNVS:
         return int.from_bytes(hashlib.sha256(f"{self.seed}:{name}".encode()).digest()[:6])
 
 
-def best_scale(run: Path, clips: EvaluationSet) -> tuple[float, str]:
+def best_scale(run: Path, clips: EvaluationSet, weights: str) -> tuple[float, str]:
     """The scale that did best in a run on validation clips, one for all clips; and how it was chosen, in words.
 
     Best is the highest mean PSNR of frames 2 to the last, over the clips that all scales were measured on. The paper
     chose one for each video by eye.
 
     Args:
-        clips: that it is to be used on: of the same kind, and not those of the run.
+        clips: that it is to be used on: of the same kind, and of other scenes. weights: digest of those to be used.
     Raises:
         RunError: there is no such run. RecipeError: it is of other clips than wanted, or has no two scales.
     """
     (of,) = gather([Run.read(run)])
-    found = {float(each.details["scale"]): each for each in of.methods if each.details.get("baseline") == ZERONVS}
-    if of.note.data_identity == clips.identity or of.note.kind != clips.kind:
+    found = {
+        float(each.details["scale"]): each
+        for each in of.methods
+        if each.details.get("baseline") == ZERONVS and each.details.get("weights") == weights
+    }
+    scenes = {record.scene for each in found.values() for record in each.records}
+    shared = sorted(scenes & {name for key in clips.keys for name in (key, key.partition(".")[0])})
+    if shared or of.note.data_identity == clips.identity or of.note.kind != clips.kind:
+        held = of.note.kind if of.note.kind != clips.kind else f"{shared[0]}, too" if shared else "the very clips"
         raise RecipeError(
-            f"a scale is chosen on validation clips of the same kind, {clips.kind}, and {run} holds "
-            f"{'the very clips' if of.note.kind == clips.kind else of.note.kind}; give another run, or the number"
+            f"a scale is chosen on validation clips of the same kind, {clips.kind}, and of other scenes, and {run} "
+            f"holds {held}; give another run, or the number"
         )
     common = set.intersection(*(set(each.places) for each in found.values())) if len(found) > 1 else set[str]()
     if not common:
-        raise RecipeError(f"{run} holds no clips measured with two scales of {ZERONVS}; evaluate there with several")
+        raise RecipeError(
+            f"{run} holds no clips measured with two scales of these weights; evaluate there with several"
+        )
     keys = sorted(common)
     psnr_db = {scale: each.sums(keys=keys).value("psnr_db") for scale, each in sorted(found.items())}
     best = max(psnr_db, key=lambda scale: psnr_db[scale])
@@ -206,7 +215,10 @@ def published_tensors(path: Path) -> Mapping[str, Tensor]:
     lacks = [part for part in (_UNET, _VAE, _IMAGE, _PROJECTION) if not any(name.startswith(part) for name in tensors)]
     if lacks:
         raise CheckpointError(f"{path} is of another method, it has no tensors {lacks[0]}*; give zeronvs.ckpt")
-    token, inputs = tensors[f"{_PROJECTION}weight"].shape
+    projection = tensors.get(f"{_PROJECTION}weight")
+    if projection is None or projection.ndim != 2:
+        raise CheckpointError(f"{path} has no matrix {_PROJECTION}weight; fetch it again")
+    token, inputs = projection.shape
     if inputs - token != CAMERA_NUMBERS:
         raise CheckpointError(
             f"{path} is told of a camera in {inputs - token} numbers, ZeroNVS in {CAMERA_NUMBERS} (Zero-1-to-3 in 4); "
