@@ -244,8 +244,10 @@ def baselines(names: Sequence[str] | None, clips: EvaluationSet, options: Evalua
             raise RecipeError(f"{name} wants depth or the ground, which these clips do not tell; leave it out")
         if views > clips.cameras:
             there = f"{clips.cameras - 1} beside the source" if clips.cameras > 1 else "the source alone"
+            more = ", or --exact, with which scenes of our own have more" if clips.kind == "kubric" else ""
             raise RecipeError(
                 f"{name} wants {views} cameras, and these clips have {there}; give {stem}_{clips.cameras} or less"
+                + more * (not options.exact)
             )
         found.append(kind.make(clips, options, views))
     return tuple(found)
