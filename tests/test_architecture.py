@@ -26,7 +26,7 @@ MOST = [
     ("tests/model", 27, 6_206),
     ("gcd_node", 59, 13_508),
     ("tests/node", 37, 10_733),
-    ("train/gcd_train", 115, 26_773),
+    ("train/gcd_train", 115, 26_772),
     ("tests/train", 72, 14_621),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is

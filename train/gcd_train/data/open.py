@@ -150,10 +150,8 @@ class _Opening:
 
     def _run(self, learned: Samples, held: Samples, count: int, fps: float) -> RunData:
         """count: of the clips that are measured on."""
-        drawn_by = (self.recipe.seed, fps, self.config.frames, self.config.height, self.config.width)
-        clips, valid = (
-            self._clips(each, n, fps, drawn_by=drawn_by) for each, n in ((learned, len(learned)), (held, count))
-        )
+        made = partial(self._clips, fps=fps, drawn_by=(self.recipe.seed,))
+        clips, valid = made(learned, len(learned)), made(held, count)
         return RunData(clips=clips, valid=valid, drawn=self._sides(learned))
 
     def cache(self) -> RunData:
@@ -231,16 +229,17 @@ class _Opening:
         count: int,
         fps: float,
         ontology: Ontology | None = None,
-        drawn_by: tuple[float, ...] = (),
+        drawn_by: tuple[int, ...] = (),
     ) -> Clips:
-        """drawn_by: what else than [data] decides which frames a clip has; two sets of one origin are the same."""
-        sides = self._sides(samples)
+        """drawn_by: what more decides which frames a clip has; sets of one origin are the same."""
+        sides, config = self._sides(samples), self.config
+        size = (config.frames, config.height, config.width)
         return MadeClips(
             make=sides.sample if ontology is None else partial(_placed, sides, ontology.places),
             seeds=range(count if sides is samples else 2 * count),
             camera=self.config.camera,
             fps=fps,
-            origin=digest_of(self._data, str(self.folder), *drawn_by),
+            origin=digest_of(self._data, str(self.folder), fps, size, drawn_by),
             classes=() if ontology is None else ontology.classes,
         )
 

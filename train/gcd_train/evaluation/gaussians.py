@@ -198,9 +198,9 @@ class GaussianSplatting(PerScene):
 
     def _optimiser(self, scene: MovedGaussians) -> torch.optim.Adam:
         """Rates as in 3DGS, times ten as there are a tenth or less of its updates."""
-        rates = {"means": 1e-3 * scene.bounds.half_m, "quaternions": 0.005, "scales": 0.02, "opacities": 0.05}
-        groups = [{"name": name, "params": [value], "first": (rates | {"colours": 0.02})[name]}
-                  for name, value in scene.rest.items()]  # fmt: skip
+        first = {"quaternions": 0.005, "scales": 0.02, "opacities": 0.05, "colours": 0.02}
+        first["means"] = 1e-3 * scene.bounds.half_m
+        groups = [{"name": name, "params": [value], "first": first[name]} for name, value in scene.rest.items()]
         groups.append({"name": "planes", "params": list(scene.planes.parameters()), "first": 0.2})
         others = [scene.trunk, scene.heads, scene.background]
         weights = [weight for module in others for weight in module.parameters()]
