@@ -269,6 +269,9 @@ class SourceInfo:
     hfov_deg: horizontal field of view, if the source itself knows it.
     lens: calibration the source itself knows, for pictures of the size above.
     stamp_uncertainty_us: how far a stamp may be from mid-exposure.
+    optical_frame: TF frame of the camera, x right, y down, z ahead; of a log the pictures' own, else by the kind.
+    recorded_after_ns: of a log, when its first picture was recorded, minus that one's stamp: the log's clock may be
+        another one.
     """
 
     kind: SourceKind
@@ -281,6 +284,11 @@ class SourceInfo:
     hfov_deg: float | None = None
     lens: LensModel | None = None
     stamp_uncertainty_us: int = 500
+    optical_frame: str = ""
+    recorded_after_ns: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "optical_frame", self.optical_frame or f"{self.kind}_optical")
 
     def hfov_in_use(self, stated_deg: float | None) -> float | None:
         """The field of view a launch file states, else what the source itself knows, degrees."""

@@ -145,7 +145,7 @@ def preview_message(context: StreamContext, frame: Frame, arrival_ns: int, epoch
             resize="none" if picture is frame.image else "area",
             epoch=epoch,
         ),
-        frame_id=f"{source.kind}_optical",
+        frame_id=source.optical_frame,
         frame_role=("at_goal",),
         shape=(1, *picture.shape),
         encoding="jpeg",
@@ -188,7 +188,7 @@ def _common(context: StreamContext) -> dict[str, Any]:
         "boot_id": context.boot_id,
         "clock": context.source.clock,
         "t_capture_unc_us": context.source.stamp_uncertainty_us,
-        "src_frame_id": f"{context.source.kind}_optical",
+        "src_frame_id": context.source.optical_frame,
         "cfg_digest": context.digest,
         "pose_units": "scene" if family is None else family.pose_units,
     }

@@ -35,6 +35,7 @@ from gcd_node.ros_messages import (
     note_messages,
     view_messages,
     view_topic,
+    write_bag_metadata,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -253,6 +254,9 @@ class Recorder:
             self._dropped.update(item.topic for item in self._items)
             self._items.clear()
         finished = bool(self._files) and self._files[-1].close(is_broken=is_broken)
+        if finished:
+            with suppress(OSError):  # the disk is full: `ros2 bag reindex` makes it
+                write_bag_metadata(self._files[0].path.parent, self._files)
         reason, message = self._failure or (self._stop or "INTERNAL", "")
         done = self.report()
         fields = {"reason": reason, "file": done.file, "bytes": done.bytes, "written": done.written}

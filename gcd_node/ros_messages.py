@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+import yaml
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
@@ -58,7 +60,8 @@ def _types() -> Any:
 
 
 class McapFile:
-    """An MCAP file being written. size, messages: so far. begun_ns: UTC."""
+    """An MCAP file being written. size, messages: so far. begun_ns: UTC. counts: messages by topic and type. span_ns:
+    log times of its first and last message on the time line."""
 
     def __init__(self, path: Path) -> None:
         """Create `path`. Raises OSError: it is there already, or cannot be."""
@@ -68,6 +71,7 @@ class McapFile:
         self._writer.start(profile="ros2", library=f"gcd-node; mcap-python/{version('mcap')}")
         self._ids: dict[str, int] = {}  # of a type its schema's, of a topic its channel's
         self.size = self.messages = 0
+        self.counts, self.span_ns = Counter[tuple[str, str]](), (2**63 - 1, 0)
         self._has_end = False
         self._flushed = (0, 0)  # size and messages that are on the disk for certain
 
@@ -92,6 +96,8 @@ class McapFile:
             sequence, channel = each.sequence % 2**32, self._ids[each.topic]
             self._writer.add_message(channel, each.log_ns, data, publish_time=each.sent_ns, sequence=sequence)
             self.messages += 1
+            self.counts[each.topic, kind] += 1
+            self.span_ns = min(self.span_ns[0], each.log_ns), max(self.span_ns[1], each.log_ns)
         self.size = self._file.tell()
 
     def flush(self) -> None:
@@ -126,12 +132,42 @@ class McapFile:
         return False
 
 
+def write_bag_metadata(folder: Path, files: Sequence[McapFile]) -> None:
+    """Write metadata.yaml, which makes a ROS 2 bag of a folder with these files. Raises OSError.
+
+    Source: rosbag2's metadata of version 5, that of Humble, which later distributions read.
+    """
+    counts = sum((file.counts for file in files), Counter[tuple[str, str]]())
+
+    def times(part: Sequence[McapFile]) -> dict[str, Any]:
+        start_ns, end_ns = min(each.span_ns[0] for each in part), max(each.span_ns[1] for each in part)
+        span = {"nanoseconds_since_epoch": start_ns}, {"nanoseconds": max(0, end_ns - start_ns)}
+        return {"starting_time": span[0], "duration": span[1], "message_count": sum(each.messages for each in part)}
+
+    def topic(name: str, kind: str) -> dict[str, str]:
+        return {"name": name, "type": kind, "serialization_format": "cdr", "offered_qos_profiles": ""}
+
+    bag = {
+        "version": 5,
+        "storage_identifier": "mcap",
+        **times(files),
+        "topics_with_message_count": [
+            {"topic_metadata": topic(*key), "message_count": count} for key, count in sorted(counts.items())
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file.path.name for file in files],
+        "files": [{"path": file.path.name, **times((file,))} for file in files],
+    }
+    (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": bag}, sort_keys=False))
+
+
 # Inputs and views.
 
 
 def input_messages(frame: Frame, info: SourceInfo, log_ns: int, record: RecordConfig) -> Iterator[RosMessage]:
     """A frame, of a live source with its stamp in UTC, and its camera. info: with the calibration in use."""
-    head, size = _header(frame.stamp_ns, f"{info.kind}_optical"), frame.size
+    head, size = _header(frame.stamp_ns, info.optical_frame), frame.size
     if record.input_encoding == "raw":
         picture = _image(head, frame.image)
     else:

@@ -25,7 +25,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "check": ("run:check", "Look at all that a launch file needs, before anything is started; loads no weights."),
     "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
     "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
-    "replay": ("run:replay_launch", "Replay a launch file's recording in lockstep into a run that can be compared."),
+    "replay": (
+        "run:replay_launch",
+        "Replay a launch file's recording in lockstep into a run that can be compared, or a ROS 2 bag.",
+    ),
     "diff": ("run:diff", "Compare two runs: identical, or how far apart, where first, and what they were made from."),
     "status": ("watch:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),
     "synthesize": (

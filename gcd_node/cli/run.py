@@ -17,6 +17,7 @@ from typer import Argument, Option
 
 from gcd_node.cli.main import table
 from gcd_node.config import LifeConfig, NodeConfig, load_config, to_toml
+from gcd_node.errors import UsageError
 from gcd_node.service import ServiceManager, background_logging
 
 if TYPE_CHECKING:
@@ -136,24 +137,33 @@ def demo(
 
 def replay_launch(
     config: ConfigPath,
-    out: Annotated[Path, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")],
+    out: Annotated[Path | None, Option("--out", metavar="RUN", help="Folder for the run; new, or empty.")] = None,
+    bag: Annotated[Path | None, Option("--bag", metavar="BAG", help="Instead, a ROS 2 bag for its views.")] = None,
     changes: Changes = None,
 ) -> None:
-    """Replay a launch file's recording in lockstep into a run that can be compared.
+    """Replay a launch file's recording in lockstep into a run that can be compared, or into a ROS 2 bag.
 
     RUN gets manifest.json (what it was made from, and a SHA-256 of every view of every window) and the pixels without
-    loss. It appears when it is complete. Opens no socket; the same machine gives the same hashes every time.
+    loss. BAG gets the views with the stamps of the log they were made from, to be played or merged with it. Both appear
+    when they are complete. Opens no socket; the same machine gives the same hashes every time.
     """
-    from gcd_node.replay.lockstep import replay
+    if (out is None) == (bag is None):
+        raise UsageError("a replay is written either as a run, --out RUN, or as a ROS 2 bag, --bag BAG; give one")
+    from gcd_node.replay.lockstep import replay, replay_to_bag
 
     settings = load_config(config, changes or ())
-    loading = Text(f"loading {settings.model.weights}")
+    loading, console = Text(f"loading {settings.model.weights}"), Console(markup=False)
     with Console(stderr=True, markup=False).status(loading) as status:
+        if bag is not None:
+            summary = replay_to_bag(settings, bag, lambda report: status.update(_words(report)))
+            console.print(f"wrote {bag}: {summary.counts.windows} windows", soft_wrap=True, highlight=False)
+            return
+        assert out is not None
         run = replay(settings, out, lambda report: status.update(_words(report)))
     manifest = run.manifest
     totals = {"frames": manifest.frames, "windows": len(manifest.windows), "windows with NaN": manifest.nan_windows}
-    Console(markup=False).print(table([*manifest.made_from.items(), *totals.items(), *manifest.rejected.items()]))
-    Console(markup=False).print(f"wrote {run.path}", soft_wrap=True, highlight=False)
+    console.print(table([*manifest.made_from.items(), *totals.items(), *manifest.rejected.items()]))
+    console.print(f"wrote {run.path}", soft_wrap=True, highlight=False)
 
 
 def diff(

@@ -1,9 +1,11 @@
-"""A launch file replayed: its recording through its model as fast as that goes, into a run on disk."""
+"""A launch file replayed: its recording through its model as fast as that goes, into a run on disk or a ROS 2 bag."""
 
+import dataclasses
 import hashlib
 import platform
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,12 +20,14 @@ from msgspec.structs import replace
 from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
 from gcd_model import Traits
 from gcd_node.config import LifeConfig, NodeConfig
-from gcd_node.errors import ConfigError, ModelFailedError, SourceError
+from gcd_node.errors import ConfigError, ModelFailedError, OutputError, SourceError
+from gcd_node.frame import FrameSource
 from gcd_node.image_io import write_whole
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import PublisherStats
 from gcd_node.node import Node
+from gcd_node.pipeline import Summary
 from gcd_node.replay.run import (
     MANIFEST,
     Digest,
@@ -38,7 +42,8 @@ from gcd_node.replay.run import (
     pixel_digest,
 )
 from gcd_node.session import load_model, model_threads
-from gcd_node.sources import LiveSource, SyntheticSource, open_source, resolve_path
+from gcd_node.ros_messages import McapFile, RosMessage, view_messages, write_bag_metadata
+from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
 from gcd_node.stream_context import config_digest
 
 PARTS = Parts(open_source=open_source, load_model=load_model)
@@ -92,11 +97,7 @@ def replay(
     with new_folder(out) as folder, repeatable:
         writer = RunWriter(folder, on_window)
         summary = Node(config, parts, writer, on_configured=traits.append, on_window=writer.finish_window).run()
-        if not writer.windows:
-            raise ModelFailedError(
-                f'none of the {summary.counts.nan_windows} windows came out: all had NaN; try dtype = "float32" in '
-                "[model], and look at the weights with `gcd-node weights inspect`"
-            )
+        _require_windows(summary)
         manifest = Manifest(
             made_from=_made_from(config, traits[-1]),
             config=msgspec.to_builtins(config),
@@ -111,16 +112,94 @@ def replay(
     return open_run(out)
 
 
-class RunWriter:
-    """A message sink that needs no reader: keeps the windows of a lockstep node and their maps.
+def replay_to_bag(
+    config: NodeConfig, out: Path, on_window: Callable[[WindowReport], None] | None = None, parts: Parts = PARTS
+) -> Summary:
+    """Replay a launch file into the ROS 2 bag `out`: its views, on the time line of the log they were made from.
+
+    Stamps are those of the log's pictures, log times when the log recorded them, and transforms hang on the frame_id of
+    its pictures: so the bag can be played or merged with the log. Args and errors: as of `replay`.
+    """
+    config = lockstep_config(config)
+    with new_folder(out) as folder, closing(McapFile(folder / f"{out.name}_0.mcap")) as file:
+        writer = BagWriter(file, config)
+
+        def opened(section: SourceConfig) -> FrameSource:
+            source = parts.open_source(section)
+            writer.recorded_after_ns = source.info.recorded_after_ns
+            return source
+
+        own = Parts(open_source=opened, load_model=parts.load_model)
+        summary = Node(config, own, writer, on_window=on_window).run()
+        _require_windows(summary)
+        if not file.close():
+            raise OutputError(f"cannot finish {out}: the disk is full or broken; make room on it")
+        write_bag_metadata(folder, [file])
+    return summary
+
+
+def _require_windows(summary: Summary) -> None:
+    if not summary.counts.windows:
+        raise ModelFailedError(
+            f'none of the {summary.counts.nan_windows} windows came out: all had NaN; try dtype = "float32" in '
+            "[model], and look at the weights with `gcd-node weights inspect`"
+        )
+
+
+class DeafSink:
+    """A message sink that needs no reader, and that nobody waits for. What is not overridden is not kept."""
+
+    def __init__(self) -> None:
+        self.stats = PublisherStats()  # nobody reads
+
+    def note(self, topic: StatusTopic, header: OriginHeader, fields: Mapping[str, Any]) -> None: ...
+
+    def preview(self, made: Callable[[], ViewMessage]) -> None: ...
+
+    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None: ...
+
+    def stop_waiting(self) -> None: ...
+
+
+class BagWriter(DeafSink):
+    """Writes views into a file. recorded_after_ns: see SourceInfo."""
+
+    def __init__(self, file: McapFile, config: NodeConfig) -> None:
+        super().__init__()
+        self._file, self.recorded_after_ns, self._config = file, 0, config
+
+    def send(self, message: ViewMessage) -> bool:
+        """Take a view; see MessageSink. Raises OutputError."""
+        if kind_of(message.topic) != "frm":  # a frame is part of its window
+            try:
+                self._file.write(self._at_capture(message))
+            except OSError as error:
+                raise OutputError(f"cannot write {self._file.path}: {error.strerror}; make room on its disk") from error
+        return True
+
+    def _at_capture(self, message: ViewMessage) -> Iterator[RosMessage]:
+        """Its ROS messages at the time of their stamps, by image_transport's names. Ages of a replay mean nothing."""
+        newest_ns = message.header.t_capture_ns[-1]
+        for each in view_messages(message, self._config):
+            head = getattr(each.fields, "header", None)
+            stamp_ns = newest_ns if head is None else head.stamp.sec * 10**9 + head.stamp.nanosec
+            at_ns = stamp_ns + self.recorded_after_ns
+            kind = each.fields.__msgtype__.rpartition("/")[2]
+            if kind != "Float64":
+                topic = f"{each.topic}/compressed" if kind == "CompressedImage" else each.topic
+                yield dataclasses.replace(each, topic=topic, log_ns=at_ns, sent_ns=at_ns)
+
+
+class RunWriter(DeafSink):
+    """Keeps the windows of a lockstep node and their maps.
 
     Single frames are part of their window, and deviations of its samples: neither is kept.
     """
 
     def __init__(self, folder: Path, on_window: Callable[[WindowReport], None] | None) -> None:
+        super().__init__()
         self.windows: list[WindowEntry] = []
         self.troubles: dict[str, str] = {}
-        self.stats = PublisherStats()  # nobody reads
         self._folder, self._on_window = folder, on_window
         self._views: dict[str, dict[KeptKind, Digest]] = {}  # of the window in work, as the next two
         self._seed, self._ood = 0, ()
@@ -165,14 +244,6 @@ class RunWriter:
         if topic == "event" and fields["code"] in ("MODEL_NAN", "GPU_OOM"):
             detail = fields["rung"] if "rung" in fields else f"seeds {', '.join(map(str, fields['seeds']))}"
             self.troubles[f"{fields['code']} in window {fields['window_id']}"] = detail
-
-    # Nobody looks, and nobody is waited for:
-
-    def preview(self, made: Callable[[], ViewMessage]) -> None: ...
-
-    def end(self, message: EndMessage, *, delay_ms: int | None = None) -> None: ...
-
-    def stop_waiting(self) -> None: ...
 
 
 def _made_from(config: NodeConfig, traits: Traits) -> dict[str, str]:

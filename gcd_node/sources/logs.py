@@ -203,6 +203,8 @@ class _Survey:
             codec=codec,
             lens=self.cameras.lens(self.topic, (width, height)),
             stamp_uncertainty_us=_HEADER_UNCERTAINTY_US if self.header_stamps else round(1e6 / fps),
+            optical_frame=printable(self.frame_id, _SHOWN),
+            recorded_after_ns=self._stamps_ns[self.topic][0][1] - stamps[0],
         )
         recorded = self._reader.recorded
         with contextlib.suppress(KeyError, ValueError):  # none was written, or by somebody else

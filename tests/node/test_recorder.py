@@ -234,6 +234,8 @@ def test_a_recording_that_rotated_is_read_part_by_part_and_plays_as_the_source_g
     assert [fields["file"] for fields in box.events("REC_ROTATED")] == [
         f"{path.parent.name}/{path.name}" for path in found[1:]
     ]
+    with AnyReader([found[0].parent]) as bag:  # one ROS 2 bag of several files
+        assert bag.message_count == sum(len(said(path)) for path in found)
     source, again = replayed(found[0].parent, painting_traits())
     for kind in ("win", "cls"):
         assert hashes(again, kind) == hashes(box, kind)
@@ -406,7 +408,7 @@ def test_everything_is_of_ros_2_decodes_and_is_counted_by_the_index(whole: Run) 
     # `ros2 bag play` refuses files in which some messages are CDR and others not (rosbag2 issue 1245)
     assert {each.message_encoding for each in found.channels.values()} == {"cdr"}
     assert {each.encoding for each in found.schemas.values()} == {"ros2msg"}
-    with AnyReader([path]) as reader:  # by the definitions in the file
+    with AnyReader([path.parent]) as reader:  # as a ROS 2 bag, by the definitions in it
         values = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
     assert len(values) == len(heard)
 

@@ -21,6 +21,10 @@ import torch
 import zmq
 from cameras import ramp, write_video
 from fakes import HEIGHT, WIDTH, FakeSource, FakeSynthesizer, fake_config, fake_maps, painting_traits, traits
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from robot_logs import camera_info, compressed, write_bag
+from rosbags.rosbag2 import Reader, StoragePlugin
 
 import gcd_node.testing  # noqa: F401  loaded before the inner sessions, which put sys.modules back
 from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, Trajectory, View
@@ -41,8 +45,9 @@ from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.replay import lockstep
 from gcd_node.replay.compare import Tolerance, compare, report_text
-from gcd_node.replay.lockstep import digest_of, lockstep_config, replay
+from gcd_node.replay.lockstep import digest_of, lockstep_config, replay, replay_to_bag
 from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, keep_pixels, new_folder, open_run, pixel_digest
+from gcd_node.sources import open_source
 from gcd_node.stream_context import config_digest
 
 WINDOWS, FRAMES = 3, 14
@@ -514,3 +519,60 @@ def test_the_plugin_brings_no_model_into_a_session_that_replays_nothing(pytester
     assert project["entry-points"]["pytest11"] == {"gcd_node.testing": "gcd_node.testing"}
     done = subprocess.run(command, cwd=pytester.path, env=alone, capture_output=True, text=True, timeout=50)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+# ROS 2 bags: one goes in, one of its views comes out.
+
+
+def test_a_bag_becomes_a_bag_of_its_views_that_fits_beside_it(tmp_path: Path) -> None:
+    """Stamped by a simulation's clock, recorded by the wall's; read by rosbags and by the reference library."""
+    stamps_ns = [round((5 + i / 10) * 1e9) for i in range(28)]
+    said = [("/front/camera_info", camera_info(192, 128, d=()))]
+    said += [
+        ("/front/image_raw/compressed", compressed(*each)) for each in zip(ramp(28, 192, 128), stamps_ns, strict=True)
+    ]
+    log = write_bag(tmp_path / "drive", said, StoragePlugin.MCAP)
+    config = fake_config("view.main={}", source=f'kind = "mcap"\npath = "{log}"')
+    own = Parts(
+        open_source=open_source,
+        load_model=lambda _: LevelModel(painting_traits(), holds=("visibility", "inverse_depth")),
+    )
+    assert replay_to_bag(config, tmp_path / "views", parts=own).counts.windows == 2
+    run = replay(config, tmp_path / "run", parts=own)
+
+    with Reader(tmp_path / "views") as bag, Reader(log) as before:
+        types = {each.topic.removeprefix("/view/main/"): each.msgtype.rpartition("/")[2] for each in bag.connections}
+        assert types == {
+            "image/compressed": "CompressedImage", "camera_info": "CameraInfo", "visibility": "Image",
+            "depth": "Image", "classes": "Image", "header": "String", "/tf": "TFMessage",
+        }  # fmt: skip
+        told = {each.topic: [m for m in bag.messages([each])] for each in bag.connections}
+        recorded_ns = [at_ns for each, at_ns, _ in before.messages() if each.topic.endswith("compressed")]
+    with (tmp_path / "views" / "views_0.mcap").open("rb") as file:
+        read = [
+            (channel.topic, message.log_time, value)
+            for _, channel, message, value in make_reader(
+                file, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
+        ]
+    assert len(read) == sum(map(len, told.values()))
+    for name in ("image/compressed", "camera_info", "visibility", "depth"):
+        heads = [(at_ns, value.header) for topic, at_ns, value in read if topic == f"/view/main/{name}"]
+        assert [head.stamp.sec * 10**9 + head.stamp.nanosec for _, head in heads] == stamps_ns
+        assert [at_ns for at_ns, _ in heads] == recorded_ns
+    seen = np.concatenate([run.read_view(window, "main")["vis"] for window in run.manifest.windows])
+    drawn = [np.frombuffer(value.data, np.uint8) for topic, _, value in read if topic.endswith("visibility")]
+    np.testing.assert_array_equal(np.stack(drawn).reshape(seen.shape), seen)
+    transform = next(value for topic, _, value in read if topic == "/tf").transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("front_optical", "main_optical")
+
+
+def test_a_bag_is_whole_or_not_there_and_needs_a_free_place(tmp_path: Path) -> None:
+    config = fake_config(source=SOURCE)
+    with pytest.raises(ModelFailedError):
+        replay_to_bag(config, tmp_path / "bag", parts=parts(nan_model(set(range(WINDOWS)))))
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError):
+        replay_to_bag(config, tmp_path / "file", parts=parts())
+    assert run_app(["replay", "any.toml"]) == run_app(["replay", "any.toml", "--out", "a", "--bag", "b"]) == 64
