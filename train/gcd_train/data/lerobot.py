@@ -57,10 +57,12 @@ def extra(module: str) -> Any:
 
 
 class CameraCalibration(FileLens, frozen=True, kw_only=True):
-    """One camera, and where it stands, once for all or by the name of a feature."""
+    """One camera, and where it stands, once for all or by the name of a feature. synthetic: it never stood there; such
+    cameras are learned from only where somebody names them."""
 
     base_from_camera: tuple[tuple[float, ...], ...] | None = None
     pose_feature: str | None = None
+    synthetic: bool = False
 
     @property
     def pose(self) -> Doubles | None:
@@ -99,8 +101,6 @@ def read_cameras(folder: Path, calibration: Path | None = None) -> dict[str, Cam
                 require_rigid(torch.from_numpy(camera.pose), f"base_from_camera of {name}")
         except (ModelError, ValueError) as error:
             raise FileFault(path, f"is wrong about {name}: {error}") from error
-    if len(cameras) < 2:
-        raise FileFault(path, f"tells of {len(cameras)} camera(s), pairs need two or more")
     return cameras
 
 
@@ -147,6 +147,13 @@ class EpisodePlace:
     def name(self) -> str:
         """As reports call it."""
         return f"episode_{self.number:06d}"
+
+
+def read_set(folder: Path) -> tuple[Info, tuple[EpisodePlace, ...]]:
+    """What a data set says of itself, and its episodes by number. Raises DataError: it is none, or has none; FileFault:
+    what it says is damaged."""
+    info = _read_info(folder)
+    return info, _episodes(folder, info)
 
 
 def _read_info(folder: Path) -> Info:
@@ -257,7 +264,7 @@ class LeRobotPairs(DrawnSamples):
     nearest in time. size: width and height of the samples; pictures are cropped about their middle to its shape and
     resized; of two lenses both sides have the narrower one. A row or picture may lie half a frame of the set from
     the time it is taken for.
-    cameras: features to choose from, by default all that are calibrated; source and target are drawn from them.
+    cameras: features to choose from, by default all that are calibrated and not synthetic; source and target are drawn from them.
     calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
     episodes: which of the set's, from the first number up to the second, as in a slice: (-10, None) are the last ten.
 
@@ -279,14 +286,14 @@ class LeRobotPairs(DrawnSamples):
     ) -> None:
         for module in ("pyarrow.parquet", "av"):  # what is not installed is said now, not sample by sample
             extra(module)
-        self.info = _read_info(folder)
-        every = _episodes(folder, self.info)
+        self.info, every = read_set(folder)
         self.episodes = every[slice(*episodes)]
         if not self.episodes:
             raise DataError(f"{folder} has {len(every)} episodes, none of them in {episodes}")
         super().__init__(seed, repeats * len(self.episodes))
         self._calibrations = read_cameras(folder, calibration)
-        self.cameras = self._chosen(cameras or tuple(self._calibrations))
+        real = tuple(name for name, camera in self._calibrations.items() if not camera.synthetic)
+        self.cameras = self._chosen(cameras or real)
         self.fps = fps or self.info.fps
         if self.fps > self.info.fps * 1.001:
             raise DataError(f"clips of {self.fps:g} frames per second were wanted, {folder} has {self.info.fps:g}")
@@ -315,14 +322,14 @@ class LeRobotPairs(DrawnSamples):
         cameras = [self.cameras[int(k)] for k in random.choice(len(self.cameras), 2, replace=False)]
         moving = {feature for name in cameras if (feature := self._calibrations[name].pose_feature)}
         rows = read_rows(episode.data, ["timestamp", *sorted(moving)], episode.number)
-        times = _checked_times(episode, np.array([_number(row["timestamp"]) for row in rows]))
+        times = row_times(episode, rows)
         chosen = self._window(episode, times, random)
         taken = [rows[row] for row in chosen]
         sides = [
             Side(
                 self._pictures(episode, name, times[list(chosen)]),
                 self._calibrations[name].lens,
-                _poses(episode, self._calibrations[name], taken),
+                row_poses(episode, self._calibrations[name], taken),
             )
             for name in cameras
         ]
@@ -361,8 +368,9 @@ def _number(value: float | list[float]) -> float:
     return float(value[0] if isinstance(value, list) else value)
 
 
-def _checked_times(episode: EpisodePlace, times: Doubles) -> Doubles:
-    """Timestamps that rise, as many as the set says. Raises FileFault."""
+def row_times(episode: EpisodePlace, rows: Sequence[Mapping[str, Any]]) -> Doubles:
+    """Timestamps of an episode's rows, seconds: they rise, and are as many as the set says. Raises FileFault."""
+    times = np.array([_number(row["timestamp"]) for row in rows])
     if len(times) != episode.length or not len(times):
         raise FileFault(episode.data, f"has {len(times)} rows of {episode.name}, meta says {episode.length}")
     wrong = np.flatnonzero(~(np.diff(times) > 0))
@@ -372,7 +380,7 @@ def _checked_times(episode: EpisodePlace, times: Doubles) -> Doubles:
     return times
 
 
-def _poses(episode: EpisodePlace, camera: CameraCalibration, rows: list[dict[str, list[float]]]) -> Doubles:
+def row_poses(episode: EpisodePlace, camera: CameraCalibration, rows: Sequence[Mapping[str, Any]]) -> Doubles:
     """base_from_camera [T, 4, 4]. Raises FileFault if the feature holds no poses."""
     if camera.pose is not None:
         return np.tile(camera.pose, (len(rows), 1, 1))

@@ -36,7 +36,44 @@ _POSE_FEATURE = f"observation.camera_pose.{WRIST}"
 _SAMPLED = 8
 """Every so many frames' pictures go into the statistics."""
 _FILE = "chunk-000/file-000"
+_PERCENTS = (1, 10, 50, 90, 99)
+"""Quantiles in the statistics, as LeRobot has them."""
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+def new_video(path: Path, width: int, height: int, fps: Fraction, crf: int = 18) -> tuple[Any, Any]:
+    """Container and stream of a video that LeRobot reads, for `add_picture`. crf: quality of H.264, lower is better; 0
+    loses nothing."""
+    container = extra("av").open(str(path), "w")
+    stream = container.add_stream("libx264", rate=fps)
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    stream.time_base = 1 / fps
+    stream.codec_context.gop_size = 2  # as LeRobot's own: any frame is near a key frame
+    stream.options = {"crf": str(crf), "preset": "fast", "bf": "0"}
+    return container, stream
+
+
+def add_picture(container: Any, stream: Any, picture: Bytes, number: int) -> None:
+    """Append a picture, u8 [H, W, 3], as frame `number`."""
+    frame = extra("av").VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24")
+    frame.pts, frame.time_base = number, 1 / stream.codec_context.framerate
+    container.mux(stream.encode(frame))
+
+
+def video_feature(width: int, height: int, fps: float) -> dict[str, Any]:
+    """What meta/info.json says of such a video."""
+    video: dict[str, Any] = {"height": height, "width": width, "codec": "h264"}
+    video |= {"pix_fmt": "yuv420p", "is_depth_map": False, "fps": fps, "channels": 3}
+    info = {f"video.{key}": value for key, value in video.items()} | {"has_audio": False}
+    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
+
+
+def statistics_of(rows: NDArray[Any], *, colours: bool) -> dict[str, list[Any]]:
+    """Of rows [N, C] as LeRobot writes it: C numbers each, or of colours, 0 to 255, [3, 1, 1] in [0, 1]."""
+    found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    found |= {f"q{percent:02d}": np.percentile(rows, percent, axis=0) for percent in _PERCENTS}
+    unit, shape = (255, (3, 1, 1)) if colours else (1, (-1,))
+    return {key: (row / unit).reshape(shape).tolist() for key, row in found.items()} | {"count": [len(rows)]}
 
 
 class LeRobotWriter:
@@ -67,13 +104,7 @@ class LeRobotWriter:
         (folder / "meta").mkdir(parents=True, exist_ok=True)
         for name, camera in cameras.items():
             path = self._place(f"videos/{name}", "mp4")
-            container = self._av.open(str(path), "w")
-            stream = container.add_stream("libx264", rate=fps)
-            stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
-            stream.time_base = Fraction(1, fps)
-            stream.codec_context.gop_size = 2  # as LeRobot's own: any frame is near a key frame
-            stream.options = {"crf": str(crf), "preset": "fast", "bf": "0"}
-            self._videos[name] = container, stream
+            self._videos[name] = new_video(path, camera.width, camera.height, Fraction(fps), crf)
 
     def add(
         self,
@@ -123,7 +154,9 @@ class LeRobotWriter:
         table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": list(tasks)})
         table = table.replace_schema_metadata({"pandas": json.dumps(index)})
         self._parquet.write_table(table, self._folder / "meta/tasks.parquet")
-        statistics = {name: self._statistics(name, np.concatenate(rows)) for name, rows in self._seen.items()}
+        statistics = {
+            name: statistics_of(np.concatenate(rows), colours=name in self._cameras) for name, rows in self._seen.items()
+        }
         for name, told in (("stats", statistics), ("info", self._info())):
             (self._folder / f"meta/{name}.json").write_text(json.dumps(told, indent=4) + "\n", encoding="utf-8")
         calibration = msgspec.json.format(msgspec.json.encode(CameraFile(cameras=self._cameras)), indent=1)
@@ -139,12 +172,10 @@ class LeRobotWriter:
         frames = 0
         for frames, seen in enumerate(pictures, start=1):
             for name, camera in self._cameras.items():
-                picture, (container, stream) = seen[name], self._videos[name]
+                picture = seen[name]
                 if picture.shape != (camera.height, camera.width, 3):
                     raise DataError(f"{name} must be {camera.width} x {camera.height}, got a picture {picture.shape}")
-                frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24")
-                frame.pts, frame.time_base = self._frames + frames - 1, Fraction(1, self._fps)
-                container.mux(stream.encode(frame))
+                add_picture(*self._videos[name], picture, self._frames + frames - 1)
                 if frames % _SAMPLED == 1:
                     self._seen.setdefault(name, []).append(picture[::4, ::4].reshape(-1, 3))
         return frames
@@ -179,13 +210,6 @@ class LeRobotWriter:
             row[f"videos/{name}/to_timestamp"] = (self._frames + frames) / self._fps
         return row
 
-    def _statistics(self, name: str, rows: NDArray[Any]) -> dict[str, list[Any]]:
-        """Of rows [N, C] as LeRobot writes it: C numbers each, or [3, 1, 1] for the channels of pictures."""
-        unit = 255 if name in self._cameras else 1
-        found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
-        shape = (3, 1, 1) if name in self._cameras else (-1,)
-        return {key: (row / unit).reshape(shape).tolist() for key, row in found.items()} | {"count": [len(rows)]}
-
     def _info(self) -> dict[str, Any]:
         return {
             "codebase_version": "v3.0",
@@ -206,11 +230,7 @@ class LeRobotWriter:
     def _features(self) -> dict[str, Any]:
         told: dict[str, Any] = {}
         for name, camera in self._cameras.items():
-            video: dict[str, Any] = {"height": camera.height, "width": camera.width, "codec": "h264"}
-            video |= {"pix_fmt": "yuv420p", "is_depth_map": False, "fps": self._fps, "channels": 3}
-            info = {f"video.{key}": value for key, value in video.items()} | {"has_audio": False}
-            shape, axes = [camera.height, camera.width, 3], ["height", "width", "channels"]
-            told[name] = {"dtype": "video", "shape": shape, "names": axes, "info": info}
+            told[name] = video_feature(camera.width, camera.height, self._fps)
         for name, rows in self._seen.items():
             if name not in self._cameras and name not in _OWN:
                 names = list(self._names.get(name, [])) or None
