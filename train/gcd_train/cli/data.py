@@ -1,4 +1,4 @@
-"""Data sets looked after: repacked, encoded once; LeRobot sets written and read."""
+"""Data sets looked after: repacked, encoded once; LeRobot sets written, read, and given more cameras."""
 
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -24,20 +24,23 @@ from gcd_train.data.cache_writer import CacheOptions, cache_job, cache_scenes
 from gcd_train.data.compact import Compaction
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.lerobot import LeRobotPairs
+from gcd_train.data.lerobot_augment import Augmentation, AugmentOptions
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
 from gcd_train.data.splits import write_sweep
 from gcd_train.errors import DataError
-from gcd_train.files import remove_leftovers
+from gcd_train.files import only_writer, remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
 
 Done = TypeVar("Done")
 
 data = typer.Typer(no_args_is_help=True, help="Downloaded data sets: repacking.")
 export = typer.Typer(no_args_is_help=True, help="Write data in other programs' formats.")
+augment = typer.Typer(no_args_is_help=True, help="Write data sets with more cameras than filmed them.")
 
 
 @data.callback()
 @export.callback()
+@augment.callback()
 def about() -> None:
     """Keep these commands with sub-commands, however many there are."""
 
@@ -115,6 +118,32 @@ def lerobot(
         for done in export_tabletop(out, wanted):
             show(done)
     say(f"wrote {out}; look at it with `gcd-train lerobot {out}`")
+
+
+@augment.command("lerobot")
+@with_fields_of(AugmentOptions)
+def augment_lerobot(
+    source: Annotated[Path, typer.Argument(metavar="DATASET", help="A LeRobot data set, v3.0 or v2.1.")],
+    out: Annotated[Path, typer.Option(help="The new data set; run the same line again to go on.")],
+    workers: Workers = 1,
+    **options: Any,
+) -> None:
+    """Copy a LeRobot data set and give it novel views of a camera, marked synthetic, with what of them was seen.
+
+    Everything else stays byte by byte. OUT appears when it is whole; episodes that are done are kept until then.
+    """
+    stop_as_by_ctrl_c()
+    with errors_shown():
+        if workers > 1:
+            one_thread_each()
+        work = Augmentation.of(source, out, AugmentOptions(**options))
+        with only_writer(work.parts), progress_bar("episodes", len(work.episodes), keep=True) as show:
+            work.claim()
+            for done, outcome in enumerate(map_items(work, work.episodes, workers=workers), 1):
+                outcome.unwrap()
+                show(done)
+            work.finish()
+        say(f"wrote {out}: {', '.join(work.features)}")
 
 
 @export.command()

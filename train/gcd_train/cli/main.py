@@ -7,6 +7,7 @@ from importlib import import_module
 import typer
 
 COMMANDS = {
+    "augment": ("data:augment", "Write data sets with more cameras than filmed them."),
     "cache": ("data:cache", "Encode a driving set once, so that training never runs the frozen encoders again."),
     "calibrate": (
         "evaluate:calibrate_command",

@@ -44,7 +44,7 @@ _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 def new_video(path: Path, width: int, height: int, fps: Fraction, crf: int = 18) -> tuple[Any, Any]:
     """Container and stream of a video that LeRobot reads, for `add_picture`. crf: quality of H.264, lower is better; 0
     loses nothing."""
-    container = extra("av").open(str(path), "w")
+    container = extra("av").open(str(path), "w", format="mp4")
     stream = container.add_stream("libx264", rate=fps)
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     stream.time_base = 1 / fps
@@ -155,7 +155,8 @@ class LeRobotWriter:
         table = table.replace_schema_metadata({"pandas": json.dumps(index)})
         self._parquet.write_table(table, self._folder / "meta/tasks.parquet")
         statistics = {
-            name: statistics_of(np.concatenate(rows), colours=name in self._cameras) for name, rows in self._seen.items()
+            name: statistics_of(np.concatenate(rows), colours=name in self._cameras)
+            for name, rows in self._seen.items()
         }
         for name, told in (("stats", statistics), ("info", self._info())):
             (self._folder / f"meta/{name}.json").write_text(json.dumps(told, indent=4) + "\n", encoding="utf-8")
