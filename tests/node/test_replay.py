@@ -546,7 +546,7 @@ def test_a_bag_becomes_a_bag_of_its_views_that_fits_beside_it(tmp_path: Path) ->
             "image/compressed": "CompressedImage", "camera_info": "CameraInfo", "visibility": "Image",
             "depth": "Image", "classes": "Image", "header": "String", "/tf": "TFMessage",
         }  # fmt: skip
-        told = {each.topic: [m for m in bag.messages([each])] for each in bag.connections}
+        told = {each.topic: list(bag.messages([each])) for each in bag.connections}
         recorded_ns = [at_ns for each, at_ns, _ in before.messages() if each.topic.endswith("compressed")]
     with (tmp_path / "views" / "views_0.mcap").open("rb") as file:
         read = [

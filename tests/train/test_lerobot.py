@@ -3,22 +3,30 @@
 import json
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
+import torch
+from fake_model import FakeModel, traits_of
 from headless import needs_egl
 from tiny_world import tiny_recipe
 from typer.testing import CliRunner
 
+from gcd_model import RenderOptions, SourceFeatures, Trajectory, View
 from gcd_model.config import ModelConfig
+from gcd_model.live.config import LiveConfig
 from gcd_model.weights.card import FAMILIES
 from gcd_train.cli.main import app
+from gcd_train.data import lerobot_augment
 from gcd_train.data.files import FileFault
-from gcd_train.data.lerobot import CAMERA_FILE, CameraCalibration, LeRobotPairs
+from gcd_train.data.lerobot import CAMERA_FILE, CameraCalibration, LeRobotPairs, read_set
+from gcd_train.data.lerobot_augment import Augmentation, AugmentOptions
 from gcd_train.data.lerobot_export import (
     LeRobotWriter,
     TabletopExport,
@@ -26,7 +34,8 @@ from gcd_train.data.lerobot_export import (
 )
 from gcd_train.data.open import RunData, open_data
 from gcd_train.data.sample import Sample
-from gcd_train.errors import DataError, RunError
+from gcd_train.data.videos import nearest_pictures
+from gcd_train.errors import DataError, RecipeError, RunError
 from gcd_train.recipe_data import DataRecipe
 
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
@@ -353,6 +362,158 @@ def test_a_wrong_description_is_named(copied: Path, change: dict[str, object], s
     (copied / "meta/info.json").write_text(json.dumps(info | change))
     with pytest.raises(DataError, match=said):
         LeRobotPairs(copied)
+
+
+# novel views
+
+PATTERN = np.arange(64)[None].repeat(64, 0) % 3  # visibility, at the network's size
+
+
+class SeeingModel(FakeModel):
+    """Shows the source itself, and says what was seen by a pattern."""
+
+    def render(
+        self, features: SourceFeatures, trajectories: Sequence[Trajectory], options: RenderOptions | None = None
+    ) -> list[View]:
+        frames = len(features.latents)
+        seen = torch.from_numpy(PATTERN.astype(np.uint8)).expand(frames, *PATTERN.shape)
+        return [replace(view, visibility=seen) for view in super().render(features, trajectories, options)]
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeModel:
+    """In place of the live model, frame by frame."""
+    model = SeeingModel(traits_of(LiveConfig(frames=1), "live"))
+    monkeypatch.setattr(lerobot_augment, "_model", lambda *_: model)
+    return model
+
+
+def _augment(source: Path, out: Path, **options: Any) -> Augmentation:
+    usual = {"camera": "left", "view": ["same=0,0,0"], "source_radius": 1.0}
+    return Augmentation.of(source, out, AugmentOptions(**usual | options))
+
+
+def _made_of(work: Augmentation) -> Path:
+    work.claim()
+    assert [work(episode) for episode in work.episodes] == [episode.length for episode in work.episodes]
+    work.finish()
+    return work.out
+
+
+def _film(folder: Path, feature: str, episode: int) -> np.ndarray:
+    """u8 [T, H, W, 3]."""
+    places = {each.number: each for each in read_set(folder)[1]}
+    path, begin = places[episode].videos[feature]
+    return np.stack(nearest_pictures(path, [begin + row / FPS for row in range(ROWS)], 1e-4, av))
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_a_set_gets_a_view_of_every_frame_and_everything_else_stays(
+    made: Path, tmp_path: Path, version: str, fake: FakeModel
+) -> None:
+    source = made if version == "v3.0" else _as_version_two(made, tmp_path / "old")
+    pose = tmp_path / "poses.json"
+    pose.write_text(json.dumps({"moved": _pose(0.1, 0.02).tolist()}))
+    out = _made_of(_augment(source, tmp_path / "out", poses=pose))
+    assert sorted(path.name for path in tmp_path.iterdir() if "out" in path.name) == ["out"]
+    changed = {"info.json", "stats.json", "cameras.json"}
+    for path in (each for each in source.rglob("*") if each.is_file() and each.name not in changed):
+        if path.parent.parent.name != "episodes":
+            assert (out / path.relative_to(source)).read_bytes() == path.read_bytes()
+    for path in source.glob("meta/episodes/*/*"):
+        before = pq.read_table(path)
+        assert pq.read_table(out / path.relative_to(source)).select(before.column_names).equals(before)
+    for number in (episode.number for episode in read_set(source)[1]):
+        view, filmed = (_film(out, name, number).astype(int) for name in (f"{LEFT}_same", LEFT))
+        assert np.abs(view - filmed).mean(axis=(1, 2, 3)).max() < 3.0  # rows are 6 levels apart
+        seen = _film(out, f"{LEFT}_same_visibility", number)
+        levels = np.array([0, 128, 255], np.uint8)[PATTERN]
+        exact = cv2.resize(levels, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
+        np.testing.assert_array_equal(seen, np.broadcast_to(exact[None, ..., None], seen.shape))
+    assert [len(each.video) for each in fake.clips] == [1] * ROWS * len(read_set(source)[1])
+    assert all(each.odometry is not None for each in fake.clips)  # the calibration says that the camera stands still
+    features = json.loads((out / "meta/info.json").read_text())["features"]
+    assert {name for name, each in features.items() if each.get("info", {}).get("synthetic")} == {
+        f"{LEFT}_{name}{kind}" for name in ("same", "moved") for kind in ("", "_visibility")
+    }
+    assert f"`{LEFT}_moved`" in (out / "README.md").read_text()
+    assert set(_only(out, LEFT, RIGHT).cameras) == set(LeRobotPairs(out).cameras) - {HAND}  # none by itself
+    sample = _only(out, LEFT, f"{LEFT}_moved").sample(0)
+    assert _apart(sample, _pose(0.1, 0.02)) < 1e-9
+
+
+@pytest.mark.usefixtures("fake")
+def test_episodes_that_are_done_stay_and_the_set_appears_when_all_are(made: Path, tmp_path: Path) -> None:
+    work = _augment(made, tmp_path / "out")
+    work.claim()
+    work(work.episodes[0])
+    with pytest.raises(RunError, match="other options"):
+        _augment(made, tmp_path / "out", source_radius=2.0).claim()
+    assert not work.out.exists()
+    assert [work(episode) for episode in work.episodes] == [0, ROWS, ROWS]
+    work.finish()
+    assert len(_film(work.out, f"{LEFT}_same", 2)) == ROWS
+    assert not work.parts.exists()
+
+
+def test_a_model_of_clips_views_every_frame_once(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six frames at a time of twenty: the last clip overlaps the one before."""
+    model = FakeModel(traits_of(ModelConfig(frames=6, height=64, width=64, camera="spherical"), "kubric90"))
+    monkeypatch.setattr(lerobot_augment, "_model", lambda *_: model)
+    out = _made_of(_augment(made, tmp_path / "out", source_radius=None))
+    for number in range(3):
+        view, filmed = (_film(out, name, number).astype(int) for name in (f"{LEFT}_same", LEFT))
+        assert np.abs(view - filmed).mean(axis=(1, 2, 3)).max() < 3.0
+    assert not _film(out, f"{LEFT}_same_visibility", 0).any()  # it does not tell
+    model.traits = replace(model.traits, config=msgspec.structs.replace(model.traits.config, frames=ROWS + 1))
+    with pytest.raises(DataError, match="has 20 frames, fake works on 21"):
+        _augment(made, tmp_path / "other", source_radius=None)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"camera": "top"}, DataError),
+        ({"view": []}, RecipeError),
+        ({"view": ["same"]}, RecipeError),
+        ({"view": ["../up=1"]}, RecipeError),
+        ({"source_radius": None}, RecipeError),
+        ({"poses": Path("missing.json")}, FileFault),
+        ({"calibration": Path("missing.json")}, DataError),
+    ],
+)
+@pytest.mark.usefixtures("fake")
+def test_a_view_that_cannot_be_is_refused_before_anything_is_made(
+    options: dict[str, Any], error: type[Exception], made: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(error):
+        _augment(made, tmp_path / "out", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("fake")
+def test_a_set_without_a_lens_asks_for_the_field_of_view_and_none_is_written_over(copied: Path, tmp_path: Path) -> None:
+    (copied / CAMERA_FILE).unlink()
+    with pytest.raises(DataError, match="--hfov-deg"):
+        _augment(copied, tmp_path / "out")
+    assert _augment(copied, tmp_path / "out", hfov_deg=60.0).cameras == {}
+    with pytest.raises(RunError, match="is there already"):
+        _augment(copied, copied, hfov_deg=60.0)
+    with pytest.raises(DataError, match="no LeRobot data set"):
+        _augment(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_the_live_model_augments_by_the_command(copied: Path, tmp_path: Path) -> None:
+    """Frames of its view agree with the camera's where it stands in the same place."""
+    line = ["augment", "lerobot", str(copied), "--out", str(tmp_path / "out"), "--camera", "left"]
+    done = CliRunner().invoke(app, [*line, "--view", "same=0", "--source-radius", "1.0", "--workers", "2"])
+    assert done.exit_code == 0, done.output
+    for number in range(3):
+        view, filmed = (_film(tmp_path / "out", name, number).astype(int) for name in (f"{LEFT}_same", LEFT))
+        assert np.abs(view - filmed).mean() < 4.0
+    assert (_film(tmp_path / "out", f"{LEFT}_same_visibility", 0) == 255).mean() > 0.9
+    assert CliRunner().invoke(app, [*line, "--view", "same=0"]).exit_code == RunError.exit_code
 
 
 # the tabletop world

@@ -264,7 +264,8 @@ class LeRobotPairs(DrawnSamples):
     nearest in time. size: width and height of the samples; pictures are cropped about their middle to its shape and
     resized; of two lenses both sides have the narrower one. A row or picture may lie half a frame of the set from
     the time it is taken for.
-    cameras: features to choose from, by default all that are calibrated and not synthetic; source and target are drawn from them.
+    cameras: features to choose from, by default all that are calibrated and not synthetic; source and target are drawn
+    from them.
     calibration: a file in place of the set's meta/cameras.json. repeats: the set counts as so many times its episodes.
     episodes: which of the set's, from the first number up to the second, as in a slice: (-10, None) are the last ten.
 

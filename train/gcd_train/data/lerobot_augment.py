@@ -18,7 +18,6 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,10 +27,10 @@ import numpy as np
 import torch
 from typer import Option
 
-from gcd_model import FrameSynthesizer, RenderOptions, Traits, Trajectory, ViewSynthesizer, load_synthesizer
+from gcd_model import FrameSynthesizer, RenderOptions, Traits, Trajectory, View, ViewSynthesizer, load_synthesizer
 from gcd_model.clip import Clip
 from gcd_model.errors import FileError
-from gcd_model.geometry import Intrinsics, Spherical, SphericalDelta
+from gcd_model.geometry import Intrinsics, Spherical
 from gcd_model.small_files import read_json
 from gcd_train.data.files import MOST_TEXT, FileFault
 from gcd_train.data.lerobot import (
@@ -48,6 +47,7 @@ from gcd_train.data.lerobot import (
     row_times,
 )
 from gcd_train.data.lerobot_export import add_picture, new_video, statistics_of, video_feature
+from gcd_train.data.paths import delta_of
 from gcd_train.data.sample import Bytes, to_network
 from gcd_train.data.videos import Doubles, nearest_pictures
 from gcd_train.errors import DataError, RecipeError, RunError
@@ -83,7 +83,6 @@ class AugmentOptions:
     calibration: Annotated[Path | None, Option(help="Cameras, if the set has no meta/cameras.json.")] = None
     weights: Annotated[str, Option(help="package:NAME, random:FAMILY or a path.")] = "package:live-small"
     device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
-    seed: Annotated[int, Option(min=0, help="Of the noise samples begin with.")] = 0
 
 
 @functools.cache
@@ -93,12 +92,12 @@ def _model(weights: str, device: str) -> ViewSynthesizer:
     return model.streaming() if isinstance(model, FrameSynthesizer) else model
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Augmentation:
     """Views of one episode at a time, in any process; `finish` makes the data set of all.
 
-    source: the data set. parts: folder of what is done so far. camera: feature. lens: of its pictures. calibration: of
-    the camera, None if nobody wrote one. paths: by the name of the view. width, height: of the camera's pictures.
+    source: the data set. camera: feature. lens: of its pictures, where somebody states it. cameras: of the set's
+    calibration, empty without. paths: by the name of the view.
     """
 
     source: Path
@@ -109,8 +108,6 @@ class Augmentation:
     lens: Intrinsics | None
     cameras: Mapping[str, CameraCalibration]
     paths: Mapping[str, Trajectory]
-    width: int
-    height: int
     options: AugmentOptions
 
     @classmethod
@@ -128,40 +125,31 @@ class Augmentation:
         camera = options.camera if options.camera in info.videos else _IMAGES + options.camera
         if camera not in info.videos:
             raise DataError(f"{source} has no video {options.camera}; it has {', '.join(info.videos) or 'none'}")
-        shape = info.features[camera].shape  # some sets have the channels first
-        height, width = shape[:2] if shape[-1:] == (3,) else shape[1:3]
+        width, height = _size_of(info, camera)
         if width % 2 or height % 2:
             raise DataError(f"H.264 wants an even width and height, {camera} is {width} x {height}")
-        told = options.calibration or (source / CAMERA_FILE if (source / CAMERA_FILE).exists() else None)
-        cameras = {} if told is None else read_cameras(source, told)
+        is_calibrated = options.calibration is not None or (source / CAMERA_FILE).exists()
+        cameras = read_cameras(source, options.calibration) if is_calibrated else {}
         traits = _model(options.weights, options.device).traits
-        lens = None if options.hfov_deg is None else Intrinsics.from_hfov(options.hfov_deg, width, height)
-        if lens is None and camera in cameras:
-            lens = cameras[camera].lens
+        lens = cameras[camera].lens if camera in cameras else None
+        if options.hfov_deg is not None:
+            lens = Intrinsics.from_hfov(options.hfov_deg, width, height)
         if lens is None and (traits.live or traits.splat != "none"):
-            raise DataError(
-                f"nobody knows the lens of {camera}; state its field of view with --hfov-deg, or {CAMERA_FILE}"
-            )
+            raise DataError(f"nobody knows the lens of {camera}; state it with --hfov-deg, or in {CAMERA_FILE}")
+        if lens is not None and (lens.width, lens.height) != (width, height):
+            raise DataError(f"{camera} is {width} x {height}, its calibration says {lens.width} x {lens.height}")
         paths = _paths(traits, options)
-        taken = [name for name in paths if f"{camera}_{name}" in info.features]
-        if taken:
-            raise RecipeError(f"{source} has a view {camera}_{taken[0]} already; choose another name")
+        if taken := [name for name in paths if f"{camera}_{name}" in info.features]:
+            raise RecipeError(f"{source} has {camera}_{taken[0]} already; choose another name for the view")
         if (shortest := min(episodes, key=lambda each: each.length)).length < traits.config.frames:
             few = f"{shortest.name} has {shortest.length} frames"
             raise DataError(f"{few}, {traits.name} works on {traits.config.frames}; take package:live-small")
-        return cls(
-            source=source,
-            out=out,
-            info=info,
-            episodes=episodes,
-            camera=camera,
-            lens=lens,
-            cameras=cameras,
-            paths=paths,
-            width=width,
-            height=height,
-            options=options,
-        )
+        return cls(source, out, info, episodes, camera, lens, cameras, paths, options)
+
+    @property
+    def model(self) -> ViewSynthesizer:
+        """Of this process."""
+        return _model(self.options.weights, self.options.device)
 
     @property
     def parts(self) -> Path:
@@ -175,10 +163,7 @@ class Augmentation:
 
     def claim(self) -> None:
         """Say what the parts are made of. Raises RunError if those that are there are made of something else."""
-        told = {
-            "set": str(self.source.resolve()),
-            "model": _model(self.options.weights, self.options.device).traits.sha256_12,
-        }
+        told = {"set": str(self.source.resolve()), "model": self.model.traits.sha256_12}
         told |= {name: str(value) for name, value in asdict(self.options).items() if name != "device"}
         text, path = json.dumps(told, indent=1).encode(), self.parts / "made_from.json"
         if path.exists() and path.read_bytes() != text:
@@ -198,9 +183,8 @@ class Augmentation:
             videos: dict[str, tuple[Any, Any]] = {}
             for feature in self.features:
                 path = stack.enter_context(whole(self._part(episode, feature)))
-                rate = Fraction(self.info.fps).limit_denominator(1001)
                 crf = 0 if feature.endswith(_SEEN) else 18
-                videos[feature] = new_video(path, self.width, self.height, rate, crf)
+                videos[feature] = new_video(path, *_size_of(self.info, self.camera), self.info.fps, crf)
                 stack.callback(videos[feature][0].close)
             for number, seen in enumerate(self._seen(episode)):
                 for feature, picture in seen.items():
@@ -218,63 +202,62 @@ class Augmentation:
 
     def _seen(self, episode: EpisodePlace) -> Iterator[dict[str, Bytes]]:
         """Pictures of all features, frame by frame."""
-        model, options = _model(self.options.weights, self.options.device), RenderOptions(seed=self.options.seed)
+        model = self.model
         if isinstance(model, FrameSynthesizer):
             model.reset()
-        size, frames = _size(model.traits, self.width, self.height), model.traits.config.frames
+        size, frames = _network_size(model.traits, *_size_of(self.info, self.camera)), model.traits.config.frames
         start = 0
         for pictures, poses in self._source(episode, frames):
             small = np.stack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in pictures])
             clip = Clip(
                 video=to_network(small),
                 fps=self.info.fps,
-                lens=None if self.lens is None else _resized(self.lens, size),
+                lens=None if self.lens is None else self.lens.resized(*size),
                 odometry=torch.from_numpy(poses) if model.traits.live and poses is not None else None,
             )
-            views = model.render(model.encode(clip), list(self.paths.values()), options)
+            views = model.render(model.encode(clip), list(self.paths.values()), RenderOptions())
             new = min(frames, episode.length - start)  # the last clip may overlap the one before
             for t in range(frames - new, frames):
                 yield {
                     feature: picture
                     for name, view in zip(self.paths, views, strict=True)
-                    for feature, picture in self._of_view(name, view.video[t], view.visibility, t)
+                    for feature, picture in self._of_view(name, view, t)
                 }
             start += new
 
-    def _of_view(
-        self, name: str, picture: torch.Tensor, visibility: torch.Tensor | None, t: int
-    ) -> Iterator[tuple[str, Bytes]]:
-        pixels = (picture.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
-        size = self.width, self.height
+    def _of_view(self, name: str, view: View, t: int) -> Iterator[tuple[str, Bytes]]:
+        pixels = (view.video[t].clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+        size = _size_of(self.info, self.camera)
         yield f"{self.camera}_{name}", cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR).astype(np.uint8)
-        seen = np.zeros(pixels.shape[:2], np.uint8) if visibility is None else _LEVELS[visibility[t].numpy()]
+        is_known = view.visibility is not None
+        seen = _LEVELS[view.visibility[t].numpy()] if is_known else np.zeros(pixels.shape[:2], np.uint8)
         grey = cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST)
         yield f"{self.camera}_{name}{_SEEN}", np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8)
 
     def _source(self, episode: EpisodePlace, frames: int) -> Iterator[tuple[list[Bytes], Doubles | None]]:
         """Clips of so many pictures of the camera, and base_from_camera [T, 4, 4] where somebody wrote it down."""
         camera = self.cameras.get(self.camera)
-        columns = ["timestamp"] if camera is None or camera.pose_feature is None else ["timestamp", camera.pose_feature]
-        rows = read_rows(episode.data, columns, episode.number)
+        moving = [] if camera is None or camera.pose_feature is None else [camera.pose_feature]
+        rows = read_rows(episode.data, ["timestamp", *moving], episode.number)
         times, poses = row_times(episode, rows), None if camera is None else row_poses(episode, camera, rows)
         path, begin = episode.videos[self.camera]
         starts = [min(start, len(times) - frames) for start in range(0, len(times), frames)]
         several = max(1, _AT_ONCE // frames)
         for few in (starts[i : i + several] for i in range(0, len(starts), several)):
             wanted = sorted({number for start in few for number in range(start, start + frames)})
-            tolerance_s = 0.5 / self.info.fps + _SLACK_S
-            found = nearest_pictures(path, [begin + times[number] for number in wanted], tolerance_s, extra("av"))
+            times_s = [begin + float(times[number]) for number in wanted]
+            found = nearest_pictures(path, times_s, 0.5 / self.info.fps + _SLACK_S, extra("av"))
             by_number = dict(zip(wanted, found, strict=True))
             for start in few:
-                clip = slice(start, start + frames)
-                yield [by_number[i] for i in range(start, start + frames)], None if poses is None else poses[clip]
+                clip = range(start, start + frames)
+                yield [by_number[number] for number in clip], None if poses is None else poses[list(clip)]
 
     # The data set of all episodes.
 
     def finish(self) -> None:
         """Write the data set; it appears when it is whole, and the parts go. Raises RunError, FileFault."""
         with new_folder(self.out.absolute().parent, self.out.name) as folder:
-            shutil.copytree(self.source, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".cache"))
+            shutil.copytree(self.source, folder, copy_function=shutil.copyfile, dirs_exist_ok=True)
             for feature in self.features:
                 self._join_videos(folder, feature)
             samples = [np.load(self.parts / f"{each.name}.npz") for each in self.episodes]
@@ -335,24 +318,23 @@ class Augmentation:
 
     def _describe(self, folder: Path, samples: Sequence[Mapping[str, Bytes]]) -> None:
         """What the set says of its features, its cameras, and on its card."""
-        traits = _model(self.options.weights, self.options.device).traits
+        traits = self.model.traits
         path = folder / "meta/info.json"
         info, cameras = json.loads(path.read_text()), dict(self.cameras)
-        card = [
-            f"\n## Synthetic cameras\n\nMade of `{self.camera}` by {traits.name} ({traits.sha256_12}); nobody filmed them.\n"
-        ]
+        made_by = f"Made of `{self.camera}` by {traits.name} ({traits.sha256_12}); nobody filmed them."
+        card = ["", "## Synthetic cameras", "", made_by, ""]
         for name, view in self.paths.items():
             pose, feature = view.source_from_target[-1].numpy(), f"{self.camera}_{name}"
             made = {"synthetic": True, "made_from": self.camera, "model": f"{traits.name} {traits.sha256_12}"}
             made |= {"source_from_view": pose.tolist()}
             for each in (feature, feature + _SEEN):
-                told = video_feature(self.width, self.height, self.info.fps)
+                told = video_feature(*_size_of(self.info, self.camera), self.info.fps)
                 info["features"][each] = told | {"info": told["info"] | made}
             source = self.cameras.get(self.camera)
             if source is not None and source.pose is not None:
                 rows = tuple(map(tuple, (source.pose @ pose).tolist()))
                 cameras[feature] = msgspec.structs.replace(source, base_from_camera=rows, synthetic=True)
-            card.append(f"- `{feature}`; `{feature}{_SEEN}`: 255 seen now, 128 seen before, 0 painted\n")
+            card.append(f"- `{feature}`; `{feature}{_SEEN}`: 255 seen now, 128 seen before, 0 painted")
         if "total_videos" in info:
             info["total_videos"] += len(self.features) * len(self.episodes)
         path.write_text(json.dumps(info, indent=4) + "\n", encoding="utf-8")
@@ -366,7 +348,7 @@ class Augmentation:
             (folder / CAMERA_FILE).write_bytes(text)
         readme = folder / "README.md"
         before = readme.read_text() if readme.exists() else "---\ntags:\n- LeRobot\n- synthetic\n---\n"
-        readme.write_text(before + "\n".join(card), encoding="utf-8")
+        readme.write_text(before + "\n".join([*card, ""]), encoding="utf-8")
 
 
 def _like(known: Mapping[str, Any], statistics: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -378,21 +360,14 @@ def _paths(traits: Traits, options: AugmentOptions) -> dict[str, Trajectory]:
     """By the name of the view; at the goal in every frame. Raises RecipeError, FileFault; ModelError as `plan_view`."""
     found: dict[str, Trajectory] = {}
     if options.view and traits.live and options.source_radius is None:
-        raise RecipeError(
-            "--view turns about what the camera looks at; say how far that is with --source-radius METRES"
-        )
+        raise RecipeError("--view turns about what the camera looks at: say how far that is with --source-radius")
+    radius = options.source_radius
+    stands = None
+    if radius is not None:
+        stands = Spherical(azimuth_deg=0.0, elevation_deg=options.source_elevation_deg, radius_m=radius)
     for text in options.view or ():
         name, _, numbers = text.partition("=")
-        try:
-            azimuth_deg, elevation_deg, radius_m = (*map(float, numbers.split(",")), 0.0, 0.0)[:3]
-        except ValueError:
-            raise RecipeError(
-                f"--view wants NAME=AZIMUTH,ELEVATION,RADIUS such as left=-10,0,0, got {text!r}"
-            ) from None
-        delta = SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)
-        radius = options.source_radius
-        stands = None if radius is None else Spherical(azimuth_deg=0.0, elevation_deg=options.source_elevation_deg, radius_m=radius)
-        found[name] = traits.plan_view(delta, source=stands, move_time=0)
+        found[name] = traits.plan_view(delta_of(numbers, "--view NAME="), source=stands, move_time=0)
     if options.poses is not None:
         try:
             poses = read_json(options.poses, dict[str, list[list[float]]], MOST_TEXT)
@@ -408,17 +383,17 @@ def _paths(traits: Traits, options: AugmentOptions) -> dict[str, Trajectory]:
     return found
 
 
-def _size(traits: Traits, width: int, height: int) -> tuple[int, int]:
+def _size_of(info: Info, camera: str) -> tuple[int, int]:
+    """Width and height; some sets have the channels first."""
+    shape = info.features[camera].shape
+    height, width = shape[:2] if shape[-1:] == (3,) else shape[1:3]
+    return width, height
+
+
+def _network_size(traits: Traits, width: int, height: int) -> tuple[int, int]:
     """Width and height that the network works at: about its trained area, whole multiples, near the camera's shape."""
     config = traits.config
     shrunk = min(1.0, math.sqrt(config.width * config.height / (width * height)))
     factor = config.size_factor
     across, along = (max(factor, round(side * shrunk / factor) * factor) for side in (width, height))
     return across, along
-
-
-def _resized(lens: Intrinsics, size: tuple[int, int]) -> Intrinsics:
-    across, along = size[0] / lens.width, size[1] / lens.height
-    return Intrinsics(
-        width=size[0], height=size[1], fx=lens.fx * across, fy=lens.fy * along, cx=lens.cx * across, cy=lens.cy * along
-    )

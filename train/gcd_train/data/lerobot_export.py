@@ -41,13 +41,13 @@ _PERCENTS = (1, 10, 50, 90, 99)
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
-def new_video(path: Path, width: int, height: int, fps: Fraction, crf: int = 18) -> tuple[Any, Any]:
+def new_video(path: Path, width: int, height: int, fps: float, crf: int = 18) -> tuple[Any, Any]:
     """Container and stream of a video that LeRobot reads, for `add_picture`. crf: quality of H.264, lower is better; 0
     loses nothing."""
-    container = extra("av").open(str(path), "w", format="mp4")
-    stream = container.add_stream("libx264", rate=fps)
+    container, rate = extra("av").open(str(path), "w", format="mp4"), Fraction(fps).limit_denominator(1001)
+    stream = container.add_stream("libx264", rate=rate)
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-    stream.time_base = 1 / fps
+    stream.time_base = 1 / rate
     stream.codec_context.gop_size = 2  # as LeRobot's own: any frame is near a key frame
     stream.options = {"crf": str(crf), "preset": "fast", "bf": "0"}
     return container, stream
@@ -104,7 +104,7 @@ class LeRobotWriter:
         (folder / "meta").mkdir(parents=True, exist_ok=True)
         for name, camera in cameras.items():
             path = self._place(f"videos/{name}", "mp4")
-            self._videos[name] = new_video(path, camera.width, camera.height, Fraction(fps), crf)
+            self._videos[name] = new_video(path, camera.width, camera.height, fps, crf)
 
     def add(
         self,

@@ -273,3 +273,13 @@ def _step(rng: np.random.Generator, at: float, most: float, bounds: Range) -> fl
     """A change that stays within the bounds and is at most `most`; the nearest end for a start outside of them."""
     low, high = max(at - most, bounds[0]), min(at + most, bounds[1])
     return float(np.clip(rng.uniform(low, max(low, high)), *bounds)) - at
+
+
+def delta_of(text: str, option: str) -> SphericalDelta:
+    """`AZIMUTH,ELEVATION,RADIUS` of a command line; elevation and radius may be left out. option: as the message names
+    it. Raises RecipeError."""
+    try:
+        azimuth_deg, elevation_deg, radius_m = (*map(float, text.split(",")), 0.0, 0.0)[:3]
+    except ValueError:
+        raise RecipeError(f"{option}AZIMUTH,ELEVATION,RADIUS wants numbers such as 30,15,0, got {text!r}") from None
+    return SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m)

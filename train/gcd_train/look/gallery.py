@@ -29,6 +29,7 @@ from gcd_model import (
 from gcd_model.errors import OptionError, ShapeError
 from gcd_model.geometry import Intrinsics, center_crop_box
 from gcd_train.data.encodings import read_colour
+from gcd_train.data.paths import delta_of
 from gcd_train.data.sample import Bytes, to_network
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.galleries import Strip, painted, to_bytes, write_sheet, write_video
@@ -81,16 +82,7 @@ class GalleryOptions:
     @property
     def goals(self) -> tuple[SphericalDelta, ...]:
         """Of steered models, target minus source; radius and elevation may be left out. Raises RecipeError."""
-        found: list[SphericalDelta] = []
-        for text in self.angles or ():
-            try:
-                azimuth_deg, elevation_deg, radius_m = (*map(float, text.split(",")), 0.0, 0.0)[:3]
-            except ValueError:
-                raise RecipeError(
-                    f"--angles wants AZIMUTH,ELEVATION,RADIUS in numbers such as 30,15,0, got {text!r}"
-                ) from None
-            found.append(SphericalDelta(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, radius_m=radius_m))
-        return tuple(found)
+        return tuple(delta_of(text, "--angles ") for text in self.angles or ())
 
     @property
     def source(self) -> Spherical | None:
