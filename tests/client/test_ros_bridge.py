@@ -176,8 +176,20 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node(bench: Bench) -> None:
     names = ("image", "image/compressed", "camera_info", "classes", "class_names", "depth", "visibility")
     topics, pictures = {f"~/top/{name}" for name in names} | {"/tf", "/diagnostics"}, jpeg_window(pose_units="m")
-    bench.until(lambda: topics <= set(bench.node.published), pictures, class_map(), depth(), visibility())
+    source = replace(pictures, topic="src/frm", header=replace(pictures.header, view_id="src"))
+    topics |= {"~/src/image/compressed", "~/events"}
+    event = StatusMessage(topic="event", header=origin(), fields={"code": "STATE", "level": 0})
+    sent = (pictures, class_map(), depth(), visibility(), source, event)
+    bench.until(lambda: topics <= set(bench.node.published), *sent)
     assert bench.node.topics == topics
+    assert bench.out("~/src/image/compressed")[0].header.frame_id == "robot/gcd/source_optical"
+    assert json.loads(bench.out("~/events")[0].data)["code"] == "STATE"
+    layout = (PACKAGE.parents[1] / "foxglove-live.json").read_text().replace("/topdown/", "/top/")
+    shown = set(re.findall(r'"(/\w[\w/]+)', layout))
+    assert len(shown) >= 8
+    assert {re.sub("^/gcd/", "~/", name) for name in shown} <= topics
+    parts = set(re.findall(r'name==\\"([^\\]+)', layout.replace("topdown", "top")))
+    assert {f"robot/{name}" for name in parts} <= {each.name for each in bench.out("/diagnostics")[-1].status}
     headers = [bench.out(f"~/top/{name}")[0].header for name in names if name != "class_names"]
     newest_at_goal = divmod(window().header.t_capture_ns[1], 10**9)
     assert {(each.frame_id, (each.stamp.sec, each.stamp.nanosec)) for each in headers} == {
@@ -189,7 +201,7 @@ def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node
     assert frames == ("robot/gcd/source_optical", "robot/gcd/top_optical")
     bench.until(lambda: len(bench.out("~/top/classes")) > 1, class_map())
     bench.until(lambda: "~/top/image" in bench.node.topics, meta("~/../x"))  # no view id, and never a topic
-    assert {topic.split("/")[1] for topic in bench.node.topics if topic[0] == "~"} == {"top"}
+    assert {topic.split("/")[1] for topic in bench.node.topics if topic[0] == "~"} == {"top", "src", "events"}
     (latched,) = bench.out("~/top/class_names")
     assert [(each["id"], each["name"], tuple(each["colour"])) for each in json.loads(latched.data)] == [
         (each.id, each.name, each.colour) for each in CLASSES

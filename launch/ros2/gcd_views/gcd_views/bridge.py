@@ -39,7 +39,7 @@ from gcd_client import (
     read_public_key,
 )
 from gcd_client.endpoints import resolve_endpoint
-from gcd_client.protocol import ViewKind, view_topic
+from gcd_client.protocol import PREVIEW_ID, ViewKind, to_text, view_topic
 from gcd_views import messages
 
 SILENT_AFTER_S = 3.0  # a node speaks once a second
@@ -146,10 +146,11 @@ class ViewReader(Reader):
 
 
 class StatusReader(Reader):
-    """Keeps the last status and the ids of the views of the gcd node."""
+    """Keeps the last status and the ids of the views of the gcd node, and gives each event to `on_event`."""
 
-    def __init__(self, settings: Settings, stop: threading.Event) -> None:
+    def __init__(self, settings: Settings, on_event: Callable[[StatusMessage], None], stop: threading.Event) -> None:
         super().__init__("status", stop)
+        self._on_event = on_event
         self.status: StatusMessage | None = None
         self.views: tuple[str, ...] = ()
         self._settings, self._heard_s = settings, 0.0
@@ -161,7 +162,7 @@ class StatusReader(Reader):
 
     def _read(self) -> None:
         settings = self._settings
-        with StatusSubscriber(settings.status, ("status", "meta"), settings.keys) as notes:
+        with StatusSubscriber(settings.status, keys=settings.keys) as notes:
             while not self._stop_event.is_set():
                 note = notes.receive(_POLL_MS)
                 if note is None:
@@ -172,6 +173,8 @@ class StatusReader(Reader):
                     for each in views:
                         view_topic(each, "win")  # raises MessageError: no id of a view
                     self.views = views
+                elif note.topic == "event":
+                    self._on_event(note)
                 else:  # the last one is repeated to whoever subscribes: it may be old
                     kept_s = max(0.0, (time.time_ns() - note.header.t_publish_ns) / 1e9)
                     self.status, self._heard_s = note, time.monotonic() - kept_s
@@ -231,7 +234,10 @@ class GcdViews(Node):
         self._settings, self._stop_event = self._read_parameters(), threading.Event()
         self._topics: dict[str, ViewTopics] = {}
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _STREAM)
-        self._status = StatusReader(self._settings, self._stop_event)
+        self._source = self.create_publisher(CompressedImage, f"~/{PREVIEW_ID}/image/compressed", _NEWEST)
+        self._source_reader: ViewReader | None = None
+        self._events = self.create_publisher(String, "~/events", _STREAM)
+        self._status = StatusReader(self._settings, self._publish_event, self._stop_event)
         self._status.start()
         self.create_timer(1.0, self._on_second)
         asking, changing = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()  # both wait for the node
@@ -246,8 +252,18 @@ class GcdViews(Node):
     def stop(self) -> None:
         """End all readers."""
         self._stop_event.set()
-        for reader in [self._status, *(reader for view in self._topics.values() for reader in view.readers)]:
+        readers = [self._status, *(reader for view in self._topics.values() for reader in view.readers)]
+        for reader in readers if self._source_reader is None else [*readers, self._source_reader]:
             reader.join()
+
+    def _publish_event(self, note: StatusMessage) -> None:
+        self._events.publish(String(data=to_text(note.header, note.fields).decode()))
+
+    def _publish_source(self, view: ReceivedView, index: int) -> None:
+        frame_id = (
+            self._settings.source_frame or f"{self.get_fully_qualified_name().strip('/')}/{view.header.src_frame_id}"
+        )
+        self._source.publish(messages.to_compressed_image(view.message, index, frame_id))
 
     def _read_parameters(self) -> Settings:
         def number(name: str) -> float:  # an integer will do: `max_age_ms:=500`
@@ -276,6 +292,9 @@ class GcdViews(Node):
         for view_id in self._status.views:
             if view_id not in self._topics:
                 self._topics[view_id] = ViewTopics(self, view_id, self._settings, self._stop_event)
+        if self._source_reader is None and self._source.get_subscription_count():  # the node codes it for somebody only
+            self._source_reader = ViewReader(PREVIEW_ID, "frm", self._settings, self._publish_source, self._stop_event)
+            self._source_reader.start()
         header = Header(stamp=messages.to_time(time.time_ns()))
         self._diagnostics.publish(DiagnosticArray(header=header, status=self._all_diagnostics()))
 
