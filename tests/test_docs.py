@@ -16,6 +16,9 @@ from typing import Any, NamedTuple, get_args
 
 import msgspec
 import pytest
+from cameras import ramp
+from robot_logs import at, camera_info, compressed, write_bag
+from rosbags.rosbag2 import StoragePlugin
 from typer.main import get_command
 
 from gcd_client.control import Code, decode_reply
@@ -224,6 +227,12 @@ def test_a_shell_block_marked_run_runs(block: Block, tmp_path: Path) -> None:
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     for name in ("drive.mp4", "my.mp4"):
         shutil.copy(ROOT / "gcd_node" / "assets" / "drive.mp4", tmp_path / name)
+    if "source.path=drive " in block.text:
+        said = [("/front/camera_info", camera_info(64, 48, d=()))]
+        said += [
+            ("/front/image/compressed", compressed(*each)) for each in zip(ramp(6), map(at, range(6)), strict=True)
+        ]
+        write_bag(tmp_path / "drive", said, StoragePlugin.MCAP)
     text = block.text
     for much, little in SMALLER.items():
         text = text.replace(much, little)
