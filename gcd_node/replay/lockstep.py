@@ -41,8 +41,8 @@ from gcd_node.replay.run import (
     open_run,
     pixel_digest,
 )
-from gcd_node.session import load_model, model_threads
 from gcd_node.ros_messages import McapFile, RosMessage, view_messages, write_bag_metadata
+from gcd_node.session import load_model, model_threads
 from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
 from gcd_node.stream_context import config_digest
 
@@ -146,7 +146,7 @@ def _require_windows(summary: Summary) -> None:
         )
 
 
-class DeafSink:
+class NullSink:
     """A message sink that needs no reader, and that nobody waits for. What is not overridden is not kept."""
 
     def __init__(self) -> None:
@@ -161,7 +161,7 @@ class DeafSink:
     def stop_waiting(self) -> None: ...
 
 
-class BagWriter(DeafSink):
+class BagWriter(NullSink):
     """Writes views into a file. recorded_after_ns: see SourceInfo."""
 
     def __init__(self, file: McapFile, config: NodeConfig) -> None:
@@ -190,7 +190,7 @@ class BagWriter(DeafSink):
                 yield dataclasses.replace(each, topic=topic, log_ns=at_ns, sent_ns=at_ns)
 
 
-class RunWriter(DeafSink):
+class RunWriter(NullSink):
     """Keeps the windows of a lockstep node and their maps.
 
     Single frames are part of their window, and deviations of its samples: neither is kept.

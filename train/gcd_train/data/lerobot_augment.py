@@ -229,9 +229,9 @@ class Augmentation:
         pixels = (view.video[t].clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
         size = _size_of(self.info, self.camera)
         yield f"{self.camera}_{name}", cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR).astype(np.uint8)
-        is_known = view.visibility is not None
-        seen = _LEVELS[view.visibility[t].numpy()] if is_known else np.zeros(pixels.shape[:2], np.uint8)
-        grey = cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST)
+        unknown = torch.zeros(pixels.shape[:2], dtype=torch.uint8)
+        seen = (unknown if view.visibility is None else view.visibility[t]).numpy()
+        grey = cv2.resize(_LEVELS[seen], size, interpolation=cv2.INTER_NEAREST)
         yield f"{self.camera}_{name}{_SEEN}", np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8)
 
     def _source(self, episode: EpisodePlace, frames: int) -> Iterator[tuple[list[Bytes], Doubles | None]]:
