@@ -228,9 +228,10 @@ def test_a_shell_block_marked_run_runs(block: Block, tmp_path: Path) -> None:
     for name in ("drive.mp4", "my.mp4"):
         shutil.copy(ROOT / "gcd_node" / "assets" / "drive.mp4", tmp_path / name)
     if "source.path=drive " in block.text:
-        said = [("/front/camera_info", camera_info(64, 48, d=()))]
+        said = [("/front/camera_info", camera_info(432, 288, d=()))]
         said += [
-            ("/front/image/compressed", compressed(*each)) for each in zip(ramp(6), map(at, range(6)), strict=True)
+            ("/front/image/compressed", compressed(*each))
+            for each in zip(ramp(6, 432, 288), map(at, range(6)), strict=True)
         ]
         write_bag(tmp_path / "drive", said, StoragePlugin.MCAP)
     text = block.text

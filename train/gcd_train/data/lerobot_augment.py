@@ -210,7 +210,7 @@ class Augmentation:
         for pictures, poses in self._source(episode, frames):
             small = np.stack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in pictures])
             clip = Clip(
-                video=to_network(small),
+                video=to_network(small.astype(np.uint8, copy=False)),
                 fps=self.info.fps,
                 lens=None if self.lens is None else self.lens.resized(*size),
                 odometry=torch.from_numpy(poses) if model.traits.live and poses is not None else None,
