@@ -19,6 +19,7 @@ _BEGIN = 0.3
 # Where rays end, in halves of the cube beyond the middle as the farthest camera sees it: what lies farther off is seen
 # by one camera only, and each would paint its whole picture there.
 _END = 0.5
+_NEAR_M = 0.4  # to the middle, for cameras that turn in place: their axes meet in themselves
 _PULL, _GUESS_M = 1e-3, 10.0  # for cameras with parallel axes: weight of a guess, and how far ahead it lies
 
 
@@ -50,8 +51,8 @@ class SceneBounds:
         guess = (position + _GUESS_M * ahead).mean(dim=0)
         left = across.sum(dim=0) + _PULL * torch.eye(3, dtype=torch.float64)
         centre = torch.linalg.solve(left, torch.einsum("mij,mj->i", across, position) + _PULL * guess)
-        distances = (position - centre).norm(dim=-1)
-        half_m = max(float(distances.max()) * _INNER, 1e-3)
+        distances = (position - centre).norm(dim=-1).clamp(min=_NEAR_M)
+        half_m = float(distances.max()) * _INNER
         nearest, farthest = (float(distance) / half_m for distance in (distances.min(), distances.max()))
         return cls(centre=centre.float(), half_m=half_m, begin=nearest * _BEGIN, reach=farthest + _END)
 
