@@ -143,6 +143,12 @@ Drawing: TypeAlias = Callable[[Camera], Tensor]
 """Gives the picture of a camera, float32 [3, H, W] in [0, 1]."""
 
 
+def narrowed(picture: Tensor, camera: Camera, width: int) -> Shown:
+    """The picture at most this wide."""
+    narrow = camera.narrowed(width)
+    return F.interpolate(picture[None], size=(narrow.lens.height, narrow.lens.width), mode="area")[0], narrow
+
+
 @dataclass(frozen=True, kw_only=True)
 class PerScene(ABC):
     """A method that learns the scene of each clip from K views: the source, and further cameras from two on.
@@ -202,7 +208,7 @@ class PerScene(ABC):
                 pictures.append((to_pictures(view.rgb[None])[0], camera))
         wanted = own.ground_from_source @ own.source_from_target  # [T, 4, 4]
         bounds = SceneBounds.around(torch.stack([*(camera.world_from_camera for _, camera in pictures), *wanted]))
-        drawing = self.learn([self._narrowed(*each) for each in pictures], bounds, frames)
+        drawing = self.learn([narrowed(*each, self.picture_width) for each in pictures], bounds, frames)
         cameras = [
             Camera(lens=own.target, world_from_camera=pose, time=time).narrowed(self.picture_width)
             for pose, time in zip(wanted, times, strict=True)
@@ -212,8 +218,3 @@ class PerScene(ABC):
         if video.shape[2:] != size:
             video = F.interpolate(video, size=size, mode="bicubic", align_corners=False).clamp(0.0, 1.0)
         return Prediction(video=video)
-
-    def _narrowed(self, picture: Tensor, camera: Camera) -> Shown:
-        narrow = camera.narrowed(self.picture_width)
-        size = narrow.lens.height, narrow.lens.width
-        return F.interpolate(picture[None], size=size, mode="area")[0], narrow
