@@ -226,17 +226,21 @@ def test_means_go_by_episode_split_and_group_without_black_targets(root: Path, t
     assert (code, "data_identity" in said) == (73, True)
 
 
-def test_a_mean_over_groups_is_unknown_without_a_group(root: Path) -> None:
+def test_a_mean_is_unknown_unless_all_its_episodes_were_measured(root: Path) -> None:
     told = note(
         kind="anyview",
         protocol="anyviewbench",
         data_identity="its own",
-        groups={"a": {"a1": ("a1.e",)}, "b": {"b1": ("b1.e",)}},
+        groups={"a": {"a1": ("a1.e",)}, "b": {"b1": ("b1.e", "b1.f")}},
     )
-    both = [record("model", "a1.e"), record("copy", "a1.e"), record("copy", "b1.e")]
+    both = [
+        record("model", "a1.e"),
+        record("model", "b1.e"),
+        *(record("copy", key) for key in ("a1.e", "b1.e", "b1.f")),
+    ]
     of = gather([Run(folder=root, note=told, records=tuple(both))])[0]
     found = {(row.method, row.label): str(row.cells[0]) for row in benchmark_table(of).rows}
-    assert found["model", "mean over groups"] == "-"
+    assert found["model", "mean over groups"] == found["model", "b: b1"] == "-"  # of b1 one of two
     assert found["copy", "mean over groups"] == found["model", "a"] == "20.00"
     assert {row.method for row in published_table().rows}.isdisjoint({"model", "copy"})
     other = Run(folder=root, note=note(), records=(record("other", "a1.e"),))
@@ -264,16 +268,57 @@ def test_both_cameras_may_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         HexPlane().predict(seen)
 
 
-def test_a_lens_that_zooms_is_refused_by_what_takes_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("fx", "zooms"), [(60.0, True), (50.0 + 1e-5, False)])
+def test_a_lens_that_zooms_is_refused_by_what_takes_one(tmp_path: Path, fx: float, zooms: bool) -> None:
     still = filmed(azimuth_deg=90.0)
-    longer = replace(still.lenses[0], fx=60.0)
+    longer = replace(still.lenses[0], fx=fx)
     target = replace(still, lenses=[*still.lenses[:-1], longer])
     episode(benchmark(tmp_path, {"g": ["s"]}) / "s" / "e", target)
     clips, _ = open_clips(ClipOptions(data=[tmp_path], protocol="anyviewbench", frames=FRAMES))
     clip = clips.clip("s.e")
-    assert clip.seen.cameras.zooms
-    with pytest.raises(DataError, match="zooms"):
-        HexPlane().predict(clip.seen)
+    assert clip.seen.cameras.zooms == zooms
+    if zooms:
+        with pytest.raises(DataError, match="zooms"):
+            HexPlane().predict(clip.seen)
+
+
+def test_a_folder_without_splits_is_one_split_seen_by_the_cameras_that_are_chosen(tmp_path: Path) -> None:
+    made = {f"cam{number:02d}": filmed(azimuth_deg=40.0 * number) for number in range(3)}
+    folder = tmp_path / "kubric5d" / "scn00001"
+    folder.mkdir(parents=True)
+    write_episode(folder, made, 24.0)
+    options = ClipOptions(data=[folder.parent], protocol="anyviewbench", camera=["cam02", "cam00"])
+    clips, _ = open_clips(options)
+    assert clips.keys == ("kubric5d.scn00001",)
+    cameras = clips.clip(clips.keys[0]).seen.cameras
+    poses = [torch.from_numpy(made[name].poses[:5]) for name in ("cam02", "cam00")]
+    torch.testing.assert_close(cameras.source_from_target, relative_pose(*poses))
+    other, _ = open_clips(replace(options, camera=["cam01", "cam00"]))
+    assert other.identity != clips.identity
+    for camera, error in ((["cam02"], RecipeError), (["cam02", "cam03"], DataError), (None, DataError)):
+        with pytest.raises(error):
+            open_clips(replace(options, camera=camera))
+
+
+def test_linked_episodes_are_found_and_belong_to_the_last_folder_that_is_a_split(tmp_path: Path) -> None:
+    episode(tmp_path / "store" / "e")
+    root = benchmark(tmp_path / "bench", {"g": ["s", "t"]})
+    (root / "s" / "t").mkdir(parents=True)
+    (root / "s" / "t" / "linked").symlink_to(tmp_path / "store" / "e")
+    options = ClipOptions(data=[root], protocol="anyviewbench")
+    clips, _ = open_clips(options)
+    assert clips.keys == ("t.linked",)
+    benchmark(root, {"g": ["s"], "h": ["t"]})
+    assert open_clips(options)[0].identity != clips.identity
+
+
+@pytest.mark.parametrize("names", [("s/a/b-c", "s/a-b/c"), ("s/1/2/3/4/5/e",)])
+def test_episodes_of_one_name_or_too_deep_are_not_left_out_silently(tmp_path: Path, names: tuple[str, ...]) -> None:
+    benchmark(tmp_path, {"g": ["s"]})
+    for name in ("s/e", *names):
+        episode(tmp_path / name)
+    with pytest.raises(DataError):
+        open_clips(ClipOptions(data=[tmp_path], protocol="anyviewbench"))
 
 
 def test_another_lens_in_the_same_place_shows_the_same_directions() -> None:
@@ -421,6 +466,12 @@ def test_pairs_become_episodes_with_both_cameras(tmp_path: Path) -> None:
     assert [work(item) for item in (*work.items, work.items[0])] == [True, True, False]
     assert work.finish() == ("driving-pairs",)
     written = tmp_path / "out" / work.items[1].partition("/")[2]
+    picture = written / "rgb" / "cam1" / "0000000000.jpg"
+    stored = picture.read_bytes()
+    cv2.imwrite(str(picture), 255 - cv2.imread(str(picture)))
+    with pytest.raises(RecipeError, match="another scene"):
+        work(work.items[1])
+    picture.write_bytes(stored)
     source, target = (read(written, camera, 5) for camera in ("cam1", "cam0"))
     way = relative_pose(*(torch.from_numpy(each.poses) for each in (source, target)))
     torch.testing.assert_close(way, work.data.trajectory(1).source_from_target)  # pyright: ignore

@@ -11,10 +11,11 @@ from torch.testing import assert_close
 
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, relative_pose, to_pose
 from gcd_train.data.sample import SceneView
-from gcd_train.evaluation.gaussians import GaussianSplatting, first_points
+from gcd_train.evaluation.gaussians import GaussianSplatting, MovedGaussians, first_points
 from gcd_train.evaluation.hexplane import SPACE, TIME, HexPlane, HexPlanes, resampled
 from gcd_train.evaluation.per_scene import Camera, PerScene, SceneBounds
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
+from gcd_train.evaluation.rasteriser import rotations
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)
 FRAMES = 2
@@ -156,3 +157,104 @@ def test_first_points_lie_where_other_cameras_see_the_same() -> None:
     assert near.sum() > 20
     assert float((points[near, 2].abs() < 0.3).float().mean()) > 0.9
     assert_close(shown[near, :2], 0.5 + points[near, :2] / 30.0, rtol=0, atol=0.02)
+
+
+# --- Gaussians that are taken away and doubled -----------------------------------------------------------------------
+
+
+def scene_of(count: int, *, step: bool = False) -> tuple[MovedGaussians, torch.optim.Adam]:
+    """Gaussians that show, and their optimiser, before or after its first step."""
+    generator = torch.Generator().manual_seed(0)
+    points, shown = (torch.rand(count, 3, generator=generator) for _ in range(2))
+    bounds = SceneBounds(centre=torch.zeros(3), half_m=4.5, begin=0.6, reach=2.5)
+    scene = TINY_GAUSSIANS.scene(points, shown, bounds, FRAMES, generator)
+    optimiser = TINY_GAUSSIANS.optimiser(scene)
+    if step:
+        sum((value**2).sum() for value in scene.parameters()).backward()
+        optimiser.step()
+    return scene, optimiser
+
+
+def renewed(scene: MovedGaussians, optimiser: torch.optim.Adam, pull: Tensor, most: int) -> None:
+    TINY_GAUSSIANS.renew(scene, optimiser, pull, most, torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("step", [False, True])
+def test_what_is_kept_keeps_its_moments_and_twins_begin_anew(step: bool) -> None:
+    scene, optimiser = scene_of(16, step=step)
+    with torch.no_grad():
+        scene.rest["opacities"][3] = -20.0
+    before = {name: value.detach().clone() for name, value in scene.rest.items()}
+    moments = {g["name"]: dict(optimiser.state[g["params"][0]]) for g in optimiser.param_groups if g["name"] in before}
+    renewed(scene, optimiser, torch.arange(16.0), 17)
+    kept = [number for number in range(16) if number != 3]
+    for group in optimiser.param_groups:
+        if group["name"] in before:
+            (value,) = group["params"]
+            assert value is scene.rest[group["name"]]
+            assert len(value) == 16
+            if group["name"] in ("opacities", "colours", "quaternions"):  # the last is doubled: it is pulled most
+                assert_close(value.detach(), before[group["name"]][[*kept, 15]])
+            for name, old in moments[group["name"]].items():
+                if name != "step":
+                    assert_close(optimiser.state[value][name], torch.cat([old[kept], torch.zeros_like(old[:1])]))
+
+
+def test_halves_lie_as_the_whole_did() -> None:
+    scene, optimiser = scene_of(4000)
+    turned = torch.tensor([0.9, 0.1, -0.4, 0.2])
+    with torch.no_grad():
+        scene.rest["means"].zero_()
+        scene.rest["quaternions"].copy_(turned.expand(4000, 4))
+        scene.rest["scales"].copy_(torch.tensor([0.5, 0.1, 0.02]).log().expand(4000, 3))
+        scene.rest["scales"][2000:] -= 1.0  # too small to be halved
+    renewed(scene, optimiser, torch.arange(4000.0, 0.0, -1.0), 8000)
+    means, scales = scene.rest["means"].detach(), scene.rest["scales"].detach().exp()
+    assert_close(means[:500], -means[4000:])
+    rotation = rotations(turned[None])[0]
+    expected = rotation @ torch.diag(torch.tensor([0.5, 0.1, 0.02]) ** 2) @ rotation.T
+    assert_close(means[4000:].T.cov(), expected, rtol=0.2, atol=2e-3)
+    assert_close(scales[[0, 4000, 1000], 0], torch.tensor([0.5, 0.5, 0.8]) / torch.tensor([1.6, 1.6, 1.6]))
+    assert not means[500:4000].any()
+
+
+def test_a_scene_may_be_emptied_and_what_shows_at_a_time_alone_stays() -> None:
+    scene, optimiser = scene_of(8, step=True)
+    with torch.no_grad():
+        scene.rest["opacities"].fill_(-20.0)
+        scene.heads[3].bias.fill_(20.0)
+    renewed(scene, optimiser, torch.zeros(8), 8)
+    assert len(scene.rest["means"]) == 8
+    with torch.no_grad():
+        scene.heads[3].bias.zero_()
+    for _ in range(2):
+        renewed(scene, optimiser, torch.zeros(len(scene.rest["means"])), 8)
+        assert len(scene.rest["means"]) == 0
+        made, _ = scene.seen(Camera(lens=LENS, world_from_camera=pose_of(SOURCE), time=0.0), 0.0)
+        made.sum().backward()
+        optimiser.step()
+
+
+def test_the_first_updates_after_the_warm_up_move_little() -> None:
+    """Adam would move everything by its full rate, and the planes of space with it, where their gradient is nothing."""
+    pictures = [
+        (colours(video(each))[0], Camera(lens=LENS, world_from_camera=pose_of(each), time=-1.0)) for each in RING
+    ]
+    bounds = SceneBounds.around(torch.stack([camera.world_from_camera for _, camera in pictures]))
+    still, begun = (
+        replace(TINY_GAUSSIANS, updates=20, still=share).learn(pictures, bounds, FRAMES).args[0]
+        for share in (1.0, 0.94)
+    )
+    moved = (begun(-1.0).means - begun(None).means).norm(dim=1).mean()
+    assert 0.0 < moved < 0.03 * bounds.half_m
+    assert (begun.planes.space - still.planes.space).abs().max() < 0.03
+
+
+def test_a_camera_that_turns_in_place_learns_something() -> None:
+    turned = torch.eye(4, dtype=torch.float64)
+    turned[:2, :2] = torch.tensor([[0.8, -0.6], [0.6, 0.8]])
+    clip = source_clip()
+    path = Trajectory(source_from_target=torch.stack([torch.eye(4, dtype=torch.float64), turned]))
+    clip = replace(clip, cameras=replace(clip.cameras, trajectory=path))
+    made = replace(TINY_GAUSSIANS, updates=40).predict(clip).video
+    assert psnr_db(made[0], colours(video(SOURCE))[0]) > 12.0

@@ -1,7 +1,8 @@
 import math
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
+from importlib.machinery import ModuleSpec
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from gcd_train.evaluation import rasteriser
 from gcd_train.evaluation.per_scene import Camera
 from gcd_train.evaluation.rasteriser import DENSEST, FAINTEST, LOW_PASS, NEAREST_M, Gaussians, rasterised, rotations
 
+NAMES = ("means", "quaternions", "scales", "opacities", "colours")
 LENS = Intrinsics(fx=20.0, fy=22.0, cx=11.0, cy=7.0, width=21, height=13)  # no whole number of tiles
 CAMERA = Camera(
     lens=LENS, world_from_camera=to_pose(Spherical(azimuth_deg=30.0, elevation_deg=20.0, radius_m=6.0)), time=0.0
@@ -75,6 +77,16 @@ def test_tiles_show_what_a_loop_over_pixels_and_gaussians_shows(count: int) -> N
     assert (count > 2) == bool((passed < 0.9).any())
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_needles_are_drawn_in_single_precision_as_in_double(seed: int) -> None:
+    """20 m long, 1 mm thick; one behind the camera."""
+    scales = torch.tensor([20.0, 1e-3, 1e-3], dtype=torch.float64).expand(200, 3)
+    needles = replace(some(200, seed=seed), scales=scales)
+    single = Gaussians(**{name: getattr(needles, name).float() for name in NAMES})
+    exact, drawn = rasterised(needles, CAMERA), rasterised(single, CAMERA)
+    assert_close(drawn.passed.double(), exact.passed, rtol=0, atol=5e-3)
+
+
 def test_a_ball_ahead_is_a_bump_of_its_size() -> None:
     camera = replace(CAMERA, world_from_camera=torch.eye(4, dtype=torch.float64))
     ball = Gaussians(
@@ -92,14 +104,22 @@ def test_a_ball_ahead_is_a_bump_of_its_size() -> None:
 
 def test_its_gradient_is_that_of_its_picture() -> None:
     of = some(7, grown=0.8, seed=3)
-    names = ("means", "quaternions", "scales", "opacities", "colours")
     towards = torch.rand(LENS.height, LENS.width, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
     def weighed(*values: Tensor) -> Tensor:
-        drawn = rasterised(Gaussians(**dict(zip(names, values, strict=True))), CAMERA)
+        drawn = rasterised(Gaussians(**dict(zip(NAMES, values, strict=True))), CAMERA)
         return (torch.cat([drawn.colours, drawn.passed[..., None]], dim=-1) * towards).sum()
 
-    assert torch.autograd.gradcheck(weighed, [getattr(of, name).requires_grad_() for name in names], eps=1e-7)
+    assert torch.autograd.gradcheck(weighed, [getattr(of, name).requires_grad_() for name in NAMES], eps=1e-7)
+
+
+def test_gsplat_that_is_there_and_cannot_draw_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = ModuleType("gsplat")  # as its source alone: no CUDA, nothing compiled
+    broken.__spec__ = ModuleSpec("gsplat", None)
+    monkeypatch.setitem(sys.modules, "gsplat", broken)
+    rasteriser.has_gsplat.cache_clear()
+    assert not rasteriser.has_gsplat(torch.device("cuda"))
+    rasteriser.has_gsplat.cache_clear()
 
 
 def test_gsplat_is_given_what_its_documentation_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:

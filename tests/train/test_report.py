@@ -239,14 +239,16 @@ def test_error_against_angle_is_of_the_last_frame_and_either_way_round() -> None
     assert {point.clips for point in points} == {2}
 
 
-def test_each_curve_of_hexplane_is_of_its_own_pixels() -> None:
+def test_each_curve_over_views_is_of_its_own_method_and_pixels() -> None:
     regions = {"all": region((20.0,) * FRAMES, ssim=0.7), "occluded": region((20.0,) * FRAMES, ssim=0.3)}
     few = [msgspec.structs.replace(each, regions=regions) for each in two("hexplane_1")]
-    of = measured(two("hexplane_4"), few, two("a"))
+    of = measured(two("hexplane_4"), few, two("a"), two("4dgs_4"))
     plot = next(plot for plot in all_plots(of) if plot.name == "ssim_by_views")
     found = {name: [(str(point.x), round(point.y.value, 6)) for point in each] for name, each in plot.curves.items()}
     assert found == {
         "HexPlane, all": [("1", 0.7), ("4", 0.5)],
+        "4D-GS, all": [("4", 0.5)],
+        "4D-GS, occluded": [("4", 0.5)],
         "a, all": [("nan", 0.5)],
         "HexPlane, occluded": [("1", 0.3), ("4", 0.5)],
     }

@@ -272,6 +272,11 @@ def test_each_frame_is_seen_alone_in_its_middle_and_shown_there(networks: ZeroNv
     other = replace(method, samples=1).predict(replace(clip, source=changed, source_depth=clip.source_depth * 0)).video
     assert [torch.equal(a, b) for a, b in zip(first, other, strict=True)] == [True, False, True]
     assert method.name == "zeronvs (scale 4)"
+    for shared in (False, True):
+        one, two = (
+            replace(method, samples=1, shared_noise=shared).predict(replace(clip, key=key)).video for key in "ab"
+        )
+        assert torch.equal(one, two) == shared
 
 
 # --- what is refused, and the search of the scale --------------------------------------------------------------------

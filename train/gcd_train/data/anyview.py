@@ -1,15 +1,16 @@
 """Episodes in the unified scene layout of AnyViewBench and Kubric-5D: names, reader, writer, export of our scenes.
 
-    splits.json                              {"groups": {"argoverse": ["argoverse_A", ...], ...}}
+    splits.json                              {"groups": {"argoverse": ["argoverse_A", ...], ...}}, not in Kubric-5D
     SPLIT/EPISODE/metadata.json              cameras, resolution [H, W], num_frames, framerate
     SPLIT/EPISODE/rgb/cam0/0000000000.jpg    each frame, or rgb/cam0.mp4 with all
     SPLIT/EPISODE/lowdim/cam0/0000000000.npz each frame's `intrinsics` [3, 3] and `extrinsics` [4, 4], or
                                              lowdim/cam0.npz with [T, 3, 3] and [T, 4, 4]
 
-cam1 is the input, cam0 the target; both may move. Extrinsics are world from camera, intrinsics a pinhole in pixels of
-the stored pictures. Source: README and PROTOCOL page of TRI-ML/AnyView-DVS (Van Hoorick et al. 2026). They do not
-say, and this is assumed: camera axes are x right, y down, z ahead; pixels count from the picture's corner; all cameras
-of an episode have its resolution; an episode lies somewhere below a folder that is called as its split.
+In the benchmark cam1 is the input, cam0 the target; both may move. Kubric-5D has cam00 to cam15. Extrinsics are world
+from camera, intrinsics a pinhole in pixels of the stored pictures. Source: README and PROTOCOL page of
+TRI-ML/AnyView-DVS (Van Hoorick et al. 2026). They do not say, and this is assumed: camera axes are x right, y down, z
+ahead; pixels count from the picture's corner; all cameras of an episode have its resolution; an episode lies somewhere
+below a folder that is called as its split, the last of such; a folder without splits.json is one split.
 """
 
 import io
@@ -47,7 +48,9 @@ SPLITS, METADATA, FETCH = "splits.json", "metadata.json", "fetch_manifest.json"
 """Index of a benchmark; facts of an episode; what an episode without pixels (Ego-Exo4D, Waymo) is rebuilt by."""
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _MOST_SIDE, _MOST_FRAMES, _MOST_DEPTH = 1 << 14, 100_000, 4
-_SKEW = 1e-3  # of a focal length, as are other entries that a pinhole has not
+SKEW = 1e-3
+"""Of a focal length: what is less is no change of a lens, and no entry that a pinhole has not."""
+_JPEG_OFF = 8  # levels, more than what is lost by `_JPEG`
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
@@ -82,24 +85,30 @@ def read_groups(root: Path) -> dict[str, tuple[str, ...]]:
 
 
 def find_episodes(root: Path, splits: Sequence[str]) -> dict[str, dict[str, Path]]:
-    """Folders of the episodes by split and name, in order; of a split that is not there none.
+    """Folders of the episodes by split and name, in order, linked ones, too; of a split that is not there none.
 
-    Raises: DataError: the folder cannot be read, or an episode lies in a folder of no split.
+    Raises: DataError: the folder cannot be read, an episode lies in a folder of no split or has another's name, or
+        folders lie too deep to look for one.
     """
     found: dict[str, dict[str, Path]] = {split: {} for split in splits}
 
     def passed_on(error: OSError) -> None:
         raise DataError(f"{root} cannot be read ({error}); check its rights") from error
 
-    for place, folders, files in os.walk(root, onerror=passed_on):
-        parts = Path(place).relative_to(root).parts
-        told = METADATA in (*folders, *files)
-        folders[:] = [] if told or len(parts) > _MOST_DEPTH else sorted(folders)
-        if told:
-            split = next((part for part in parts if part in found), None)
-            if split is None:
-                raise DataError(f"{place} is an episode in no folder of a split that {SPLITS} names; take it out")
-            found[split]["-".join(parts[parts.index(split) + 1 :]) or split] = Path(place)
+    for place, folders, files in os.walk(root, onerror=passed_on, followlinks=True):
+        parts = (root.name, *Path(place).relative_to(root).parts)
+        if METADATA not in (*folders, *files):
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            if folders and len(parts) > _MOST_DEPTH + 1:
+                raise DataError(f"{place} has folders deeper than an episode lies ({_MOST_DEPTH}); take them out")
+            continue
+        folders.clear()
+        split = next((part for part in reversed(parts) if part in found), None)
+        if split is None:
+            raise DataError(f"{place} is an episode in no folder of a split that {SPLITS} names; take it out")
+        name = "-".join(parts[len(parts) - parts[::-1].index(split) :]) or split
+        if found[split].setdefault(name, Path(place)) != Path(place):
+            raise DataError(f"{place} and {found[split][name]} would both be called {name}; rename one")
     return found
 
 
@@ -200,7 +209,7 @@ class Episode:
         fx, fy, cx, cy = (float(rows[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
         lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=self.width, height=self.height)
         off = np.abs(rows - lens.matrix.numpy()) / np.array([[fx], [fy], [1.0]])
-        if not float(off.max()) <= _SKEW:
+        if not float(off.max()) <= SKEW:
             raise ValueError(f"intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {rows.round(3).tolist()}")
         return lens
 
@@ -304,16 +313,24 @@ class EpisodeExport:
         return tuple(f"{group}/{group}-{one}-{other}/{scene}" for group, scene in scenes for one, other in self.views)
 
     def __call__(self, item: str) -> bool:
-        """Write an episode; whether it was not there. Raises: DataError: it cannot be read. OSError: nor written."""
+        """Write an episode; whether it was not there.
+
+        Raises: DataError: it cannot be read. OSError: nor written. RecipeError: one of another scene has its name.
+        """
         _, split, name = item.split("/")
-        if (self.out / split / name).exists():
+        place, there = self.items.index(item), self.out / split / name
+        views = dict(zip((SOURCE, TARGET), self.views[place % len(self.views)], strict=True)) if self.views else {}
+        if there.exists():
+            data = self.data
+            first = data[place].source[0] if isinstance(data, PairedClips) else data.view(name, views[SOURCE], 0).rgb
+            known = read_colour(there / "rgb" / SOURCE / f"{_stem(0)}.jpg")
+            if known.shape != first.shape or int(np.abs(known.astype(int) - first).max()) > _JPEG_OFF:
+                raise RecipeError(f"{there} is an episode of another scene of this name; export to another folder")
             return False
-        place = self.items.index(item)
         with new_folder(self.out / split, name) as folder:
             if isinstance(self.data, PairedClips):
                 write_episode(folder, _pair(self.data, place), self.data.fps)
             else:
-                views = dict(zip((SOURCE, TARGET), self.views[place % len(self.views)], strict=True))
                 videos = {camera: _filmed(self.data, name, view) for camera, view in views.items()}
                 write_episode(folder, videos, self.data.fps)
         return True

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from gcd_model.geometry import pose_trajectory, relative_pose
-from gcd_train.data.anyview import FETCH, SOURCE, SPLITS, TARGET, Episode, find_episodes, read_groups
+from gcd_train.data.anyview import FETCH, SKEW, SOURCE, SPLITS, TARGET, Episode, find_episodes, read_groups
 from gcd_train.data.encodings import pillow
 from gcd_train.data.files import Skips
 from gcd_train.data.sample import Bytes
@@ -55,27 +55,38 @@ class EpisodeSet(EvaluationSet):
     """Episodes by name: `droid_OOD_LR.EPISODE`, the split and the folder.
 
     episodes: and of each how many frames are measured, the first ones. frames, height, width: of the longest and the
-    largest; they differ. groups: names of the clips of each split by group; none of a split that was left out.
+    largest; they differ. groups: names of the clips of each split by group; none of a split that was left out. pair:
+    input and target camera.
     """
 
     episodes: Mapping[str, tuple[Episode, int]]
     groups: dict[str, dict[str, tuple[str, ...]]]
+    pair: tuple[str, str]
 
     @classmethod
     def open(
-        cls, root: Path, *, frames: int | None = None, split: str | None = None, limit: int | None = None
+        cls,
+        root: Path,
+        *,
+        frames: int | None = None,
+        split: str | None = None,
+        limit: int | None = None,
+        pair: tuple[str, str] | None = None,
     ) -> tuple[Self, tuple[str, ...]]:
         """The set, without an identity; and what was left out, line by line.
 
         Args:
             frames: T of all clips; None for the most that the benchmark takes of each. split: only this one, or this
-                group. limit: only the first so many episodes of each split.
+                group. limit: only the first so many episodes of each split. pair: input and target camera, other than
+                the benchmark's; a folder without splits.json, as Kubric-5D's, is one split then.
         Raises:
             DataError, FileFault: it is no benchmark, an episode has fewer frames or lacks a camera, or nothing is left.
             RecipeError: no such split. RenderError: Pillow is missing.
         """
         pillow()  # what is not installed is said now, not clip by clip
-        chosen = [(group, name) for group, splits in read_groups(root).items() for name in splits]
+        whole = pair is not None and not (root / SPLITS).exists()
+        groups = {root.name: (root.name,)} if whole else read_groups(root)
+        chosen = [(group, name) for group, splits in groups.items() for name in splits]
         found, notes = find_episodes(root, [name for _, name in chosen]), Skips(logged=False)
         if split is not None:
             known = ", ".join(name for _, name in chosen)
@@ -84,7 +95,8 @@ class EpisodeSet(EvaluationSet):
                 raise RecipeError(f"{root / SPLITS} has no split or group {split!r}; there are {known}")
         episodes, kept = dict[str, tuple[Episode, int]](), dict[str, dict[str, tuple[str, ...]]]()
         for group, name in chosen:
-            opened = {key: Episode.open(folder) for key, folder in list(found[name].items())[:limit]}
+            several = list(found[name].items())[:limit]
+            opened = {key: Episode.open(folder, pair or (SOURCE, TARGET)) for key, folder in several}
             there = {f"{name}.{key}": each for key, each in opened.items() if each is not None}
             if not opened:
                 notes.add(name, str(root), "has no folder for this split")
@@ -101,6 +113,7 @@ class EpisodeSet(EvaluationSet):
         made = cls(
             episodes=episodes,
             groups=kept,
+            pair=pair or (SOURCE, TARGET),
             frames=max(length for _, length in episodes.values()),
             height=max(height for height, _ in sizes),
             width=max(width for _, width in sizes),
@@ -122,7 +135,7 @@ class EpisodeSet(EvaluationSet):
     def clip(self, key: str, /) -> HeldOutClip:
         """See EvaluationSet. Frames whose target is wholly black do not count."""
         episode, frames = self.episodes[key]
-        source, target = (episode.read(camera, frames) for camera in (SOURCE, TARGET))
+        source, target = (episode.read(camera, frames) for camera in self.pair)
         height, width = grid_size(episode.height, episode.width)
         poses = [torch.from_numpy(each.poses) for each in (source, target)]
         seen, true = (on_grid(each.pictures, height, width) for each in (source, target))
@@ -132,7 +145,11 @@ class EpisodeSet(EvaluationSet):
             source=source.lenses[0].resized(width, height),
             target=target.lenses[0].resized(width, height),
             trajectory=pose_trajectory(relative_pose(*poses)),
-            zooms=any(lens != each.lenses[0] for each in (source, target) for lens in each.lenses),
+            zooms=any(
+                float((lens.matrix - each.lenses[0].matrix).abs().max()) > SKEW * lens.fx
+                for each in (source, target)
+                for lens in each.lenses
+            ),
         )
         return HeldOutClip(
             key=key,
@@ -175,7 +192,8 @@ def benchmark_table(of: EvaluatedSet) -> Table:
         places += [(group, {group: splits}), *((f"{group}: {s}", {group: {s: keys}}) for s, keys in splits.items())]
     rows = [_row(method, label, part) for label, part in places for method in of.methods]
     out = [split for splits in of.note.groups.values() for split, keys in splits.items() if not keys]
-    notes = [f"Unweighted means over frames, episodes, splits, {len(groups)} groups; black targets do not count."]
+    means = f"Unweighted means over frames, episodes, splits, {len(groups)} groups"
+    notes = [f"{means}: of all, or not known; black targets do not count."]
     parts = [each.name for each in of.methods if any(record.crop is not None for record in each.records)]
     notes += [f"†, a part of each frame alone, which is not the protocol's: {', '.join(parts)}."] if parts else []
     notes += [f"Left out, without pixels or not there: {', '.join(out)}."] if out else []
@@ -184,26 +202,25 @@ def benchmark_table(of: EvaluatedSet) -> Table:
 
 
 def _row(method: MethodRecords, label: str, groups: Mapping[str, Mapping[str, Sequence[str]]]) -> Row:
-    """A method's mean over groups of splits of episodes; not known as soon as one split is not."""
+    """A method's mean over groups of splits of episodes; not known as soon as one episode was not measured."""
     sums, cells = method.table.clip_sums("all"), list[Cell]()
     for column in _COLUMNS:
         by_clip = sums.figure(column.figure)
-        splits = [[_mean(by_clip[_places(method, keys)]) for keys in each.values()] for each in groups.values()]
+        splits = [[_mean(by_clip, method.places, keys) for keys in each.values()] for each in groups.values()]
         value = float(np.mean([np.mean(each) for each in splits]))
         note = NO_WEIGHTS if column.figure == "lpips" and np.isnan(by_clip).all() else NOTHING
         cells.append(Cell(figure=Interval(value=value), digits=column.digits, note=note))
-    keys = [key for each in groups.values() for split in each.values() for key in split]
-    clips = f"{len(_places(method, keys))} of {len(keys)}"
+    measured = [key in method.places for each in groups.values() for split in each.values() for key in split]
+    clips = f"{sum(measured)} of {len(measured)}"
     return Row(label=label, method=method.starred, clips=clips, cells=tuple(cells))
 
 
-def _places(method: MethodRecords, keys: Sequence[str]) -> list[int]:
-    return [method.places[key] for key in keys if key in method.places]
-
-
-def _mean(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
-    """Of what is known: an episode that is black throughout is not."""
-    known = values[~np.isnan(values)]
+def _mean(
+    values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], places: Mapping[str, int], keys: Sequence[str]
+) -> float:
+    """Of a split whose episodes were all measured; one that is black throughout has no figure and does not count."""
+    known = values[[places[key] for key in keys]] if all(key in places for key in keys) else values[:0]
+    known = known[~np.isnan(known)]
     return float(known.mean()) if known.size else float("nan")
 
 

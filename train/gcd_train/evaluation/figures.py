@@ -118,7 +118,8 @@ def _told(of: EvaluatedSet, key: str) -> list[Strip]:
 
 ANGLE_STEP_DEG = 15.0
 _MOST_ANGLES = 20  # so many different ones are shown as they are
-_HEXPLANE = re.compile(r"hexplane[ _-]?(\d+)", re.IGNORECASE)
+_BY_VIEWS = re.compile(r"(hexplane|4dgs)[ _-]?(\d+)", re.IGNORECASE)
+_LABELS = {"hexplane": "HexPlane", "4dgs": "4D-GS"}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -174,25 +175,27 @@ def error_by_angle(of: EvaluatedSet) -> Plot:
 
 
 def ssim_by_views(of: EvaluatedSet) -> Plot:
-    """SSIM over the number of views that HexPlane is given; every other method as a level. No curve without HexPlane.
+    """SSIM over the number of views that HexPlane and 4D-GS are given; every other method as a level. No plot without
+    one of the two.
 
     Of clips and methods as `error_by_angle`.
 
     Source: GCD, section 5: how many input views a reconstruction needs to come near.
     """
     methods, common, told = _compared(of)
-    views = {method.name: int(m[1]) for method in methods if (m := _HEXPLANE.search(method.name))}
+    named = {method.name: m for method in methods if (m := _BY_VIEWS.search(method.name))}
+    views = {name: int(m[2]) for name, m in named.items()}
     regions: tuple[Region, ...] = ("all", "occluded")
     curves: dict[str, list[Point]] = {}
     for region, method in product(regions, sorted(methods, key=lambda m: views.get(m.name, inf))):
-        name = "HexPlane" if method.name in views else method.starred
+        name = _LABELS[named[method.name][1].lower()] if method.name in views else method.starred
         y = method.sums(region=region, keys=common).interval("ssim")
-        if y.known and views and (name == "HexPlane" or region == "all"):
+        if y.known and views and (method.name in views or region == "all"):
             point = Point(x=views.get(method.name, nan), y=y, clips=len(common))
             curves.setdefault(f"{name}, {region}", []).append(point)
     if all(isnan(curve[0].x) for curve in curves.values()):  # levels alone
         curves = {}
-    title = f"HexPlane, frames 2 to the last{told}"
+    title = f"Frames 2 to the last{told}"
     return Plot(name="ssim_by_views", title=title, across="views given", up="SSIM", curves=curves)
 
 

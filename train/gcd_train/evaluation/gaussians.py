@@ -12,7 +12,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gcd_train.evaluation.hexplane import HexPlanes
-from gcd_train.evaluation.per_scene import Background, Camera, Drawing, PerScene, SceneBounds, Shown, linear
+from gcd_train.evaluation.per_scene import (
+    Background,
+    Camera,
+    Drawing,
+    PerScene,
+    SceneBounds,
+    Shown,
+    linear,
+    narrowed,
+)
 from gcd_train.evaluation.rasteriser import Gaussians, Picture, has_gsplat, rasterised, rotations
 
 _DEPTHS = 64  # tried along a ray for a first point
@@ -20,7 +29,18 @@ _ALIKE = 0.05  # difference of colours, in [0, 1], that is none
 _UNSEEN = 0.3  # difference of colours that a place counts as which no other view sees
 _FIRST_OPACITY = 0.1  # as in 3DGS
 _LARGEST = 0.3  # deviation of a Gaussian, as a share of how far it is from the middle of the scene
-_FALLING = {"means": 0.01, "planes": 0.1, "heads": 0.1}  # learning rates at the end, as shares of the first
+_RATES = {  # of the first update; of means in halves of the cube
+    "means": 1e-3,
+    "quaternions": 0.0015,
+    "scales": 0.006,
+    "opacities": 0.015,
+    "colours": 0.006,
+    "planes": 0.05,
+    "heads": 0.01,
+    "background": 0.01,
+}
+_FALLING = {"means": 0.01}  # rate at the end, as a share of the first; of all others a tenth, as HexPlane's
+_MOVING, _RISING = ("planes", "heads"), 0.1  # whose rates rise after the warm-up, and in what share of the updates
 _SHRUNK = 0.47  # logarithm of 1.6, by which halves are smaller, as in 3DGS
 
 
@@ -73,6 +93,7 @@ class MovedGaussians(nn.Module):
 
     rest: means [N, 3], metres, quaternions [N, 4], logarithms of the scales [N, 3], logits of opacities [N, 1] and of
     colours [N, 3], which do not depend on the direction they are seen from. Before training nothing moves.
+    least: the smallest deviation, as a share of half the cube.
     Source: Wu et al. 2024 (4D-GS), section 4. Opacities change, too, so that what moves far between two frames can
     fade here and appear there; that is ours.
     """
@@ -87,10 +108,11 @@ class MovedGaussians(nn.Module):
         features: int,
         side: int,
         hidden: int,
+        least: float,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        self.bounds = bounds
+        self.bounds, self.least_m = bounds, least * bounds.half_m
         apart = torch.cdist(points, points).topk(4, largest=False).values[:, 1:].mean(dim=1)
         ones = points.new_ones(len(points), 1)
         rest = {
@@ -122,7 +144,7 @@ class MovedGaussians(nn.Module):
         return Gaussians(
             means=means,
             quaternions=quaternions,
-            scales=scales.exp(),
+            scales=((2.0 * scales).exp() + self.least_m**2).sqrt(),
             opacities=opacities[:, 0].sigmoid(),
             colours=rest["colours"].sigmoid(),
         )
@@ -138,22 +160,27 @@ class MovedGaussians(nn.Module):
 class GaussianSplatting(PerScene):
     """4D-GS with so many input views; see PerScene.
 
-    updates: steps of the optimiser, a picture each. still: share of them before anything moves (warm-up).
+    updates: steps of the optimiser, a picture each. still: share of them before anything moves (warm-up). small: share
+    of them with pictures of half the size.
     points, most: Gaussians at first and at the end. every: updates from one densification to the next, until `dense`,
-    a share of all. thinnest: opacity below which one is taken away.
-    features, side: channels and cells of the planes. hidden: width of the heads.
-    smoothness: weight of the planes' squared differences between neighbouring cells.
+    a share of all; what does not show is taken away to the end. thinnest: opacity below which it does not.
+    least: the smallest deviation, as a share of half the cube. features, side: channels and cells of the planes.
+    hidden: width of the heads. smoothness: weight of the planes' squared differences between neighbouring cells.
+    The defaults are the best of those tried on other scenes with four views, in HexPlane's time: so few views cannot
+    settle more Gaussians, or faster ones.
     Source: Wu et al. 2024 (4D-GS); as a baseline, Van Hoorick et al. 2024 (GCD), section 5.
     """
 
     stem = "4dgs"
     updates: int = 1500
     still: float = 0.25
-    points: int = 3000
-    most: int = 6000
+    small: float = 0.4
+    points: int = 500
+    most: int = 500
     every: int = 100
     dense: float = 0.6
     thinnest: float = 0.02
+    least: float = 0.01
     features: int = 8
     side: int = 24
     hidden: int = 32
@@ -167,60 +194,71 @@ class GaussianSplatting(PerScene):
     def learn(self, pictures: Sequence[Shown], bounds: SceneBounds, frames: int) -> Drawing:
         """See PerScene."""
         generator = torch.Generator().manual_seed(self.seed)
-        points, colours = first_points(pictures, bounds, self.points, generator)
-        planes = {"features": self.features, "side": self.side, "hidden": self.hidden}
-        scene = MovedGaussians(points, colours, bounds, frames=frames, generator=generator, **planes).to(self.place)
-        optimiser = self._optimiser(scene)
-        pulled, times = (torch.zeros(len(points), device=self.place) for _ in range(2))
+        scene = self.scene(*first_points(pictures, bounds, self.points, generator), bounds, frames, generator)
+        optimiser, order = self.optimiser(scene), list[int]()
+        smaller = [narrowed(picture, camera, max(1, camera.lens.width // 2)) for picture, camera in pictures]
+        pulled, times = (torch.zeros(self.points, device=self.place) for _ in range(2))
         for number in range(self.updates):
             done = number / self.updates
+            risen = min(max((done - self.still) / _RISING, 0.0), 1.0)
             for group in optimiser.param_groups:
-                group["lr"] = group["first"] * _FALLING.get(group["name"], 1.0) ** done
-            picture, camera = pictures[int(torch.randint(len(pictures), (), generator=generator))]
+                fallen = group["first"] * _FALLING.get(group["name"], 0.1) ** done
+                group["lr"] = fallen * (risen if group["name"] in _MOVING else 1.0)
+            order = order or torch.randperm(len(pictures), generator=generator).tolist()
+            picture, camera = (smaller if done < self.small else pictures)[order.pop()]
             made, drawn = scene.seen(camera, None if done < self.still else camera.time)
             drawn.centres.retain_grad()
             loss = F.l1_loss(made, picture.to(self.place))
-            if done >= self.still:  # before, the planes are to stay as they are
-                loss = loss + self.smoothness * scene.planes.roughness()
+            if risen:  # before, the planes are to stay as they are
+                loss = loss + risen * self.smoothness * scene.planes.roughness()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
             if drawn.centres.grad is not None:  # some are in the picture
                 pull = drawn.centres.grad.view(-1, 2).norm(dim=1)
                 pulled, times = pulled + pull, times + (pull > 0)
-            if (number + 1) % self.every == 0 and done < self.dense:
-                self._renew(scene, optimiser, pulled / times.clamp(min=1.0), generator)
+            if (number + 1) % self.every == 0:
+                most = self.most if done < self.dense else 0
+                self.renew(scene, optimiser, pulled / times.clamp(min=1.0), most, generator)
                 pulled, times = (torch.zeros(len(scene.rest["means"]), device=self.place) for _ in range(2))
         return partial(self._draw, scene.eval())
 
     def _draw(self, scene: MovedGaussians, camera: Camera) -> Tensor:
         return scene.seen(camera, camera.time)[0].clamp(0.0, 1.0)
 
-    def _optimiser(self, scene: MovedGaussians) -> torch.optim.Adam:
-        """Rates as in 3DGS, times ten as there are a tenth or less of its updates."""
-        first = {"quaternions": 0.005, "scales": 0.02, "opacities": 0.05, "colours": 0.02}
-        first["means"] = 1e-3 * scene.bounds.half_m
-        groups = [{"name": name, "params": [value], "first": first[name]} for name, value in scene.rest.items()]
-        groups.append({"name": "planes", "params": list(scene.planes.parameters()), "first": 0.2})
-        others = [scene.trunk, scene.heads, scene.background]
-        weights = [weight for module in others for weight in module.parameters()]
-        groups.append({"name": "heads", "params": weights, "first": 0.03})
-        return torch.optim.Adam(groups, lr=0.0, eps=1e-15, betas=(0.9, 0.99))
+    def scene(
+        self, points: Tensor, colours: Tensor, bounds: SceneBounds, frames: int, generator: torch.Generator
+    ) -> MovedGaussians:
+        """Before training. points: [N, 3], metres; colours: [N, 3] in [0, 1]; frames: T of the clip."""
+        sizes = {"features": self.features, "side": self.side, "hidden": self.hidden, "least": self.least}
+        return MovedGaussians(points, colours, bounds, frames=frames, generator=generator, **sizes).to(self.place)
+
+    def optimiser(self, scene: MovedGaussians) -> torch.optim.Adam:
+        """A group for each kind of a Gaussian's values, and for planes, heads and background."""
+        groups = {name: [value] for name, value in scene.rest.items()}
+        groups["planes"] = list(scene.planes.parameters())
+        groups["heads"] = [*scene.trunk.parameters(), *scene.heads.parameters()]
+        groups["background"] = list(scene.background.parameters())
+        rates = {**_RATES, "means": _RATES["means"] * scene.bounds.half_m}
+        named = [{"name": name, "params": values, "first": rates[name]} for name, values in groups.items()]
+        return torch.optim.Adam(named, lr=0.0, eps=1e-15, betas=(0.9, 0.99))
 
     @torch.no_grad()
-    def _renew(
-        self, scene: MovedGaussians, optimiser: torch.optim.Adam, pull: Tensor, generator: torch.Generator
+    def renew(
+        self, scene: MovedGaussians, optimiser: torch.optim.Adam, pull: Tensor, most: int, generator: torch.Generator
     ) -> None:
-        """Take away what is too thin or too large; double what pictures pull at most, of large ones as two halves.
+        """Take away what shows at no time or is too large; double what pictures pull at most, of large ones as halves.
 
-        pull: [N], mean length of the gradient of a Gaussian's place in the pictures.
+        pull: [N], mean length of the gradient of a Gaussian's place in the pictures. most: Gaussians, then.
         Source: Kerbl et al. 2023 (3DGS), section 5.2. That an eighth is doubled, in place of a threshold, is ours.
         """
         rest, scales = scene.rest, scene.rest["scales"].exp()
         far = (rest["means"] - scene.bounds.centre.to(self.place)).norm(dim=1).clamp(min=scene.bounds.half_m)
-        stay = (rest["opacities"][:, 0].sigmoid() > self.thinnest) & (scales.amax(dim=1) < _LARGEST * far)
+        moments = torch.linspace(-1.0, 1.0, scene.planes.time.shape[2]).tolist()
+        shown = torch.stack([scene(time).opacities for time in moments]).amax(dim=0)
+        stay = (shown > self.thinnest) & (scales.amax(dim=1) < _LARGEST * far)
         kept = stay.nonzero()[:, 0]
-        doubled = kept[pull[kept].topk(min(len(kept) // 8, max(self.most - len(kept), 0))).indices]
+        doubled = kept[pull[kept].topk(min(len(kept) // 8, max(most - len(kept), 0))).indices]
         large = torch.zeros_like(stay).index_fill(0, doubled, True) & (scales.amax(dim=1) > scales.amax(dim=1).median())
         aside = (
             torch.randn(len(stay), 3, 1, generator=generator).to(self.place) * scales[..., None] * large[:, None, None]
@@ -235,7 +273,7 @@ class GaussianSplatting(PerScene):
                 value = old[rows] + (side * aside[rows] if group["name"] == "means" else 0.0)
                 group["params"] = [nn.Parameter(value)]
                 rest[group["name"]] = group["params"][0]
-                moments = optimiser.state.pop(old)
-                for name in ("exp_avg", "exp_avg_sq"):
+                moments = optimiser.state.pop(old, {})
+                for name in moments.keys() & {"exp_avg", "exp_avg_sq"}:
                     moments[name] = moments[name][rows] * (side > 0)  # a twin begins anew
                 optimiser.state[group["params"][0]] = moments

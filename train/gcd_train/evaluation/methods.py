@@ -300,8 +300,12 @@ def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> 
         "weights": weights_digest,
     }
     weights = partial(open_weights, _resolved(options.svd), options.device, options.dtype, None if family else "svd")
-    shared = isinstance(clips, EpisodeSet)  # its protocol draws one noise for all episodes
-    return VanillaSVD(weights=weights, samples=samples, seed=seed, shared_noise=shared, details=details)
+    return VanillaSVD(weights=weights, samples=samples, seed=seed, shared_noise=_one_noise(clips), details=details)
+
+
+def _one_noise(clips: EvaluationSet) -> bool:
+    """Whether all clips are to be made from the same noise: AnyViewBench's protocol."""
+    return isinstance(clips, EpisodeSet)
 
 
 def _zeronvs(clips: EvaluationSet, options: EvaluateOptions, views: int) -> ZeroNVS:
@@ -330,7 +334,14 @@ def _zeronvs(clips: EvaluationSet, options: EvaluateOptions, views: int) -> Zero
         "seed": str(options.seed),
         "weights": digest((Path(options.zeronvs),))[:12],
     }
-    return ZeroNVS(networks=networks, scale=scale, samples=options.samples or 1, seed=options.seed, details=details)
+    return ZeroNVS(
+        networks=networks,
+        scale=scale,
+        samples=options.samples or 1,
+        seed=options.seed,
+        shared_noise=_one_noise(clips),
+        details=details,
+    )
 
 
 METHODS: dict[str, MethodKind] = {

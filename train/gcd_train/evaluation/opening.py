@@ -100,9 +100,10 @@ class ClipOptions:
     exact: Annotated[
         bool, Option("--exact", help="Our scenes: targets from their geometry instead of from points.")
     ] = False
-    camera: Annotated[list[str] | None, Option(help="Scenes: a camera to read; may be repeated. By default all.")] = (
-        None
-    )
+    camera: Annotated[
+        list[str] | None,
+        Option(help="Scenes: a camera to read; may be repeated. By default all. Episodes: the input, then the target."),
+    ] = None
     seed: Annotated[int, Option(min=0, help="Of drawn clips and of all noise.")] = 0
 
 
@@ -178,9 +179,17 @@ def open_clips(
 
 def _open_episodes(options: ClipOptions, model: Traits | None) -> tuple[EvaluationSet, tuple[str, ...]]:
     """Episodes of AnyViewBench, or of our scenes in its layout."""
-    others = [getattr(options, name) for name in (*_OF_SCENES, "listed")]
-    if any(each is not None and each is not False for each in others) or len(options.data) > 1:
-        raise RecipeError("AnyViewBench is one --data with --split, --limit and --frames; leave out all other choices")
+    others = [getattr(options, name) for name in (*_OF_SCENES, "listed") if name != "camera"]
+    pair = tuple(options.camera or ())
+    if (
+        any(each is not None and each is not False for each in others)
+        or len(options.data) > 1
+        or len(pair) not in (0, 2)
+    ):
+        raise RecipeError(
+            "AnyViewBench is one --data with --split, --limit, --frames and, for other cameras than its own, --camera "
+            "INPUT --camera TARGET; leave out all other choices"
+        )
     frames, root = options.frames, options.data[0].resolve()  # processes may stand elsewhere
     if model is not None and not model.live:
         raise DataError(
@@ -190,9 +199,11 @@ def _open_episodes(options: ClipOptions, model: Traits | None) -> tuple[Evaluati
     if model is not None and frames not in (None, model.config.frames):
         raise RecipeError(f"{model.name} makes clips of {model.config.frames} frames, not {frames}; leave out --frames")
     frames = frames if model is None else model.config.frames
-    clips, notes = EpisodeSet.open(root, frames=frames, split=options.split, limit=options.limit)
+    wanted = (pair[0], pair[1]) if pair else None
+    clips, notes = EpisodeSet.open(root, frames=frames, split=options.split, limit=options.limit, pair=wanted)
     folders = [each.folder.relative_to(root).as_posix() for each, _ in clips.episodes.values()]
-    return replace(clips, identity=_identity(root, folders, [options.protocol, frames], None)), notes
+    cuts = [options.protocol, frames, clips.groups, clips.pair]
+    return replace(clips, identity=_identity(root, folders, cuts, None)), notes
 
 
 def _open_pairs(options: ClipOptions) -> tuple[EvaluationSet, tuple[str, ...]]:

@@ -19,6 +19,7 @@ _BEGIN = 0.3
 # Where rays end, in halves of the cube beyond the middle as the farthest camera sees it: what lies farther off is seen
 # by one camera only, and each would paint its whole picture there.
 _END = 0.5
+_NEAR_M = 0.4  # to the middle, for cameras that turn in place: their axes meet in themselves
 _PULL, _GUESS_M = 1e-3, 10.0  # for cameras with parallel axes: weight of a guess, and how far ahead it lies
 
 
@@ -50,8 +51,8 @@ class SceneBounds:
         guess = (position + _GUESS_M * ahead).mean(dim=0)
         left = across.sum(dim=0) + _PULL * torch.eye(3, dtype=torch.float64)
         centre = torch.linalg.solve(left, torch.einsum("mij,mj->i", across, position) + _PULL * guess)
-        distances = (position - centre).norm(dim=-1)
-        half_m = max(float(distances.max()) * _INNER, 1e-3)
+        distances = (position - centre).norm(dim=-1).clamp(min=_NEAR_M)
+        half_m = float(distances.max()) * _INNER
         nearest, farthest = (float(distance) / half_m for distance in (distances.min(), distances.max()))
         return cls(centre=centre.float(), half_m=half_m, begin=nearest * _BEGIN, reach=farthest + _END)
 
@@ -142,6 +143,12 @@ Drawing: TypeAlias = Callable[[Camera], Tensor]
 """Gives the picture of a camera, float32 [3, H, W] in [0, 1]."""
 
 
+def narrowed(picture: Tensor, camera: Camera, width: int) -> Shown:
+    """The picture at most this wide."""
+    narrow = camera.narrowed(width)
+    return F.interpolate(picture[None], size=(narrow.lens.height, narrow.lens.width), mode="area")[0], narrow
+
+
 @dataclass(frozen=True, kw_only=True)
 class PerScene(ABC):
     """A method that learns the scene of each clip from K views: the source, and further cameras from two on.
@@ -201,7 +208,7 @@ class PerScene(ABC):
                 pictures.append((to_pictures(view.rgb[None])[0], camera))
         wanted = own.ground_from_source @ own.source_from_target  # [T, 4, 4]
         bounds = SceneBounds.around(torch.stack([*(camera.world_from_camera for _, camera in pictures), *wanted]))
-        drawing = self.learn([self._narrowed(*each) for each in pictures], bounds, frames)
+        drawing = self.learn([narrowed(*each, self.picture_width) for each in pictures], bounds, frames)
         cameras = [
             Camera(lens=own.target, world_from_camera=pose, time=time).narrowed(self.picture_width)
             for pose, time in zip(wanted, times, strict=True)
@@ -211,8 +218,3 @@ class PerScene(ABC):
         if video.shape[2:] != size:
             video = F.interpolate(video, size=size, mode="bicubic", align_corners=False).clamp(0.0, 1.0)
         return Prediction(video=video)
-
-    def _narrowed(self, picture: Tensor, camera: Camera) -> Shown:
-        narrow = camera.narrowed(self.picture_width)
-        size = narrow.lens.height, narrow.lens.width
-        return F.interpolate(picture[None], size=size, mode="area")[0], narrow

@@ -4,14 +4,16 @@ After Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Ren
 Volume Splatting".
 """
 
-import importlib.util
+import importlib
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gcd_model.geometry import Intrinsics
 from gcd_train.evaluation.per_scene import Camera
 
 NEAREST_M = 0.2
@@ -54,15 +56,27 @@ class Picture:
     centres: Tensor
 
 
+@lru_cache
 def has_gsplat(device: torch.device) -> bool:
-    """Whether pictures on this device are drawn by gsplat (extra `gsplat`)."""
-    return device.type == "cuda" and importlib.util.find_spec("gsplat") is not None
+    """Whether pictures on this device are drawn by gsplat (extra `gsplat`): where it is CUDA, and one can be drawn."""
+    if device.type != "cuda":
+        return False
+    lens = Intrinsics.from_hfov(60.0, _TILE, _TILE)
+    try:
+        one = torch.ones(1, 4, device=device)
+        ball = Gaussians(means=one[:, :3], quaternions=one, scales=one[:, :3], opacities=one[:, 0], colours=one[:, :3])
+        _by_gsplat(ball, Camera(lens=lens, world_from_camera=torch.eye(4), time=0.0))
+    except Exception:  # parts that are compiled are missing in many ways
+        return False
+    return True
 
 
 def rasterised(gaussians: Gaussians, camera: Camera) -> Picture:
-    """By gsplat where the Gaussians are on a CUDA device and it is there, else by `rasterised_plainly`."""
-    if not has_gsplat(gaussians.means.device):
-        return rasterised_plainly(gaussians, camera)
+    """By gsplat where the Gaussians are on a CUDA device and it works, else by `rasterised_plainly`."""
+    return (_by_gsplat if has_gsplat(gaussians.means.device) else rasterised_plainly)(gaussians, camera)
+
+
+def _by_gsplat(gaussians: Gaussians, camera: Camera) -> Picture:
     gsplat = importlib.import_module("gsplat")
     colours, covered, more = gsplat.rasterization(
         gaussians.means,
@@ -86,17 +100,16 @@ def rasterised_plainly(gaussians: Gaussians, camera: Camera) -> Picture:
 
     Source: Kerbl et al. 2023 (3DGS), section 6 and appendix C.
     """
-    centres, covariances, depths = projected(gaussians, camera)
+    centres, variances, inverse, depths = projected(gaussians, camera)
     across, down = -(-camera.lens.width // _TILE), -(-camera.lens.height // _TILE)
     with torch.no_grad():
         reach = 2.0 * (gaussians.opacities / FAINTEST).log().clamp(min=0.0)[:, None]
-        half = (reach * covariances.diagonal(dim1=1, dim2=2)).sqrt()  # of the box in which it counts
+        half = (reach * variances).sqrt()  # of the box in which it counts
         near_first = ((depths > NEAREST_M) & (gaussians.opacities > FAINTEST)).nonzero()[:, 0]
         near_first = near_first[depths[near_first].argsort(stable=True)]
         tiles, members = _by_tile(centres[near_first], half[near_first], across, down)
         members, counts = near_first[members], torch.bincount(tiles, minlength=across * down)
         starts = counts.cumsum(0) - counts
-    inverse = torch.linalg.inv(covariances).flatten(1)[:, [0, 1, 3]]
     table = torch.cat(
         [centres, inverse, gaussians.opacities.clamp(min=FAINTEST).log()[:, None], gaussians.colours], dim=1
     )  # [N, 9]
@@ -116,13 +129,15 @@ def rasterised_plainly(gaussians: Gaussians, camera: Camera) -> Picture:
     return Picture(colours=whole[..., :3], passed=whole[..., 3], centres=centres)
 
 
-def projected(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """In the picture: means [N, 2] and covariances [N, 2, 2], in pixels, and depths [N] along the optical axis.
+def projected(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """In the picture: means [N, 2], variances [N, 2] and the covariances' inverse [N, 3], xx, xy and yy, in pixels; and
+    depths [N] along the optical axis.
 
-        Sigma' = J W Sigma W^T J^T + 0.3 I,   Sigma = R S S^T R^T
+        Sigma' = J W Sigma W^T J^T + k I,   Sigma = R S S^T R^T,   k = 0.3
+        det Sigma' = |a x b|^2 + k (|a|^2 + |b|^2) + k^2,   a and b the rows of J W R S
 
-    W turns the world's axes to the camera's; J is the derivative of the projection at the mean. What lies less than
-    `NEAREST_M` ahead has no meaning but its depth.
+    The determinant is so exact for needles, too. W turns the world's axes to the camera's; J is the derivative of the
+    projection at the mean. What lies less than `NEAREST_M` ahead has no meaning but its depth.
     Source: Zwicker et al. 2001, section 6.2.2; Kerbl et al. 2023 (3DGS), equations 5 and 6.
     """
     pose, lens = camera.world_from_camera.to(gaussians.means), camera.lens
@@ -137,8 +152,12 @@ def projected(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Ten
     rows += [torch.stack([none, lens.fy / z, -lens.fy * at_y / z], 1)]
     turned = torch.stack(rows, dim=1) @ pose[:3, :3].T @ rotations(gaussians.quaternions)  # J W R
     half = turned * gaussians.scales[:, None]
-    covariances = half @ half.mT + LOW_PASS * torch.eye(2).to(half)
-    return torch.stack([lens.fx * right + lens.cx, lens.fy * below + lens.cy], dim=1), covariances, depths
+    own, (a, b) = half.square().sum(dim=2), half.unbind(dim=1)
+    determinant = torch.linalg.cross(a, b).square().sum(dim=1) + LOW_PASS * own.sum(dim=1) + LOW_PASS**2
+    variances = own + LOW_PASS
+    inverse = torch.stack([variances[:, 1], -(a * b).sum(dim=1), variances[:, 0]], dim=1) / determinant[:, None]
+    centres = torch.stack([lens.fx * right + lens.cx, lens.fy * below + lens.cy], dim=1)
+    return centres, variances, inverse, depths
 
 
 def rotations(quaternions: Tensor) -> Tensor:
@@ -177,7 +196,8 @@ def _exponents(centres: Tensor, inverse: Tensor) -> Tensor:
     (u, v), (xx, xy, yy) = centres.unbind(dim=-1), inverse.unbind(dim=-1)
     to_x, to_y = xx * u + xy * v, xy * u + yy * v
     factors = [-(to_x * u + to_y * v) / 2, to_x, to_y, -xx / 2, -xy, -yy / 2]
-    return torch.stack(factors, dim=-1) @ torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+    exponents = torch.stack(factors, dim=-1) @ torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+    return exponents.clamp_(max=0.0)  # far from a needle's middle what is rounded is large
 
 
 class _Mixed(torch.autograd.Function):

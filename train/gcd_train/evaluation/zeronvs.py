@@ -127,7 +127,7 @@ class ZeroNVS:
 
     networks: give the weights. scale: of the camera's translation, metres, see `camera_numbers` and `best_scale`.
     steps: of the sampler. size: a side of the network's pictures. samples: draws of each clip. seed: all noise comes
-    from it, the clip's key and the frame's number. details: see Predictor.
+    from it, the frame's number and, but for `shared_noise`, the clip's key. details: see Predictor.
     Source: Van Hoorick et al. 2024 (GCD), section 5, "ZeroNVS".
     """
 
@@ -137,6 +137,7 @@ class ZeroNVS:
     size: int = 256
     samples: int = 1
     seed: int = 0
+    shared_noise: bool = False
     privileged: bool = False
     details: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -153,10 +154,10 @@ class ZeroNVS:
         square = lens if crop is None else lens.cropped(*crop)
         cameras = camera_numbers(clip.cameras.source_from_target, square.vfov_deg, self.scale)
         pictures = fitted(to_network(clip.source), self.size, self.size)
-        draws: list[Prediction] = []
+        draws, key = list[Prediction](), "" if self.shared_noise else clip.key
         for number in range(self.samples):
             frames = [
-                networks.view(picture, camera, seed=self._seed(f"{clip.key}#{number}.{t}"), steps=self.steps)
+                networks.view(picture, camera, seed=self._seed(f"{key}#{number}.{t}"), steps=self.steps)
                 for t, (picture, camera) in enumerate(zip(pictures, cameras, strict=True))
             ]
             draws.append(Prediction(video=resized(torch.stack(frames), square.height, square.width), crop=crop))
