@@ -112,7 +112,8 @@ class _Look:
     def weights(self) -> str:
         section = self._config.model
         is_random = section.weights.startswith("random:")
-        if is_random or section.adapter is not None or is_export(weights_path(section.weights)):
+        is_elsewhere = is_random or section.engine == "remote"
+        if is_elsewhere or section.adapter is not None or is_export(weights_path(section.weights)):
             # Only loading says whether weights and adapter belong together, or onnxruntime takes an export here.
             traits = load_model(section).traits
         else:
