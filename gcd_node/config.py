@@ -88,7 +88,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     depth_model: str | None = None
     depth_kind: Literal["metric", "inverse"] = "metric"
     on_bad_depth: Literal["learned", "stop"] = "learned"
-    deadline_s: Annotated[float, Meta(ge=0.05, le=600)] = 2.0
+    deadline_s: Annotated[float, Meta(ge=0.05, le=30)] = 2.0
     fallback: str = "drop"
     token: str | None = None
 

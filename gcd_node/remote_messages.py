@@ -23,7 +23,7 @@ _WINDOW, _VIEWS = (name.ljust(32, b"\0") for name in (b"remote/window", b"remote
 Digest: TypeAlias = Annotated[str, Meta(pattern=r"^[0-9a-f]{12}$(?!\n)")]
 Stream: TypeAlias = Annotated[str, Meta(pattern=r"^[0-9a-f]{32}$(?!\n)")]
 _Size: TypeAlias = Annotated[int, Meta(ge=1, le=1 << 14)]
-_Seed: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 63)]
+_Seed: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
 _Header = TypeVar("_Header", bound=msgspec.Struct)
 
 
@@ -67,7 +67,7 @@ class WindowHeader(msgspec.Struct, frozen=True, kw_only=True):
     stream: Stream
     window: Annotated[int, Meta(ge=0, lt=1 << 53)]
     weights: Digest
-    deadline_ms: Annotated[int, Meta(ge=1, le=600_000)]
+    deadline_ms: Annotated[int, Meta(ge=1, le=30_000)]
     shape: tuple[_Size, _Size, _Size]
     on_sphere: Annotated[tuple[bool, ...], Meta(min_length=1, max_length=64)]
     fps: float

@@ -121,6 +121,7 @@ def serve(
     console = Console(stderr=True, markup=False)
     console.print(Text(f"deploying {settings.model.weights}"))
     with deployed(settings) as ends_with_us, contextlib.suppress(KeyboardInterrupt):
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         console.print(f"serving on {settings.serve.http}", soft_wrap=True)
         if ends_with_us:
             signal.pause()
