@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -136,6 +136,12 @@ def is_its_own(stream: Stream, message: ViewMessage, model: ViewSynthesizer) -> 
     return int(np.abs(here - images(message)).max()) <= 2
 
 
+def free_ports(count: int) -> list[int]:
+    with ExitStack() as stack:
+        found = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [each.getsockname()[1] for each in found]
+
+
 @contextmanager
 def two_machines(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """A Ray cluster whose second machine may be killed."""
@@ -145,13 +151,19 @@ def two_machines(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join(["", *(str(Path(each).resolve()) for each in (".", "model", "client"))])
     )
-    machine: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 100 << 20}
-    with socket.create_server(("127.0.0.1", 0)):
-        cluster = Cluster(
-            initialize_head=True, head_node_args={**machine, "include_dashboard": False, "temp_dir": str(folder)}
-        )
+    monkeypatch.setenv("RAY_agent_register_timeout_ms", "120000")
+
+    def machine(**more: Any) -> dict[str, Any]:
+        """Ports are given: a raylet waits 15 s at most for those that its agents find, too short on a busy machine."""
+        ports = [
+            f"{name}_port"
+            for name in ("metrics_agent", "runtime_env_agent", "metrics_export", "dashboard_agent_listen")
+        ]
+        return {"num_cpus": 1, "object_store_memory": 100 << 20, **dict(zip(ports, free_ports(4), strict=True)), **more}
+
+    cluster = Cluster(initialize_head=True, head_node_args=machine(include_dashboard=False, temp_dir=str(folder)))
     try:
-        cluster.add_node(**machine)
+        cluster.add_node(**machine())
         monkeypatch.setenv("RAY_ADDRESS", cluster.address)
         yield cluster
     finally:
@@ -172,8 +184,7 @@ def test_no_stream_of_a_fleet_stops_or_gets_anothers_views_whatever_fails(
     weights = tmp_path / "tiny.safetensors"
     card = Card(name="tiny", config=SMALLEST, family=FAMILIES["driving-semantic"], move_time=13, trained=False)
     save_weights(random_networks(SMALLEST, seed=0), weights, card)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    (port,) = free_ports(1)
     service = {
         "model": {"weights": str(weights), "device": "cpu", "threads": 1},
         "serve": {"http": f"127.0.0.1:{port}"},
