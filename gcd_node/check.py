@@ -130,7 +130,8 @@ class _Look:
             path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
         )
         try:
-            device, precision = placement(section.device, section.engine, section.dtype, live=report.live)
+            engine = None if section.engine == "remote" else section.engine  # which is not looked at here
+            device, precision = placement(section.device, engine, section.dtype, live=report.live)
         except OptionError as error:
             raise ConfigError(f"[model]: {error}") from error
         needed, free = report.parameters * (4 if precision == "float32" else 2), self._free_memory

@@ -37,7 +37,7 @@ class WindowConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     max_skew: Annotated[float, Meta(gt=0, le=0.5)] = 0.5
 
 
-EngineName = Literal["torch", "cuda", "onnxruntime", "remote"]
+EngineName = Literal["torch", "cuda", "onnxruntime"]
 Quality = Literal["exact", "fast", "fastest"]
 SolverName = Literal["euler", "dpmpp_2m", "heun"]
 """The model's own words once more: readers of launch files need no model, which takes seconds to import."""
@@ -69,7 +69,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     adapter: str | None = None
     family: str | None = None
     device: str = "auto"
-    engine: EngineName | None = None
+    engine: EngineName | Literal["remote"] | None = None
     providers: tuple[str, ...] = ()
     dtype: str | None = None
     threads: Count | None = None

@@ -50,7 +50,7 @@ _APP = "gcd"
 _AT_ONCE = 16  # requests that a replica takes, one in work and the others waiting; more go to the next replica
 _LONGEST_REQUEST_S = 30.0
 _MOST_VIEWS = 64
-_ROUTER = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
+_ROUTER: Any = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
 
 
 class ServeSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -14,6 +14,7 @@ import torch
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from gcd_client.images import payload_of
 from gcd_client.protocol import MAX_PAYLOAD, MessageError, Part, pack, unpack
 from gcd_model import SourceFeatures, Traits, Trajectory, View
 from gcd_node.config import Quality, SolverName
@@ -103,10 +104,9 @@ def window_message(header: WindowHeader, features: RemoteFeatures, paths: Sequen
     """A window as it is sent."""
     assert features.video is not None, "encode keeps the pictures"
     pictures = ((features.video + 1) * 127.5).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
-    poses = [path.source_from_target.numpy() for path in paths]
-    angles = [path.delta.numpy() for path in paths if path.delta is not None]
-    rows = [memoryview(np.ascontiguousarray(each)).cast("B") for each in (pictures.numpy(), *poses, *angles)]
-    return pack(_WINDOW, 0, header.window, msgspec.json.encode(header), *rows)
+    poses = [path.source_from_target.numpy().tobytes() for path in paths]
+    angles = [path.delta.numpy().tobytes() for path in paths if path.delta is not None]
+    return pack(_WINDOW, 0, header.window, msgspec.json.encode(header), payload_of(pictures.numpy()), *poses, *angles)
 
 
 def read_window(content: Part, traits: Traits) -> tuple[WindowHeader, NDArray[np.uint8], list[Trajectory]]:
@@ -143,8 +143,7 @@ def views_message(header: WindowHeader, views: Sequence[View]) -> bytes:
     """The views of a window as they are sent back, in whole levels."""
     found = ViewsHeader(stream=header.stream, window=header.window, weights=header.weights)
     rows = [view.samples.numpy() for view in views] + [v.classes.numpy() for v in views if v.classes is not None]
-    parts = [memoryview(np.ascontiguousarray(each)).cast("B") for each in rows]
-    return pack(_VIEWS, 0, header.window, msgspec.json.encode(found), *parts)
+    return pack(_VIEWS, 0, header.window, msgspec.json.encode(found), *map(payload_of, rows))
 
 
 def read_views(content: Part, asked: WindowHeader, paths: Sequence[Trajectory], traits: Traits) -> list[View]:

@@ -5,6 +5,7 @@
 
 import itertools
 import os
+import shutil
 import socket
 import threading
 import time
@@ -168,6 +169,7 @@ def two_machines(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]
         yield cluster
     finally:
         cluster.shutdown()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def replicas(machine: Any) -> list[psutil.Process]:
@@ -178,7 +180,7 @@ def replicas(machine: Any) -> list[psutil.Process]:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_no_stream_of_a_fleet_stops_or_gets_anothers_views_whatever_fails(
-    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("ray.serve")
     weights = tmp_path / "tiny.safetensors"

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from cameras import Bench, Camera, until
-from fakes import FakeSynthesizer, painting_traits, traits
+from fakes import FakeSource, FakeSynthesizer, fake_config, live_traits, painting_traits, run, traits
 from msgspec.structs import replace as struct_replace
 from mutations import BYTE_PIECES, TEXT_PIECES, Mutator
 from remote_service import Act, ServiceStandIn, WholeLevels, respond
@@ -252,14 +252,16 @@ def filmed(folder: Path, load: Callable[[ModelSection], ViewSynthesizer], more: 
         rig.await_state("active")
         filming = threading.Thread(target=film, daemon=True)
         filming.start()
-        yield rig
-        done.set()
-        filming.join()
+        try:
+            yield rig
+        finally:
+            done.set()
+            filming.join()
 
 
 @pytest.mark.parametrize("falls_back", [False, True], ids=["drop", "live"])
 def test_a_node_says_when_its_service_is_late_and_back_and_labels_who_drew(tmp_path: Path, falls_back: bool) -> None:
-    fallback = load_synthesizer("random:live", device="cpu", frames=14) if falls_back else None
+    fallback = FakeSynthesizer(replace(live_traits(), name="stand-in")) if falls_back else None
     with (
         ServiceStandIn(WholeLevels(traits())) as service,
         filmed(tmp_path, lambda _: remote(service, fallback=fallback)) as rig,
@@ -276,12 +278,24 @@ def test_a_node_says_when_its_service_is_late_and_back_and_labels_who_drew(tmp_p
         rig.await_views(len(rig.of()) + 1)
         rig.await_status(lambda status: "REMOTE_LATE" not in status["reasons"])
     names = [view.header.model.name for view in rig.of()]
-    assert set(names) == ({"fake", "random-live"} if falls_back else {"fake"})
+    assert set(names) == ({"fake", "stand-in"} if falls_back else {"fake"})
     assert {names[0], names[-1]} == {"fake"}
     ids = [view.header.window_id for view in rig.of()]
     assert ids == sorted(set(ids))
     digests = {view.header.model.name: view.header.cfg_digest for view in rig.of()}
     assert len(set(digests.values())) == len(digests)
+
+
+def test_the_live_model_draws_what_a_dead_service_does_not_with_its_own_maps_and_name() -> None:
+    with ServiceStandIn(WholeLevels(traits())) as service:
+        far = remote(service, fallback=load_synthesizer("random:live", device="cpu", frames=14))
+    box = run(fake_config(), far, FakeSource(28))
+    assert Counter(message.topic for message in box.views) == Counter(
+        {f"view/main/{kind}": 2 for kind in ("win", "cls", "vis", "depth", "std")} | {"view/main/frm": 28}
+    )
+    names = {message.header.model.name for message in box.views}
+    assert names == {"random-live"}
+    assert {each.topic for each in box.ends} == {message.topic for message in box.views}
 
 
 def test_a_node_that_starts_before_its_service_waits_for_it(tmp_path: Path) -> None:
