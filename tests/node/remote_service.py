@@ -1,6 +1,7 @@
 """A service in this process, in place of one on a cluster: a replica behind a plain HTTP server, faults to order."""
 
 import asyncio
+import ssl
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -32,7 +33,7 @@ class ServiceStandIn:
     """Use it as a context manager. act: answers a window in the replica's place: with the open request, and what gives
     the replica's own reply; None lets the replica answer. asked: windows that came."""
 
-    def __init__(self, model: ViewSynthesizer, *, token: str | None = None) -> None:
+    def __init__(self, model: ViewSynthesizer, *, token: str | None = None, tls: ssl.SSLContext | None = None) -> None:
         config = {"model": {"weights": "fake"}, "serve": {"token": token}}
         self.replica = Replica(config, lambda _: model)
         self.act: Act | None = None
@@ -63,6 +64,9 @@ class ServiceStandIn:
 
         self._server = Server(("127.0.0.1", 0), Handler)
         self.address = f"http://127.0.0.1:{self._server.server_port}"
+        if tls is not None:
+            self._server.socket = tls.wrap_socket(self._server.socket, server_side=True)
+            self.address = f"https://localhost:{self._server.server_port}"
 
     def __enter__(self) -> "ServiceStandIn":
         for target in (self._loop.run_forever, lambda: self._server.serve_forever(0.02)):

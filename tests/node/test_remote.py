@@ -1,7 +1,10 @@
 """A model that computes elsewhere: the same views, by a deadline, or none; what a node does meanwhile."""
 
 import asyncio
+import shutil
 import socket
+import ssl
+import subprocess
 import threading
 import time
 from collections import Counter
@@ -199,6 +202,22 @@ def test_nobody_there_is_told_at_once_and_a_name_that_does_not_resolve_by_the_de
         with pytest.raises(RemoteError):
             rendered(far)
         assert time.monotonic() - started_s < DEADLINE_S + SLACK_S
+
+
+def test_over_https_a_service_must_be_who_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl: apt install openssl")
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    subject = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *subject]
+    subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    with ServiceStandIn(WholeLevels(traits()), tls=context) as service:
+        with pytest.raises(RemoteError, match="CERTIFICATE"):
+            remote(service)
+        monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+        assert rendered(remote(service))
 
 
 def test_a_cancelled_window_is_not_waited_for() -> None:
