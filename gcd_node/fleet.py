@@ -56,7 +56,7 @@ _ROUTER: Any = "ray.serve.experimental.consistent_hash_router.ConsistentHashRout
 class ServeSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where a service listens, and on how many replicas of the model it runs.
 
-    http: address on every machine of the cluster. token: file of the password, the same on every machine; without one
+    http: address on the head of the cluster. token: file of the password, the same on every machine; without one
         only a loopback address may be served.
     certificate, key: PEM files; with them it speaks https.
     replicas: left out, one for each GPU of the cluster, or without GPUs one for each machine.
@@ -288,7 +288,8 @@ def deployed(config: ServiceConfig) -> Generator[bool]:
             ssl_certfile=config.serve.certificate,
             ssl_keyfile=config.serve.key,
         )
-        serve.start(proxy_location="EveryNode", http_options=options)
+        # With a proxy on every machine, one that dies holds up the replicas that answer it until its death is noticed.
+        serve.start(proxy_location="HeadOnly", http_options=options)
         serve.run(app(msgspec.to_builtins(config)), name=_APP, route_prefix="/")
         yield is_own
     finally:
