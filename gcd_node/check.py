@@ -112,7 +112,8 @@ class _Look:
     def weights(self) -> str:
         section = self._config.model
         is_random = section.weights.startswith("random:")
-        if is_random or section.adapter is not None or is_export(weights_path(section.weights)):
+        is_elsewhere = is_random or section.engine == "remote"
+        if is_elsewhere or section.adapter is not None or is_export(weights_path(section.weights)):
             # Only loading says whether weights and adapter belong together, or onnxruntime takes an export here.
             traits = load_model(section).traits
         else:
@@ -129,7 +130,8 @@ class _Look:
             path, family=section.family, head_width=section.head_width, image_heads=section.image_heads
         )
         try:
-            device, precision = placement(section.device, section.engine, section.dtype, live=report.live)
+            engine = None if section.engine == "remote" else section.engine  # which is not looked at here
+            device, precision = placement(section.device, engine, section.dtype, live=report.live)
         except OptionError as error:
             raise ConfigError(f"[model]: {error}") from error
         needed, free = report.parameters * (4 if precision == "float32" else 2), self._free_memory

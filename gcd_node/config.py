@@ -46,8 +46,12 @@ SolverName = Literal["euler", "dpmpp_2m", "heun"]
 class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model and how it is sampled. What is left out is as the checkpoint was made for.
 
-    weights: a checkpoint, a diffusers folder, an export, `package:NAME`, or `random:FAMILY` (noise, for the plumbing).
-    engine: what computes: "torch", "cuda" (compiled, on a GPU) or "onnxruntime" (exports); left out, what fits weights.
+    weights: a checkpoint, a diffusers folder, an export, `package:NAME`, or `random:FAMILY` (noise, for the plumbing);
+        of engine "remote" the address of a service (`gcd-node serve`), http:// or https://.
+    engine: what computes: "torch", "cuda" (compiled, on a GPU), "onnxruntime" (exports) or "remote"; left out, what
+        fits weights.
+    deadline_s, fallback, token: of engine "remote": from a whole window to its views; what renders the windows that
+        are not back by then, a live model's weights or "drop"; file of the service's password.
     providers: of onnxruntime, by its own names, best first; left out, its CPU one, or on device "cuda" its CUDA one.
     adapter: file of a low-rank adapter trained on these weights; family and move_time are then the adapter's.
     threads: CPU threads for the model, and for OpenCV beside it; leave the rest of the robot its cores.
@@ -65,7 +69,7 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     adapter: str | None = None
     family: str | None = None
     device: str = "auto"
-    engine: EngineName | None = None
+    engine: EngineName | Literal["remote"] | None = None
     providers: tuple[str, ...] = ()
     dtype: str | None = None
     threads: Count | None = None
@@ -84,8 +88,13 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     depth_model: str | None = None
     depth_kind: Literal["metric", "inverse"] = "metric"
     on_bad_depth: Literal["learned", "stop"] = "learned"
+    deadline_s: Annotated[float, Meta(ge=0.05, le=30)] = 2.0
+    fallback: str = "drop"
+    token: str | None = None
 
     def __post_init__(self) -> None:
+        if (self.engine == "remote") != self.weights.startswith(("http://", "https://")):
+            raise ValueError('engine = "remote" goes with the address of a service as weights, http://HOST:PORT')
         low, high = self.guidance_interval or (0.0, 0.0)
         if low > high:
             raise ValueError(f"guidance_interval goes from a noise level up to another, got {low:g} to {high:g}")

@@ -1,7 +1,7 @@
 """What can go wrong in the node, and the exit code each becomes (sysexits).
 
     NodeError 70
-    ├── UsageError 64, StaleError 69, PublisherError 70, ModelFailedError 70
+    ├── UsageError 64, StaleError 69, RemoteError 69, PublisherError 70, ModelFailedError 70
     ├── EndpointError 73, OutputError 73, DamagedRunError 65, ConfigError 78
     └── SourceError 66
         └── TooShortError 65, DepthError 65, SourceAbsentError 69, ReaderError 70, SourceLostError 75
@@ -61,6 +61,12 @@ class SourceLostError(SourceError):
 
 class StaleError(NodeError):
     """No fresh status came in time."""
+
+    exit_code = 69
+
+
+class RemoteError(NodeError):
+    """A model that computes elsewhere gave no views, or none in time."""
 
     exit_code = 69
 

@@ -159,10 +159,10 @@ class Health:
             self._raised[code] = level
             return is_new
 
-    def clear_reason(self, code: str) -> None:
-        """It is over; nothing happens if it never was."""
+    def clear_reason(self, code: str) -> bool:
+        """It is over; whether it was raised."""
         with self._lock:
-            self._raised.pop(code, None)
+            return self._raised.pop(code, None) is not None
 
     def forget_reasons(self) -> None:
         """Clear what the last activation raised: all but a dead thread."""

@@ -24,7 +24,7 @@ from gcd_model import (
     View,
 )
 from gcd_node.encoded_frames import EncodedFrames, window_seed
-from gcd_node.errors import DepthError
+from gcd_node.errors import DepthError, RemoteError
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
 from gcd_node.model import Failure, FailureCounter, ModelSlot, Pulse, model_errors, oom_levels, render_grey, tried
 from gcd_node.status import Announcer, Condition
@@ -115,14 +115,17 @@ class Renderer:
         self._bad_depth, self._bad_odometry, self._lost_motion, self._other_world = (
             Condition(code, announcer, hold_s=hold_s) for code in _WORK_REASONS
         )
+        self._remote_late = Condition("REMOTE_LATE", announcer, hold_s=0.0, over="REMOTE_BACK")
         self._epoch = -1
         self._latest: tuple[StreamContext, StreamContext] | None = None
 
     def warm_up(self) -> None:
-        """Render a grey clip in one step. Raises NonFiniteError, DeviceMemoryError."""
+        """Render a grey clip in one step; of a model that computes elsewhere, with its fallback alone. Raises
+        NonFiniteError, DeviceMemoryError."""
         settings, mount = self._live.settings(), self._context_at(-1).mount
         paths = [view.planned() for view in self._views.sync(settings, mount)]
-        render_grey(self._model.synthesizer, paths, mount, self._options(settings, 0, steps=1))
+        if (local := self._model.local) is not None:
+            render_grey(local, paths, mount, self._options(settings, 0, steps=1))
 
     def encode_ahead(self, filling: PartialWindow) -> bool:
         """Encode one frame of the window that fills; False if there is nothing to do. Raises DeviceMemoryError."""
@@ -163,7 +166,7 @@ class Renderer:
                 self._health.count("model")
             else:
                 self._render_or_count(job, placed)
-        except DepthError:
+        except (DepthError, RemoteError):
             self._health.count("model")
 
     @property
@@ -295,14 +298,12 @@ class Renderer:
         if isinstance(placed, Failure):
             raise placed
         assert placed is not None, "only this thread makes the memory begin anew"
-        section, halved = job.context.config.model, "half the steps" in self._given_up
-        steps = max(1, sampler_in_use(section, job.context.traits).steps // (2 if halved else 1))
         with model_errors():
-            views = self._draw(job, seed, placed, steps if halved else section.steps)
+            context, steps, views = self._drawn(job, seed, placed)
         if self.cancel.is_set():  # a model that ignores cancel: nothing may follow the end
             raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
-        self._tell_source(job.context, views[0])
+        self._tell_source(context, views[0])
         for virtual, view in zip(job.views, views, strict=True):
             rendered = Rendered(
                 window=job.window,
@@ -315,11 +316,29 @@ class Renderer:
                 seed=seed,
                 utc_offset_ns=offset_ns,
             )
-            self._out.send(messages(job.context, rendered))
-            age_s = (time.monotonic_ns() - newest_ns(job.context, job.window)) / 1e9
+            self._out.send(messages(context, rendered))
+            age_s = (time.monotonic_ns() - newest_ns(context, job.window)) / 1e9
             self._health.published(virtual.view_id, age_s)
         self._health.stage("publish", (time.monotonic_ns() - ended_ns) / 1e9)
         self._count(job, (ended_ns - job.started_ns) / 1e9)
+
+    def _drawn(self, job: Job, seed: int, placed: _Known) -> tuple[StreamContext, int, list[View]]:
+        """The views, in how many steps, and in whose context: the model's, or where that computes elsewhere and is late
+        its fallback's. Raises RemoteError: it has none."""
+        section, halved = job.context.config.model, "half the steps" in self._given_up
+        steps = max(1, sampler_in_use(section, job.context.traits).steps // (2 if halved else 1))
+        try:
+            views = self._draw(job, seed, placed, steps if halved else section.steps)
+        except RemoteError as error:
+            self._remote_late.update({"message": str(error)})
+            if (fallback := self._model.local) is None:
+                raise
+        else:
+            self._remote_late.update(None)
+            return job.context, steps, views
+        context, steps = replace(job.context, traits=fallback.traits), fallback.traits.config.sampling.steps
+        features = EncodedFrames(self.pulse.beat).features(fallback, job.window, context)
+        return context, steps, fallback.render(features, job.paths, self._options(job.settings, seed, steps=steps))
 
     def _draw(self, job: Job, seed: int, placed: _Known, steps: int | None) -> list[View]:
         started_s = time.monotonic()

@@ -32,6 +32,7 @@ from gcd_model import (
 from gcd_node.config import ModelSection
 from gcd_node.errors import ModelFailedError, NodeError
 from gcd_node.health import Health, Level, ModelState
+from gcd_node.remote import RemoteSynthesizer
 from gcd_node.status import Announcer
 
 Made = TypeVar("Made")
@@ -88,6 +89,11 @@ class ModelSlot:
             self._synthesizer = loaded.streaming() if isinstance(loaded, FrameSynthesizer) else loaded
             self.traits = self._synthesizer.traits
         return self._synthesizer
+
+    @property
+    def local(self) -> ViewSynthesizer | None:
+        """What renders in this process: the model; of one that computes elsewhere its fallback, None without one."""
+        return self.synthesizer.fallback if isinstance(self.synthesizer, RemoteSynthesizer) else self.synthesizer
 
     def forget_frames(self) -> None:
         """What a model that works frame by frame remembers of the frames before; others remember nothing."""

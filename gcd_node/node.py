@@ -12,7 +12,7 @@ from gcd_client.control import Code
 from gcd_model import ModelError, Traits
 from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig
-from gcd_node.errors import NodeError, SourceAbsentError, SourceError, SourceLostError
+from gcd_node.errors import NodeError, RemoteError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import THREAD_DIED, Health, Level
 from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import PATHS, Lifecycle, Parts, State, Transitions, Verb
@@ -68,7 +68,7 @@ class Node:
         self._life = Lifecycle()
         self._work: threading.Thread | None = None
         self._service = service or ServiceManager({})
-        self._failures = 0  # of attempts to activate, in a row
+        self._failures = 0  # of attempts to become active, in a row
         self._ends: queue.SimpleQueue[None] = queue.SimpleQueue()  # something in it: the life loop is to end
         self._stop_s: float | None = None
         self._retry_s: float | None = None
@@ -139,9 +139,9 @@ class Node:
             self._begin("shutdown")
         elif state is State.ACTIVE and stream is not None and stream.over:
             self._begin("deactivate")
-        elif self._retry_s is not None and time.monotonic() >= self._retry_s and state is State.INACTIVE:
+        elif self._retry_s is not None and time.monotonic() >= self._retry_s and state <= State.INACTIVE:
             self._retry_s = None
-            self._begin("activate")
+            self._begin("activate" if state is State.INACTIVE else "configure")
         self._announcer.status_if_due()
 
     def _look_after(self, silent_s: float) -> None:
@@ -264,12 +264,13 @@ class Node:
     def _after_failure(self, error: Exception, verb: Verb) -> None:
         """Give up, try again later, or wait for a command."""
         self._service.ready()
-        is_live = self._config.source.kind in LIVE_KINDS
+        is_camera_lost = verb == "activate" and isinstance(error, SourceError)
+        may_come = is_camera_lost and self._config.source.kind in LIVE_KINDS
         if self._stop_s is not None and verb != "shutdown":
             return
         if self._once or isinstance(error, SourceLostError):
             self._give_up(error)
-        elif verb == "activate" and self._on_its_own and is_live and isinstance(error, SourceError):
+        elif self._on_its_own and (may_come or isinstance(error, RemoteError)):
             self._retry_s = time.monotonic() + (wait_s := backoff_s(self._config.source.kind, self._failures))
             _LOG.log(logging.INFO if self._failures else logging.WARNING, "trying again in %.1f s", wait_s)
             self._failures += 1
@@ -281,6 +282,6 @@ class Node:
 
 def _code(error: Exception) -> Code:
     """What the event of a failed transition says."""
-    if isinstance(error, SourceAbsentError | SourceLostError):
+    if isinstance(error, SourceAbsentError | SourceLostError | RemoteError):
         return Code.NOT_READY
     return Code.BAD_ARG if isinstance(error, NodeError | ModelError) else Code.INTERNAL

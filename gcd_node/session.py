@@ -25,6 +25,7 @@ from gcd_node.lifecycle import Parts
 from gcd_node.node import Node
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
+from gcd_node.remote import open_remote
 from gcd_node.service import ServiceManager, listen
 from gcd_node.sources import LIVE_KINDS, open_source
 
@@ -41,11 +42,14 @@ def load_model(section: ModelSection) -> ViewSynthesizer:
     """The model of a launch file, on as many threads as model_threads() says; OpenCV gets no more for its pictures.
 
     Raises:
-        CheckpointError: see load_synthesizer(). ConfigError: options the checkpoint cannot have.
+        CheckpointError: see load_synthesizer(). ConfigError: options the checkpoint cannot have. RemoteError: see
+            open_remote().
     """
     threads = model_threads(section)
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
+    if section.engine == "remote":
+        return open_remote(section)
     try:
         return load_synthesizer(
             section.weights,

@@ -80,19 +80,21 @@ class Announcer:
 class Condition:
     """A reason in the node's health while something is wrong with what comes in; announced once each time it begins.
 
-    hold_s: how long it must be right again: frames, unlike windows, may be wrong every second time.
+    hold_s: how long it must be right again: frames, unlike windows, may be wrong every second time. over: the event of
+    its end, "" for none.
     """
 
-    def __init__(self, code: str, announcer: Announcer, *, hold_s: float) -> None:
-        self._code, self._announcer, self._hold_s = code, announcer, hold_s
+    def __init__(self, code: str, announcer: Announcer, *, hold_s: float, over: str = "") -> None:
+        self._code, self._announcer, self._hold_s, self._over = code, announcer, hold_s, over
         self._wrong_s = -math.inf
 
     def update(self, problem: Mapping[str, object] | None) -> None:
         """Of the newest input. problem: fields of the event that announces its begin; None if all is right."""
         now_s = time.monotonic()
         if problem is None:
-            if now_s - self._wrong_s >= self._hold_s:
-                self._announcer.health.clear_reason(self._code)
+            is_over = now_s - self._wrong_s >= self._hold_s and self._announcer.health.clear_reason(self._code)
+            if is_over and self._over:
+                self._announcer.event(self._over, Level.OK)
             return
         self._wrong_s = now_s
         if self._announcer.health.raise_reason(self._code, Level.WARN):

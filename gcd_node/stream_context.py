@@ -309,9 +309,13 @@ def _model_in_use(section: ModelSection, traits: Traits) -> ModelSection:
     used = sampler_in_use(section, traits)
     return structs.replace(
         section,
+        weights=traits.sha256_12 if section.engine == "remote" else section.weights,
         device="auto",
         threads=None,
         engine=None,
+        deadline_s=2.0,
+        fallback="drop",
+        token=None,
         providers=(),
         dtype=None,
         family=section.family if family is None else family.name,

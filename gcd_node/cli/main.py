@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("run:demo", "Replay the packaged drive through the model and over ZeroMQ into a second process."),
     "run": ("run:run", "Run the node on a launch file, until its recording ends or it is told to."),
+    "serve": ("run:serve", "Serve a model to many nodes, on Ray Serve: one replica a GPU."),
     "check": ("run:check", "Look at all that a launch file needs, before anything is started; loads no weights."),
     "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
     "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),

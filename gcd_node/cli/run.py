@@ -1,8 +1,10 @@
 """What is done with a launch file: `gcd-node run`, `check`, `replay` and the `diff` of two runs; and `demo`, which has
 one of its own. What brings torch is imported when called."""
 
+import contextlib
 import gc
 import os
+import signal
 import statistics
 import sys
 from pathlib import Path
@@ -104,6 +106,26 @@ def check(config: ConfigPath, changes: Changes = None, print_config: PrintConfig
     for each in findings:
         if each.error is not None:
             raise each.error
+
+
+def serve(
+    config: Annotated[Path, Argument(metavar="CONFIG", help="A file such as launch/serve.toml.")],
+) -> None:
+    """Serve a model to many nodes, on Ray Serve: one replica a GPU.
+
+    Deploys on the Ray cluster of this machine, or of RAY_ADDRESS, and ends; the service stays until `serve shutdown`.
+    Without a cluster it serves on this machine alone, until Ctrl-C. Nodes name its address: [model] engine = "remote".
+    """
+    from gcd_node.fleet import deployed, load_service
+
+    settings = load_service(config)
+    console = Console(stderr=True, markup=False)
+    console.print(Text(f"deploying {settings.model.weights}"))
+    with deployed(settings) as ends_with_us, contextlib.suppress(KeyboardInterrupt):
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        console.print(f"serving on {settings.serve.http}", soft_wrap=True)
+        if ends_with_us:
+            signal.pause()
 
 
 def demo(

@@ -40,12 +40,14 @@ from gcd_model.loading import export_weights, load_synthesizer, placement, weigh
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
 from gcd_model.synthesizer import FrameSynthesizer, ViewSynthesizer
 from gcd_model.traits import Traits
+from gcd_model.weights.card import Card
 from gcd_model.weights.load import WeightsReport, convert_weights, inspect_weights
 
 __all__ = [
     "Augmentation",
     "CameraMount",
     "Cancelled",
+    "Card",
     "CheckpointError",
     "Clip",
     "DeviceMemoryError",

@@ -8,11 +8,13 @@ import socket
 import stat
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+import yaml
 from cameras import write_video
 from fakes import write_tiny
 from msgspec.structs import replace
@@ -22,13 +24,14 @@ from gcd_node.check import check_launch
 from gcd_node.cli.main import COMMANDS, run_app
 from gcd_node.config import NodeConfig, PublishConfig, load_config, parse_config
 from gcd_node.errors import ConfigError, SourceError, TooShortError, UsageError
+from gcd_node.fleet import load_service, service_config
 from gcd_node.publisher import Publisher
 from gcd_node.sources import RecordedSource, SyntheticSource
 
 Capture = pytest.CaptureFixture[str]
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "launch"
-TOMLS = sorted(LAUNCH.glob("*.toml"))
+TOMLS = sorted(path for path in LAUNCH.glob("*.toml") if path.name != "serve.toml")
 UNIT = LAUNCH / "systemd" / "gcd-node@.service"
 INSTALLED = "/opt/gcd-node/bin/gcd-node"
 PATIENCE_S = 60
@@ -157,6 +160,29 @@ def test_the_container_copies_what_is_there_runs_as_nobody_special_and_calls_com
     assert command in COMMANDS
     assert f"launch/{Path(config).name}" in " ".join(all_of("COPY"))
     assert (all_of("USER"), all_of("STOPSIGNAL")) == (["10001:10001"], ["SIGTERM"])
+
+
+def test_a_fleets_files_are_what_serve_and_the_service_take() -> None:
+    assert load_service(LAUNCH / "serve.toml").serve.token is None
+    spec = yaml.safe_load((LAUNCH / "kubernetes" / "rayservice.yaml").read_text())["spec"]
+    config, cluster = yaml.safe_load(spec["serveConfigV2"]), spec["rayClusterConfig"]
+    pytest.importorskip("ray.serve.schema").ServeDeploySchema.model_validate(config)
+    (application,) = config["applications"]
+    module, _, name = application["import_path"].partition(":")
+    assert callable(getattr(import_module(module), name))
+    settings, options = service_config(application["args"]), config["http_options"]
+    assert settings.serve.http == f"{options['host']}:{options['port']}"
+    (workers,) = cluster["workerGroupSpecs"]
+    pods = [group["template"]["spec"] for group in (cluster["headGroupSpec"], workers)]
+    containers = [each for pod in pods for each in pod["containers"]]
+    assert settings.serve.replicas == workers["replicas"] * int(containers[1]["resources"]["limits"]["nvidia.com/gpu"])
+    assert {each["image"] for each in containers} == {"REGISTRY/gcd-node:cuda"}
+    for pod, container in zip(pods, containers, strict=True):  # every machine has the token and the weights
+        mounts = {each["mountPath"]: each["name"] for each in container["volumeMounts"]}
+        assert set(mounts.values()) == {each["name"] for each in pod["volumes"]}
+        assert settings.serve.token in mounts
+        assert str(Path(settings.model.weights).parent) in mounts
+    assert f"ray=={cluster['rayVersion']}" in (ROOT / "constraints.txt").read_text().splitlines()
 
 
 # `gcd-node check`, and launch files with changes, as text again.
