@@ -12,6 +12,7 @@ from gcd_model.conditioning import SourceFeatures
 from gcd_model.diffusion import RenderOptions, Sampler
 from gcd_model.engines.onnx_export import is_export
 from gcd_model.errors import (
+    AlignmentError,
     Cancelled,
     CheckpointError,
     DeviceMemoryError,
@@ -33,6 +34,16 @@ from gcd_model.geometry import (
     center_crop_box,
     nearest_delta,
 )
+from gcd_model.live.alignment import (
+    Alignment,
+    CameraMove,
+    Features,
+    Landmarks,
+    align,
+    features,
+    landmarks,
+    landmarks_of,
+)
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.eyes import PlacedFrame, SeenFrame
 from gcd_model.live.synthesizer import visibility_of
@@ -43,15 +54,20 @@ from gcd_model.traits import Traits
 from gcd_model.weights.load import WeightsReport, convert_weights, inspect_weights
 
 __all__ = [
+    "Alignment",
+    "AlignmentError",
     "Augmentation",
     "CameraMount",
+    "CameraMove",
     "Cancelled",
     "CheckpointError",
     "Clip",
     "DeviceMemoryError",
+    "Features",
     "FileError",
     "FrameSynthesizer",
     "Intrinsics",
+    "Landmarks",
     "ModelError",
     "NonFiniteError",
     "OptionError",
@@ -71,14 +87,18 @@ __all__ = [
     "ViewRangeError",
     "ViewSynthesizer",
     "WeightsReport",
+    "align",
     "center_crop_box",
     "convert_weights",
     "decode_toml",
     "explain_settings_error",
     "export_weights",
+    "features",
     "hatched",
     "inspect_weights",
     "is_export",
+    "landmarks",
+    "landmarks_of",
     "load_synthesizer",
     "nearest_delta",
     "placement",

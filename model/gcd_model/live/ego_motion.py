@@ -133,10 +133,8 @@ class EgoMotion:
         inner = torch.zeros(depth.shape, dtype=torch.uint8)
         inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
         inner[inside] = (static.cpu() & depth.isfinite() & (depth > 0))[inside].to(torch.uint8)
-        share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread.cpu() * _SPREADS).clamp(min=_SUREST)
-        self._last = frame = _Frame(
-            *self._new, depth=depth.double().numpy(), share=share.double().numpy(), usable=inner.numpy()
-        )
+        share = depth_share(depth, spread)
+        self._last = frame = _Frame(*self._new, depth=depth.double().numpy(), share=share, usable=inner.numpy())
         if len(self._tracks):
             column, row = np.rint(self._tracks.place).astype(int).T
             self._tracks = _placed_better(self._tracks, frame, self._pose).rows(frame.usable[row, column] > 0)
@@ -152,6 +150,12 @@ class EgoMotion:
             step = inverse(self._pose) @ pose
             _require_plausible(step, "the picture")
         self._pose, self._step, self._tracks = pose, step, tracks
+
+
+def depth_share(depth: Tensor, spread: Tensor | None) -> Array:
+    """The standard error of each depth, in parts of it, float64; both as `EgoMotion.settle` takes them."""
+    share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread * _SPREADS).clamp(min=_SUREST)
+    return share.cpu().double().numpy()
 
 
 def require_motion(before: Tensor | None, after: Tensor) -> Tensor:
@@ -281,7 +285,7 @@ def _placed_better(tracks: Tracks, frame: _Frame, pose: Array) -> Tracks:
 _MOST = 0.75
 """Share of the tracks that agree with a pose from which on no other is tried."""
 _RANSAC_PX, _RANSAC_ROUNDS = 2.0, 150
-_FLOW_PX = 0.25
+FLOW_PX = 0.25
 """Standard error of a followed place."""
 _DOUBTED, OUTLIER, _HOPELESS = 1.5, 4.0, 12.0
 """In standard errors: from here on a track counts less, not at all, and not even while the pose is still rough."""
@@ -328,7 +332,7 @@ def _refined(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Arra
     """Robust least squares over all tracks: the pose, and by how many standard errors each track differs from it."""
     for number in range(_ROUGH_STEPS + _FINE_STEPS):
         limit = _HOPELESS if number < _ROUGH_STEPS else OUTLIER
-        residual, slope = _reprojection(tracks, lens, pose)
+        residual, slope = reprojection(tracks, lens, pose)
         distance = np.linalg.norm(residual, axis=1)
         weight = np.minimum(1.0, _DOUBTED / np.maximum(distance, 1e-9)) * (distance < limit)
         weighted = (slope * weight[:, None, None]).reshape(-1, 6)
@@ -337,12 +341,12 @@ def _refined(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Arra
         pose = pose @ inverse(rigid(change[3:], change[:3]))
         if number >= _ROUGH_STEPS and np.abs(change).max() < _SETTLED:
             break
-    distance = np.linalg.norm(_reprojection(tracks, lens, pose)[0], axis=1)
+    distance = np.linalg.norm(reprojection(tracks, lens, pose)[0], axis=1)
     behind = projected(tracks.point, pose, lens)[0][:, 2] <= BEHIND_M
     return pose, np.where(behind, np.inf, distance)
 
 
-def _reprojection(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
+def reprojection(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
     """Residuals [N, 2] and their slopes by a step and a turn of the camera [N, 2, 6], in standard errors.
 
     A wrong depth moves a point along the ray on which it was seen: in that direction of the picture it counts less.
@@ -360,11 +364,11 @@ def _reprojection(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array,
     blur = (slope[:, :, :3] @ ray[:, :, None])[:, :, 0] * tracks.share[:, None]
     size = np.linalg.norm(blur, axis=1)[:, None]
     along = blur / np.maximum(size, 1e-9)
-    excess = (1 - _FLOW_PX / np.hypot(_FLOW_PX, size)) * along
+    excess = (1 - FLOW_PX / np.hypot(FLOW_PX, size)) * along
     residual = tracks.place - place
     residual = residual - excess * (along * residual).sum(1, keepdims=True)
     slope = slope - excess[:, :, None] * (along[:, None] @ slope)
-    return residual / _FLOW_PX, slope / _FLOW_PX
+    return residual / FLOW_PX, slope / FLOW_PX
 
 
 def unprojected(place: Array, depth: Array, lens: Intrinsics, pose: Array) -> Array:
