@@ -41,7 +41,7 @@ _EDGE = 1.1
 """Depths around a landmark differ by less than this factor: at an edge nobody knows on which side it lies."""
 _FEWEST, _LEAST_SHARE = 12, 0.25
 """Of the matches, that agree with a pose: fewer are a coincidence."""
-_MOST_DEG, _MOST_SHARE = 3.0, 0.05
+_MOST_DEG, _MOST_SHARE = 1.5, 0.02
 """Doubt about an angle, and about a place in parts of the distance to the landmarks, beyond which a pose is none."""
 
 
@@ -122,38 +122,47 @@ def features(picture: Array, lens: Intrinsics) -> Features:
     return Features(place=place, descriptor=descriptor, lens=lens)
 
 
-def landmarks(picture: Array, depth: Array, share: Array, lens: Intrinsics) -> Landmarks:
+def landmarks(
+    picture: Array, lens: Intrinsics, depth: Array, share: Array, depth_lens: Intrinsics | None = None
+) -> Landmarks:
     """Of a picture with depth.
 
     Args:
-        picture: u8 [H, W, 3], RGB. depth: [H, W] metres, 0 or not finite: none, also for what moves. share: [H, W], its
-            standard error, in parts of it.
+        picture: u8 [H, W, 3], RGB. depth: [h, w] metres, 0 or not finite: none, also for what moves. share: [h, w], its
+            standard error, in parts of it. depth_lens: of the depth, if that has another size; from the same place.
     Raises: AlignmentError: there are next to none.
     """
     import cv2
 
     place, descriptor = _described(picture)
-    depth = np.where(np.isfinite(depth) & (depth < SKY_M), depth, 0).astype(np.float32)
-    column, row = np.rint(place).astype(int).T
-    near, far = (change(depth, np.ones((3, 3)))[row, column] for change in (cv2.erode, cv2.dilate))
-    known = (near > 0) & (far < _EDGE * near)
-    if known.sum() < _FEWEST:
-        raise AlignmentError(f"only {known.sum()} corners of the picture have a depth; {_FEWEST} are needed")
-    place, column, row = place[known], column[known], row[known]
-    point = unprojected(place, depth[row, column].astype(float), lens, np.eye(4))
-    tracks = Tracks(place=place, point=point, eye=np.zeros_like(point), share=share[row, column])
-    return Landmarks(tracks=tracks, descriptor=descriptor[known], lens=lens)
+    depth_lens = depth_lens or lens
+    ray = (place + 0.5 - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    there = (ray * (depth_lens.fx, depth_lens.fy) + (depth_lens.cx, depth_lens.cy) - 0.5).astype(np.float32)
+    column, row = np.rint(there).astype(int).clip(0, (depth_lens.width - 1, depth_lens.height - 1)).T
+    known = np.isfinite(depth) & (depth > 0) & (depth < SKY_M)
+    inverse_depth = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)  # linear on planes
+    far, near = (change(inverse_depth, np.ones((3, 3)))[row, column] for change in (cv2.erode, cv2.dilate))
+    good = (far > 0) & (near < _EDGE * far)
+    if good.sum() < _FEWEST:
+        raise AlignmentError(f"only {good.sum()} corners of the picture have a depth; {_FEWEST} are needed")
+    inverse_m = cv2.remap(inverse_depth, *there[good].T[..., None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    point = unprojected(place[good], 1 / inverse_m[:, 0].astype(float), lens, np.eye(4))
+    tracks = Tracks(place=place[good], point=point, eye=np.zeros_like(point), share=share[row, column][good])
+    return Landmarks(tracks=tracks, descriptor=descriptor[good], lens=lens)
 
 
-def landmarks_of(frame: SeenFrame) -> Landmarks:
-    """Of what stands still in a frame that the live model has looked at. Raises AlignmentError as `landmarks`."""
-    seen, picture = frame.geometry, ((frame.picture.cpu() + 1) * 127.5).round().clamp(0, 255)
-    return landmarks(
-        picture.to(torch.uint8).permute(1, 2, 0).numpy(),
-        torch.where(seen.static, seen.metres, 0.0).cpu().numpy(),
-        depth_share(seen.metres, seen.spread),
-        frame.lens,
-    )
+def landmarks_of(frame: SeenFrame, picture: Array | None = None, lens: Intrinsics | None = None) -> Landmarks:
+    """Of what stands still in a frame that the live model has looked at.
+
+    picture: u8 [H, W, 3], the same one, finer than the model takes it; with its lens.
+    Raises: AlignmentError as `landmarks`.
+    """
+    seen = frame.geometry
+    if picture is None or lens is None:
+        levels = ((frame.picture.cpu() + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
+        picture, lens = levels.permute(1, 2, 0).numpy(), frame.lens
+    depth = torch.where(seen.static, seen.metres, 0.0).cpu().numpy()
+    return landmarks(picture, lens, depth, depth_share(seen.metres, seen.spread), frame.lens)
 
 
 def align(known: Sequence[Landmarks], seen: Sequence[Features]) -> Alignment:
