@@ -32,6 +32,7 @@ from gcd_model.geometry import (
     SphericalDelta,
     Trajectory,
     center_crop_box,
+    invert_rigid,
     nearest_delta,
 )
 from gcd_model.live.alignment import (
@@ -96,6 +97,7 @@ __all__ = [
     "features",
     "hatched",
     "inspect_weights",
+    "invert_rigid",
     "is_export",
     "landmarks",
     "landmarks_of",

@@ -68,6 +68,11 @@ class Landmarks:
     descriptor: Array
     lens: Intrinsics
 
+    @property
+    def features(self) -> Features:
+        """The same without their points."""
+        return Features(place=self.tracks.place, descriptor=self.descriptor, lens=self.lens)
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CameraMove:
