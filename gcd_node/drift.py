@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 
+import numpy as np
 import torch
 from msgspec.structs import replace
 from torch import Tensor
@@ -24,7 +25,7 @@ _PERIOD_S = 0.4  # from one check to the next; each takes some 40 ms of a core
 _NICE = 10
 _IN_A_ROW = 3  # checks that agree: an arm before the lens is no camera that moved
 _UNSEEN_S, _HOLD_S = 5.0, 1.0
-_MOVED_CM, _MOVED_DEG = 0.5, 0.5
+_MOVED_CM, _MOVED_DEG = 0.5, 0.5  # a step, a turn; and a shift of the picture as by such a step to the side
 _FROM_REFERENCE, _SIGMAS = 4.0, 3.0  # so many times that, and surer: other light, other things and a learned depth
 
 
@@ -53,7 +54,7 @@ class DriftDetector:
         self._anchor: Landmarks | None = None  # what the camera saw first
         self._expected: dict[str, Tensor] = {}  # anchor_from_source as the pose of each view takes it to be
         self._last: Tensor | None = None  # the same as it was found by the last check
-        self._in_a_row, self._seen_s = 0, time.monotonic()
+        self._in_a_row, self._seen_s, self._is_seen = 0, time.monotonic(), True
         self._moves = Condition("CAMERA_MOVED", announcer, hold_s=_HOLD_S)
         self._unaligned = Condition("UNALIGNED", announcer, hold_s=0.0)
         self.moved: frozenset[str] = frozenset()
@@ -88,23 +89,32 @@ class DriftDetector:
 
     def check(self, frame: SeenFrame) -> None:
         """Look at one frame."""
+        now: Landmarks | None = None
         try:
             now = landmarks_of(frame)
-            self._recent.append(now)
-            if len(self._recent) < _IN_A_ROW:
-                return
-            self._anchor = self._anchor or now
-            found = align([self._anchor], [now.features])
+            found = align([self._anchor or now], [now.features])
         except AlignmentError as error:
+            self._keep(now, is_seen=False)
             self._miss(str(error))
             return
-        self._seen_s = time.monotonic()
+        self._keep(now, is_seen=True)
+        if len(self._recent) < _IN_A_ROW:
+            return
+        self._anchor, self._seen_s = self._anchor or now, time.monotonic()
         problem: Mapping[str, object] | None = None
         for view_id, view in self._views().items():
             if view_id not in self._expected:
                 problem = self._begin(view_id, view, found.pose) or problem
         self._unaligned.update(problem)
         self._judge(found)
+
+    def _keep(self, now: Landmarks | None, *, is_seen: bool) -> None:
+        """The latest frames of one scene. is_seen: of that of the anchor."""
+        if now is None or is_seen != self._is_seen:
+            self._recent.clear()
+        self._is_seen = is_seen
+        if now is not None:
+            self._recent.append(now)
 
     def _views(self) -> dict[str, ViewConfig]:
         """The canonical views that there are now."""
@@ -124,7 +134,7 @@ class DriftDetector:
         self._expected[view_id] = anchor_from_now
         if view.pose is None:
             self._set_pose(view_id, view, found.pose, found.moved_from(torch.eye(4, dtype=torch.float64)))
-        elif _is_beyond(found.moved_from(_pose_of(view)), _FROM_REFERENCE, _SIGMAS):
+        elif _is_beyond(found, _pose_of(view), _FROM_REFERENCE, _SIGMAS):
             self._expected[view_id] = anchor_from_now @ found.pose @ invert_rigid(_pose_of(view))
         return None
 
@@ -134,8 +144,8 @@ class DriftDetector:
         moves = {each: found.moved_from(pose) for each, pose in self._expected.items() if each in views}
         if not moves:
             return
-        beyond = {view_id for view_id, move in moves.items() if _is_beyond(move)}
-        view_id, worst = max(moves.items(), key=lambda each: _excess(each[1]))
+        beyond = {view_id for view_id in moves if _is_beyond(found, self._expected[view_id])}
+        view_id, worst = max(moves.items(), key=lambda each: each[1].pixels)
         self._announcer.health.camera = _rounded(worst)
         self._in_a_row = self._in_a_row + 1 if beyond else 0
         if self._in_a_row >= _IN_A_ROW:
@@ -145,7 +155,7 @@ class DriftDetector:
         elif not beyond:
             self.moved = frozenset()
             self._moves.update(None)
-        if last is not None and not _is_beyond(found.moved_from(last)):  # it stands
+        if last is not None and not _is_beyond(found, last):  # it stands
             for view_id in [each for each, view in views.items() if view.realign and each in self.moved]:
                 self._follow(view_id, views[view_id])
             for view_id in [each for each in views if each in self._asked and each in self._expected]:
@@ -177,6 +187,7 @@ class DriftDetector:
 
     def _miss(self, reason: str) -> None:
         """The camera sees nothing of what it saw first: it was turned away, or something stands before it."""
+        self._announcer.health.camera = None
         for view_id in self._asked:
             self._announcer.event("ALIGN_FAILED", Level.WARN, {"view": view_id, "message": reason})
         self._asked.clear()
@@ -206,16 +217,15 @@ def _pose_of(view: ViewConfig) -> Tensor:
     return torch.tensor(pose_matrix(view.pose or ()), dtype=torch.float64).view(4, 4)
 
 
-def _is_beyond(move: CameraMove, times: float = 1.0, sigmas: float = 1.0) -> bool:
-    """Whether the camera surely moved by more than it may, or by so many times more."""
+def _is_beyond(found: Alignment, expected: Tensor, times: float = 1.0, sigmas: float = 1.0) -> bool:
+    """Whether the camera surely stands farther from there than it may, or so many times farther."""
+    move = found.moved_from(expected)
+    aside_px = found.lens.fx * _MOVED_CM / 100 / float(np.median(found.inliers.point[:, 2]))
     return (
         move.centimetres - sigmas * move.doubt_centimetres > times * _MOVED_CM
         or move.degrees - sigmas * move.doubt_degrees > times * _MOVED_DEG
+        or move.pixels - sigmas * move.doubt_pixels > times * aside_px
     )
-
-
-def _excess(move: CameraMove) -> float:
-    return max(move.centimetres / _MOVED_CM, move.degrees / _MOVED_DEG)
 
 
 def _rounded(move: CameraMove) -> dict[str, float]:

@@ -51,7 +51,7 @@ HFOV_DEG, REFERENCE_DEG, STEREO_DEG, BASELINE_M = 60.0, 55.0, 66.0, 0.075
 CHECK_FRAMES, BEFORE, AFTER = 10, 4, 4
 """24 Hz frames from check to check, checks before a move, and those within 2 s after it, of which the first comes late."""
 MOVES = ((1.0, 1.0), (3.0, 3.0), (5.0, 5.0), (10.0, 10.0))
-"""Of the pose's reference camera from the source, centimetres and degrees, in drawn directions."""
+"""Of the pose's reference camera from the source, centimetres and degrees, in drawn directions; twice each."""
 LAUNCH = """[source]\nkind = "synthetic"\n[model]\nweights = "package:live-small"\n[view.v]\nkind = "canonical"
 reference = "-"\nhfov_deg = 60.0\npose = [0, 0, 0, 0, 0, 0, 1]\n"""
 
@@ -150,18 +150,16 @@ def network() -> Any:
 def pose_figures(seed: int, depth: Depth) -> dict[str, Any]:
     """Of a scene: errors of the pose of a reference camera after each of MOVES, in mm and degrees, and the doubt."""
     scene, random, rows = tabletop_scene(seed, 60), np.random.default_rng([seed, 1]), []
-    for cm, deg in MOVES:
-        source = place(random)
+    source, camera = place(random), Camera(depth, random)
+    frames = camera.see(scene, [35, 40, 45, 50, 55], np.tile(source, (5, 1, 1)), fine=True)
+    known, lens = [landmarks_of(*each) for each in frames], Intrinsics.from_hfov(REFERENCE_DEG, *REFERENCE)
+    for cm, deg in MOVES * 2:
         goal = moved(source, random, cm, deg)
-        lens = Intrinsics.from_hfov(REFERENCE_DEG, *REFERENCE)
         picture = looks_otherwise(film(scene, [0], goal[None], REFERENCE, REFERENCE_DEG).rgb[0], random)
-        steps = [35, 40, 45, 50, 55]
-        camera = Camera(depth, random)
+        truth = np.linalg.inv(source) @ goal
+        truth[:3, 3] /= UNITS_A_METRE
         row: dict[str, Any] = {"cm": cm, "deg": deg}
         try:
-            known = [landmarks_of(*each) for each in camera.see(scene, steps, np.tile(source, (5, 1, 1)), fine=True)]
-            truth = np.linalg.inv(source) @ goal
-            truth[:3, 3] /= UNITS_A_METRE
             off = align(known, [features(picture, lens)]).moved_from(torch.from_numpy(truth))
             row |= {"mm": 10 * off.centimetres, "off_deg": off.degrees, "px": off.pixels}
             row |= {"doubt_mm": 10 * off.doubt_centimetres, "doubt_deg": off.doubt_degrees}

@@ -59,7 +59,7 @@ def calibrate_view(
     view = CalibratedView(
         pose=tuple(found.pose.flatten().tolist()), inliers=len(found.inliers), matches=found.matches, **asdict(move)
     )
-    write_whole(out, lambda file: file.write(tomli_w.dumps(msgspec.to_builtins(view)).encode()))
+    write_whole(out, lambda file: file.write(view.to_toml().encode()))
     rows = [
         ("from the source camera", move.pixels, move.degrees, move.centimetres),
         ("standard error", move.doubt_pixels, move.doubt_degrees, move.doubt_centimetres),

@@ -315,15 +315,18 @@ def _consensus(tracks: Tracks, lens: Intrinsics, guess: Array) -> Array:
     import cv2
 
     cv2.setRNGSeed(0)
-    found, turn, step, _ = cv2.solvePnPRansac(
-        tracks.point,
-        tracks.place.astype(np.float64),
-        np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]]),
-        None,
-        iterationsCount=_RANSAC_ROUNDS,
-        reprojectionError=_RANSAC_PX,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )
+    try:
+        found, turn, step, _ = cv2.solvePnPRansac(
+            tracks.point,
+            tracks.place.astype(np.float64),
+            np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]]),
+            None,
+            iterationsCount=_RANSAC_ROUNDS,
+            reprojectionError=_RANSAC_PX,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:  # of points that coincide
+        return guess
     usable = found and np.isfinite(turn).all() and np.isfinite(step).all()
     return inverse(rigid(turn[:, 0], step[:, 0])) if usable else guess
 
