@@ -9,30 +9,27 @@ imported where it is used.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.errors import AlignmentError
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M
-from gcd_model.live.ego_motion import (
+from gcd_model.live.ego_motion import depth_share
+from gcd_model.live.eyes import SeenFrame
+from gcd_model.live.pnp import (
     FLOW_PX,
     OUTLIER,
+    Array,
     Tracks,
-    depth_share,
     inverse,
     likeliest_pose,
     projected,
     reprojection,
     unprojected,
 )
-from gcd_model.live.eyes import SeenFrame
-
-Array = NDArray[Any]
 
 _FEATURES, _CONTRAST = 1500, 0.01
 _RATIO = 0.8
