@@ -1,6 +1,6 @@
 """How well a canonical view's pose is found, and a camera that was moved is noticed, on held-out tabletop scenes.
 
-    python tools/canonical_figures.py pose OUT --depth exact      # learned, stereo: the pose against a reference picture
+    python tools/canonical_figures.py pose OUT --depth exact     # learned, stereo: the pose against a reference picture
     python tools/canonical_figures.py moves OUT --depth learned   # moves of 1 cm or 1 degree: noticed within 2 s?
     python tools/canonical_figures.py alarms OUT --depth exact --seconds 270     # of each scene: alarms, nothing moved
     python tools/canonical_figures.py report OUT
@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -49,7 +50,7 @@ MODEL, CAMERA, REFERENCE = (192, 128), (640, 427), (224, 224)
 """Sizes: of what the model sees, of a camera's picture as calibrate-view takes it, and of a policy's picture."""
 HFOV_DEG, REFERENCE_DEG, STEREO_DEG, BASELINE_M = 60.0, 55.0, 66.0, 0.075
 CHECK_FRAMES, BEFORE, AFTER = 10, 4, 4
-"""24 Hz frames from check to check, checks before a move, and those within 2 s after it, of which the first comes late."""
+"""24 Hz frames from check to check, checks before a move, and those that surely come within 2 s after it."""
 MOVES = ((1.0, 1.0), (3.0, 3.0), (5.0, 5.0), (10.0, 10.0))
 """Of the pose's reference camera from the source, centimetres and degrees, in drawn directions; twice each."""
 LAUNCH = """[source]\nkind = "synthetic"\n[model]\nweights = "package:live-small"\n[view.v]\nkind = "canonical"
@@ -210,7 +211,7 @@ def alarm_figures(seed: int, depth: Depth, seconds: float) -> dict[str, Any]:
         steps = [CHECK_FRAMES * each for each in range(first, min(first + 50, count))]
         frames = camera.see(scene, steps, np.tile(source, (len(steps), 1, 1)), fine=False)
         said += [watch.says_moved(frame) for frame, _, _ in frames]
-    alarms = sum(now and not before for before, now in zip(said, said[1:], strict=False))
+    alarms = sum(now and not before for before, now in pairwise(said))
     return {"checks": count, "hours": count * CHECK_FRAMES / 24 / 3600, "alarms": alarms, "checks_moved": sum(said)}
 
 
@@ -226,12 +227,10 @@ def report(out: Path) -> None:
         for cm, deg in sorted({(row["cm"], row["deg"]) for row in rows}):
             some = [row for row in rows if (row["cm"], row["deg"]) == (cm, deg)]
             if folder.name.startswith("moves"):
-                checks = [row["check"] for row in some if row["check"] is not None]
-                low, high = wilson(len(checks), len(some))
-                early = sum(row["early"] for row in some)
-                print(
-                    f"  {cm:g} cm, {deg:g} deg: {len(checks)} of {len(some)} noticed [{low:.3f}, {high:.3f}], {early} early"
-                )
+                noticed, early = (sum(bool(row[name]) for row in some) for name in ("check", "early"))
+                low, high = wilson(noticed, len(some))
+                words = f"{noticed} of {len(some)} noticed [{low:.3f}, {high:.3f}], {early} early"
+                print(f"  {cm:g} cm, {deg:g} deg: {words}")
                 continue
             known = [row for row in some if "mm" in row]
             good = sum(row["mm"] <= 5 and row["off_deg"] <= 0.5 for row in known)

@@ -29,7 +29,7 @@ _JOIN_S = 2.0
 _FIND_MS = 1500.0  # the node repeats what it is made of to whoever subscribes
 
 
-@CameraConfig.register_subclass("gcd")
+@CameraConfig.register_subclass("gcd")  # pyright: ignore[reportUntypedClassDecorator]
 @dataclass(kw_only=True)
 class GcdCameraConfig(CameraConfig):  # pyright: ignore[reportUntypedBaseClass]
     """view: the view's id. endpoint: of the node's views. timeout_ms: until the first view, and of each `read`.
@@ -94,7 +94,7 @@ class GcdCamera(Camera):  # pyright: ignore[reportUntypedBaseClass]
         config = self.config
         keys = None
         if config.keys is not None and config.node_key is not None:
-            own, server = read_key_pair(Path(config.keys).expanduser()), read_public_key(Path(config.node_key))
+            own, server = read_key_pair(Path(config.keys).expanduser()), read_public_key(config.node_key)
             keys = ClientKeys(own=own, server=server)
         views = ViewSubscriber(config.endpoint, config.view, "frm", keys=keys)
         self._newest, self._error, self._is_new = None, None, False

@@ -147,7 +147,8 @@ def landmarks(
     good = (far > 0) & (near < _EDGE * far)
     if good.sum() < _FEWEST:
         raise AlignmentError(f"only {good.sum()} corners of the picture have a depth; {_FEWEST} are needed")
-    inverse_m = cv2.remap(inverse_depth, *there[good].T[..., None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    across, along = there[good].T[..., None]
+    inverse_m = cv2.remap(inverse_depth, across, along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     point = unprojected(place[good], 1 / inverse_m[:, 0].astype(float), lens, np.eye(4))
     tracks = Tracks(place=place[good], point=point, eye=np.zeros_like(point), share=share[row, column][good])
     return Landmarks(tracks=tracks, descriptor=descriptor[good], lens=lens)
@@ -203,7 +204,7 @@ def _described(picture: Array) -> tuple[Array, Array]:
     corners, descriptor = finder.detectAndCompute(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), None)
     if len(corners) < _FEWEST:
         raise AlignmentError(f"the picture has {len(corners)} corners; {_FEWEST} are needed: is it dark or blurred?")
-    place = cv2.KeyPoint.convert(corners)
+    place = np.asarray(cv2.KeyPoint.convert(corners), np.float32)
     inside = ((place > -0.5) & (place < np.array(picture.shape[1::-1]) - 0.5)).all(axis=1)
     return place[inside], descriptor[inside]
 
