@@ -200,7 +200,7 @@ def align(known: Sequence[Landmarks], seen: Sequence[Features]) -> Alignment:
 def _described(picture: Array) -> tuple[Array, Array]:
     import cv2
 
-    finder = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST)
+    finder = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     corners, descriptor = finder.detectAndCompute(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), None)
     if len(corners) < _FEWEST:
         raise AlignmentError(f"the picture has {len(corners)} corners; {_FEWEST} are needed: is it dark or blurred?")
