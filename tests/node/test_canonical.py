@@ -1,11 +1,12 @@
 """Canonical views: their camera, how their pose is found, and how a source camera that was moved is noticed."""
 
+import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fakes import Box, run, traits
+from fakes import Box, FakeSource, run, traits
 from numpy.typing import NDArray
 from textured_room import HERE, LENS, moved, seen, shot
 
@@ -107,6 +108,19 @@ def test_a_view_in_lockstep_has_the_camera_of_its_reference_and_needs_its_pose(f
         load_references(parse_config(lockstep, "test"))
     with pytest.raises(OptionError):
         VirtualView("policy", parse_config(lockstep + STANDS, "test"), traits())
+
+
+@pytest.mark.parametrize("others", ["", "[view.main]\n"])
+def test_a_node_draws_other_views_while_a_pose_is_looked_for(
+    folder: Path, others: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gcd_node.drift, "_PERIOD_S", 0.02)
+    source = FakeSource(15, fps=10.0, period_s=0.1, size=(192, 128))
+    box = run(config(folder, others), load_synthesizer("random:live"), source)
+    assert [event["view"] for event in box.events("UNALIGNED")] == ["policy"]
+    assert box.of("frm", "policy") == []
+    assert bool(box.of("frm", "main")) == bool(others)
+    assert not [thread for thread in threading.enumerate() if thread.name == "drift"]
 
 
 class Watched:
