@@ -188,9 +188,8 @@ class DriftDetector:
     def _miss(self, reason: str) -> None:
         """The camera sees nothing of what it saw first: it was turned away, or something stands before it."""
         self._announcer.health.camera = None
-        for view_id in self._asked:
-            self._announcer.event("ALIGN_FAILED", Level.WARN, {"view": view_id, "message": reason})
-        self._asked.clear()
+        while self._asked:
+            self._announcer.event("ALIGN_FAILED", Level.WARN, {"view": self._asked.pop(), "message": reason})
         if self._anchor is None:  # nor was there anything
             waiting = [each for each, view in self._views().items() if view.pose is None]
             self._unaligned.update({"view": waiting[0], "message": reason} if waiting else None)

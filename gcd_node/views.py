@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import get_args, overload
+from typing import get_args
 
 import msgspec
 import torch
@@ -61,12 +61,6 @@ class LiveConfig:
     def revision(self, view_id: str) -> int:
         """Of a view there is or has been; 0 for others."""
         return self._revisions.get(view_id, 0)
-
-    @overload
-    def set_view(self, view_id: str, view: ViewConfig) -> int: ...
-
-    @overload
-    def set_view(self, view_id: str, view: ViewConfig, instead_of: ViewConfig) -> int | None: ...
 
     def set_view(self, view_id: str, view: ViewConfig, instead_of: ViewConfig | None = None) -> int | None:
         """Replace or add a view; gives its new revision. None, and nothing changes: it is no longer `instead_of`."""
