@@ -21,7 +21,7 @@ from gcd_node.view_config import ViewConfig, pose_matrix
 from gcd_node.views import LiveConfig
 
 _LOG = logging.getLogger(__name__)
-_PERIOD_S = 0.4  # from one check to the next; each takes some 40 ms of a core
+_PERIOD_S = 0.4  # from one check to the next; each takes some 20 ms of a core
 _NICE = 10
 _IN_A_ROW = 3  # checks that agree: an arm before the lens is no camera that moved
 _UNSEEN_S, _HOLD_S = 5.0, 1.0

@@ -49,7 +49,7 @@ def calibrate_view(
     """Find where the camera of a reference picture stood, for a canonical view.
 
     Both cameras must see the same things from places that are not too far apart, some 15 cm and 15 degrees at a table.
-    Ends with 65 if they do not, 66 without a source, 78 with a wrong setting.
+    Ends with 65 if they do not, 66 without a source, 78 with a wrong setting or no such reference.
     """
     config = _config(source, reference, hfov_deg, calibration, changes or ())
     with Console(stderr=True, markup=False).status("looking"):
@@ -97,6 +97,8 @@ def _landmarks(config: NodeConfig, count: int) -> tuple[list[Landmarks], Referen
     patience.start()
     try:
         context = prepare_stream(config, model.traits, source.info)
+        if context.lens is None and source.info.hfov_in_use(config.source.hfov_deg) is None:
+            raise ConfigError("[source]: a pose takes a known lens; state hfov_deg or calibration of the source")
         reference, encoded = context.references[_VIEW], EncodedFrames(lambda: None)
         known: list[Landmarks] = []
         for frame in islice(_apart(source.frames()), count):

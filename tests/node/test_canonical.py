@@ -233,6 +233,7 @@ def test_calibrate_view_writes_a_pose_or_says_in_its_exit_code_why_not(
     write_png(folder / "other.png", shot(HERE, seed=3)[0])
     launch = folder / "launch.toml"
     source = f'[source]\nkind = "folder"\npath = "{folder}/source"\nfps = 5.0\nhfov_deg = 60.0\n'
+    (folder / "no_lens.toml").write_text(source.replace("hfov_deg = 60.0\n", "") + '[model]\nweights = "random:live"\n')
     launch.write_text(source + '[model]\nweights = "package:live-small"\nthreads = 1\n[view.main]\n')
 
     def code(reference: str, *more: str) -> int:
@@ -249,6 +250,7 @@ def test_calibrate_view_writes_a_pose_or_says_in_its_exit_code_why_not(
         ("other.png", lens, 65),
         ("missing.png", lens, 78),
         ("same.png", (), 64),
+        ("same.png", (*lens, "--source", str(folder / "no_lens.toml")), 78),
         ("same.png", (*lens, "--set", "source.path=/missing"), 66),
         ("same.png", (*lens, "--set", "model.weights=random:kubric90"), 78),
     ):
