@@ -26,6 +26,7 @@ _NICE = 10
 _IN_A_ROW = 3  # checks that agree: an arm before the lens is no camera that moved
 _UNSEEN_S, _HOLD_S = 5.0, 1.0
 _MOVED_CM, _MOVED_DEG = 0.5, 0.5  # a step, a turn; and a shift of the picture as by such a step to the side
+_PREFERRED = 0.7  # of the corners: things that the arm carries pull a pose, and the others do not follow
 _FROM_REFERENCE, _SIGMAS = 4.0, 3.0  # so many times that, and surer: other light, other things and a learned depth
 
 
@@ -220,7 +221,7 @@ def _is_beyond(found: Alignment, expected: Tensor, times: float = 1.0, sigmas: f
     """Whether the camera surely stands farther from there than it may, or so many times farther."""
     move = found.moved_from(expected)
     aside_px = found.lens.fx * _MOVED_CM / 100 / float(np.median(found.inliers.point[:, 2]))
-    return (
+    return found.preference(expected) > _PREFERRED and (
         move.centimetres - sigmas * move.doubt_centimetres > times * _MOVED_CM
         or move.degrees - sigmas * move.doubt_degrees > times * _MOVED_DEG
         or move.pixels - sigmas * move.doubt_pixels > times * aside_px

@@ -117,6 +117,16 @@ class Alignment:
             doubt_centimetres=100 * math.sqrt(variance[:3].sum()),
         )
 
+    def preference(self, expected: Tensor) -> float:
+        """The share of inliers that lie nearer to where this pose has them than to where `expected`, [4, 4], has them:
+        about a half by chance, whatever a few of them pull the pose to; 1 for a camera that moved."""
+        seen = self.inliers
+        here, there = (
+            np.linalg.norm(seen.place - projected(seen.point, pose.numpy(), self.lens)[1], axis=1)
+            for pose in (self.pose, expected)
+        )
+        return float((here < there).mean())
+
 
 def features(picture: Array, lens: Intrinsics) -> Features:
     """Of a picture u8 [H, W, 3], RGB. Raises AlignmentError: there are next to none."""
@@ -192,6 +202,7 @@ def align(known: Sequence[Landmarks], seen: Sequence[Features]) -> Alignment:
     inliers = tracks.rows(agree)
     covariance = _covariance(inliers, coarse, pose, len(pairs))
     _require_sure(inliers, pose, covariance)
+    inliers = replace(inliers, place=(inliers.place + 0.5) / scale - 0.5)
     return Alignment(
         pose=torch.from_numpy(pose), matches=len(tracks), inliers=inliers, covariance=covariance, lens=lens
     )
