@@ -147,7 +147,7 @@ class _Look:
         if traits is None or info is None:
             raise _DoubtfulError("not looked at: that takes the source and the weights")
         context = prepare_stream(config, traits, info)
-        VirtualViews(traits).sync(LiveConfig(config).settings(), context.mount)
+        VirtualViews(traits).sync(LiveConfig(config).settings(), context.mount, context.references)
         frames, names = traits.config.frames, ", ".join(config.view)
         line = f"{names}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {context.fps:g} FPS"
         line = "; ".join(filter(None, (line, in_words(context.mount, config.source.pose, traits))))

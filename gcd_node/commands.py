@@ -11,14 +11,15 @@ from gcd_client.control import Code
 from gcd_client.protocol import PROTO
 from gcd_model import ModelError, SphericalDelta, Traits, ViewFixedError, ViewRangeError, nearest_delta
 from gcd_node.auth import Role
-from gcd_node.config import ViewConfig, pose_matrix, without_secrets
+from gcd_node.config import without_secrets
 from gcd_node.health import Level
 from gcd_node.lifecycle import Transitions, Verb
 from gcd_node.preprocess import stated_sphere
 from gcd_node.recorder import Recorder
 from gcd_node.status import Announcer, calibration
 from gcd_node.stream_context import config_digest
-from gcd_node.verbs import Command, Outcome, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
+from gcd_node.verbs import AlignView, Command, Outcome, RemoveView, RequestError, SetParam, SetPose, SetView, schemas
+from gcd_node.view_config import ViewConfig, pose_matrix
 from gcd_node.views import LiveConfig, VirtualView
 
 _TOLERATED_DEG = 2.0
@@ -61,6 +62,8 @@ class NodeCommands:
                 return self._record(begin=verb == "record_start", dry_run=command.dry_run)
             case _ if isinstance(args, SetView | SetPose):
                 return self._set_view(args, command)
+            case _ if isinstance(args, AlignView):
+                return self._align_view(args, command)
             case _ if isinstance(args, RemoveView):
                 return self._remove_view(args, command)
             case _ if isinstance(args, SetParam):
@@ -138,6 +141,17 @@ class NodeCommands:
         result["view_rev"] = live.set_view(args.view, view)
         self._after_change("VIEW_SET", result)
         return Outcome(result=result)
+
+    def _align_view(self, args: AlignView, command: Command) -> Outcome:
+        view, stream = self._live.config.view.get(args.view), self._transitions.stream
+        if view is None or view.kind != "canonical":
+            raise _unknown(args.view, tuple(k for k, v in self._live.config.view.items() if v.kind == "canonical"))
+        self._require_revision(args.view, command.if_view_rev)
+        if stream is None or stream.drift is None:
+            raise RequestError("the camera is looked at while the node is active: activate first", Code.NOT_READY)
+        if not command.dry_run:
+            stream.drift.request(args.view)
+        return Outcome(code=Code.ACCEPTED, message="an event tells when it has")
 
     def _remove_view(self, args: RemoveView, command: Command) -> Outcome:
         views = self._live.settings().revisions

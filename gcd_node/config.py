@@ -1,6 +1,5 @@
 """The node's settings, as a launch file states them (TOML): one page with every section of a launch file."""
 
-import math
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePath
@@ -12,16 +11,13 @@ from msgspec import Meta
 
 from gcd_node.errors import ConfigError
 from gcd_node.sources import Count, Positive, Rate, SourceConfig, prepare_source
+from gcd_node.view_config import ViewConfig, ViewId, prepare_views
 
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
-Matrix: TypeAlias = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
-Pose: TypeAlias = tuple[float, ...]
-_FARTHEST_M = 10_000.0
 _HIDDEN = "***"
 Table: TypeAlias = dict[str, object]
 """A TOML table: keys to plain values, lists and tables."""
-ViewId: TypeAlias = Annotated[str, Meta(pattern=r"^(?!src$)[a-z0-9_]{1,16}$(?!\n)")]  # src is the input
 
 
 class WindowConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,78 +94,6 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         low, high = self.guidance_interval or (0.0, 0.0)
         if low > high:
             raise ValueError(f"guidance_interval goes from a noise level up to another, got {low:g} to {high:g}")
-
-
-class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A virtual camera.
-
-    kind: of a fixed view the goal is stated as differences from the source camera; none for a checkpoint with one fixed
-        view, or for the live model's view from above and behind.
-    orbit: starts there and swings in azimuth by rate_deg_s, between -amplitude_deg and +amplitude_deg.
-    position_m, look_at_m: of a fixed view, instead of differences, for models that take any pose: where it stands and
-        what it looks at, (x, y, z) in the frame of what the source camera is mounted on (x ahead, y left, z up, the
-        ground at z = 0).
-    pose: of kind "pose", the view's camera in the source camera's axes (x right, y down, z ahead; metres for models
-        that know them): x, y, z and a quaternion x, y, z, w, or the 16 numbers of a rigid 4x4 matrix row by row.
-    """
-
-    kind: Literal["fixed", "orbit", "pose"] = "fixed"
-    azimuth_deg: float = 0.0
-    elevation_deg: float = 0.0
-    radius: float = 0.0
-    position_m: tuple[float, float, float] | None = None
-    look_at_m: tuple[float, float, float] | None = None
-    pose: Pose | None = None
-    rate_deg_s: float | None = None
-    amplitude_deg: Positive | None = None
-
-    def __post_init__(self) -> None:
-        if (self.position_m is None) != (self.look_at_m is None):
-            raise ValueError("position_m says where a view stands, look_at_m what it looks at: state both")
-        if sum([self.position_m is not None, self.pose is not None, not self.at_source]) > 1:
-            raise ValueError("a goal is angles and radius, or position_m and look_at_m, or pose: state one of them")
-        if (self.pose is not None) != (self.kind == "pose"):
-            raise ValueError('kind = "pose" goes with pose, x, y, z and a quaternion x, y, z, w: state both')
-        if self.pose is not None:
-            pose_matrix(self.pose)
-        if self.kind == "orbit" and self.position_m is not None:
-            raise ValueError('an orbit swings about the scene: leave position_m to kind = "fixed"')
-        if {self.rate_deg_s is not None, self.amplitude_deg is not None} != {self.kind == "orbit"}:
-            raise ValueError('an orbit needs rate_deg_s and amplitude_deg, which are for kind = "orbit" alone')
-
-    @property
-    def at_source(self) -> bool:
-        """Whether there is no difference of angles and radius."""
-        return (self.azimuth_deg, self.elevation_deg, self.radius) == (0.0, 0.0, 0.0)
-
-    @property
-    def plain(self) -> dict[str, object]:
-        """Plain values; of position_m, look_at_m and pose, which came later, those that are stated."""
-        later = ("position_m", "look_at_m", "pose")
-        plain: dict[str, object] = msgspec.to_builtins(self)
-        return {name: value for name, value in plain.items() if name not in later or value is not None}
-
-
-def pose_matrix(pose: Pose) -> Matrix:
-    """A view's pose as the 16 numbers of a 4x4 matrix, row by row; whether a matrix is rigid, the model looks at.
-
-    Raises ValueError: neither 7 nor 16 numbers, not finite, farther than 10 km away, or a quaternion not of length 1.
-    """
-    if len(pose) not in (7, 16) or not all(map(math.isfinite, pose)):
-        raise ValueError("a pose is 7 numbers, x, y, z and a quaternion x, y, z, w, or 16 of a 4x4 matrix, all finite")
-    if max(map(abs, pose)) > _FARTHEST_M:
-        raise ValueError(f"a pose lies within {_FARTHEST_M:.0f} m of the source camera, got {max(map(abs, pose)):g}")
-    if len(pose) == 16:
-        return pose
-    (a, b, c), (x, y, z, w) = pose[:3], pose[3:]
-    if not math.isclose(math.hypot(x, y, z, w), 1.0, abs_tol=1e-3):
-        raise ValueError(f"a quaternion x, y, z, w has length 1, got {math.hypot(x, y, z, w):g}")
-    return (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), a),
-        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), b),
-        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), c),
-        *(0.0, 0.0, 0.0, 1.0),
-    )
 
 
 class PublishConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -319,6 +243,7 @@ def parse_config(text: str | bytes, name: str, changes: Sequence[str] = ()) -> N
         for change in changes:
             _make_change(table, change)
         prepare_source(table, name)
+        prepare_views(table, name)
         return msgspec.convert(table, NodeConfig, strict=True)
     except msgspec.ValidationError as error:
         words = re.sub(

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from gcd_client.protocol import ClassRecord
 from gcd_model import Traits, hatched
-from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig, ViewerConfig
+from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewerConfig
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
 from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_png, write_video
@@ -25,6 +25,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.session import open_session, run_until_signal
 from gcd_node.sources import FileSource, SourcePose
 from gcd_node.sources.files import read_picture
+from gcd_node.view_config import ViewConfig
 
 VIEW_ID = "topdown"
 WEIGHTS = "package:live-small"

@@ -70,7 +70,8 @@ class Health:
     state: the lifecycle's, lower case (lifecycle.State.label). model: the model's. recording: how it does.
     counts: by the names of Count, and "frames" that arrived whole, "corrupt" ones, "reconnects" and windows "built".
     faults: what spoilt how many windows. gpu_mem_mb: the device's memory in use. ood_score: how unlike the training the
-    last window looked to the model. None: unknown.
+    last window looked to the model. camera: how far it stands from where canonical views take it to stand. None:
+    unknown.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
@@ -82,6 +83,7 @@ class Health:
         self.faults: Mapping[str, int] = {}
         self.gpu_mem_mb: float | None = None
         self.ood_score: float | None = None
+        self.camera: Mapping[str, float] | None = None
         self._clock, self._lock = clock, threading.Lock()
         self._source: SourceState = "closed"
         self._lost = False
@@ -239,6 +241,7 @@ class Health:
                     for view_id, at in self._views.items()
                 },
                 "rec": {"state": rec.state} if rec.file is None else asdict(rec),
+                **({} if self.camera is None else {"camera": dict(self.camera)}),
             }
 
     # What follows is called with the lock held.

@@ -23,6 +23,7 @@ from gcd_model import (
     Trajectory,
     View,
 )
+from gcd_node.drift import DriftDetector
 from gcd_node.encoded_frames import EncodedFrames, window_seed
 from gcd_node.errors import DepthError, RemoteError
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
@@ -90,8 +91,9 @@ class Renderer:
         model: ModelSlot,
         context_at: Callable[[int], StreamContext],
         on_window: Callable[[WindowReport], None] | None = None,
+        drift: DriftDetector | None = None,
     ) -> None:
-        """context_at: what is known of the source in an epoch; -1 for now.
+        """context_at: what is known of the source in an epoch; -1 for now. drift: is shown every frame that was seen.
 
         Raises:
             OptionError, PoseError: see VirtualView.
@@ -99,10 +101,10 @@ class Renderer:
         self.counts, self.cancel = WorkCounts(), threading.Event()
         """cancel: set to abandon what is in work."""
         self._model, self._context_at, self._on_window = model, context_at, on_window
-        self._live, self._health = live, announcer.health
+        self._live, self._health, self._drift = live, announcer.health, drift
         self._out = EndOfStream(live, announcer.sink, lambda: context_at(-1))
         self._views = VirtualViews(model.traits)
-        self._views.sync(live.settings(), context_at(-1).mount)
+        self._views.sync(live.settings(), context_at(-1).mount, context_at(-1).references)
         self._failures = FailureCounter(announcer)
         self._given_up = self._failures.given_up
         self.pulse = Pulse(announcer.health, self._given_up)
@@ -122,10 +124,10 @@ class Renderer:
     def warm_up(self) -> None:
         """Render a grey clip in one step; of a model that computes elsewhere, with its fallback alone. Raises
         NonFiniteError, DeviceMemoryError."""
-        settings, mount = self._live.settings(), self._context_at(-1).mount
-        paths = [view.planned() for view in self._views.sync(settings, mount)]
-        if (local := self._model.local) is not None:
-            render_grey(local, paths, mount, self._options(settings, 0, steps=1))
+        settings, context = self._live.settings(), self._context_at(-1)
+        paths = [view.planned() for view in self._views.sync(settings, context.mount, context.references)]
+        if paths and (local := self._model.local) is not None:
+            render_grey(local, paths, context.mount, self._options(settings, 0, steps=1))
 
     def encode_ahead(self, filling: PartialWindow) -> bool:
         """Encode one frame of the window that fills; False if there is nothing to do. Raises DeviceMemoryError."""
@@ -138,12 +140,15 @@ class Renderer:
                 raise
 
     def take(self, window: FrameWindow) -> tuple[Job, Seen] | None:
-        """What of a window is needed for every view. None if its depth is not to be trusted."""
+        """What of a window is needed for every view. None if its depth is not to be trusted or there is no view."""
         with self._seeing:
             self.pulse.beat()
             job = self._job(window)
             try:
-                return job, self._seen(job)
+                seen = self._seen(job)
+                if self._drift is not None and not isinstance(seen, SourceFeatures | Failure):
+                    self._drift.offer(seen[-1])
+                return (job, seen) if job.views else None
             except DepthError:  # it is known already: see _count_bad_depth
                 self._health.count("model")
                 return None
@@ -197,7 +202,7 @@ class Renderer:
         """A command that comes from here on is for the next window."""
         settings = self._live.settings()
         context = self._context(settings, window.epoch)
-        views = self._views.sync(settings, context.mount)
+        views = self._views.sync(settings, context.mount, context.references)
         views = views[:1] if "a single view" in self._given_up else views
         paths = [view.trajectory(window.stamps_ns[-1], window.epoch) for view in views]
         return Job(
@@ -315,6 +320,7 @@ class Renderer:
                 steps=steps,
                 seed=seed,
                 utc_offset_ns=offset_ns,
+                flags=("moved",) if self._drift is not None and virtual.view_id in self._drift.moved else (),
             )
             self._out.send(messages(context, rendered))
             age_s = (time.monotonic_ns() - newest_ns(context, job.window)) / 1e9

@@ -54,7 +54,7 @@ _NO_MODEL = ModelRecord(name="none", family="unknown", sha256_12="0" * 12, preci
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Rendered:
     """One view of one window. started_ns, ended_ns: of the inference, monotonic clock. steps, seed: of the sampler.
-    utc_offset_ns: UTC minus the monotonic clock, sampled once for the whole window."""
+    utc_offset_ns: UTC minus the monotonic clock, sampled once for the whole window. flags: see QualityRecord.ood."""
 
     window: FrameWindow
     view: View
@@ -65,6 +65,7 @@ class Rendered:
     steps: int
     seed: int
     utc_offset_ns: int
+    flags: tuple[str, ...] = ()
 
 
 def utc_offset_ns() -> int:
@@ -197,6 +198,7 @@ def _common(context: StreamContext) -> dict[str, Any]:
 def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
     window, view, traits, source = rendered.window, rendered.view, context.traits, context.source
     path, offset_ns = view.trajectory, rendered.utc_offset_ns
+    camera = path.lens or context.intrinsics
     now_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
     period_ms = 1000.0 * (context.config.window.stride or path.frames) / window.fps
     to_utc_ns = offset_ns if source.clock == "realtime" else 0
@@ -230,7 +232,7 @@ def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
         encoding="rgb8",
         quality=QualityRecord(
             nan_frames=0,
-            ood=(*context.ood, *_input_flags(window), *world_flags(traits, view)),
+            ood=(*context.ood, *_input_flags(window), *world_flags(traits, view), *rendered.flags),
             steps=rendered.steps,
             seed=rendered.seed,
             ood_score=view.ood,
@@ -245,7 +247,7 @@ def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
         pose=_deltas(path),
         source_from_view=_matrices(path) if traits.knows_camera else None,
         src_pose=source_pose(context),
-        intrinsics=None if context.intrinsics is None else camera_matrix(context.intrinsics),
+        intrinsics=None if camera is None else camera_matrix(camera),
     )
 
 

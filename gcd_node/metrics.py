@@ -163,6 +163,8 @@ def _rows(health: Health, status: dict[str, Any]) -> Iterable[Row]:
     yield counter, "model_out_of_memory", "Windows the model found no memory for.", "", {"": model["oom_count"]}
     yield counter, "model_nan_windows", "Windows that came out with NaN.", "", {"": model["nan_windows"]}
     yield gauge, "view_last_published_seconds", "Since a view was published.", "view", ages_s
+    moved, text = status.get("camera", {}), "How far the camera stands from where canonical views take it to stand."
+    yield gauge, "camera_moved", text, "of", moved
     yield gauge, "subscriptions", "Subscriptions on the data socket.", "", {"": publish["subs"]}
     yield counter, "messages_sent", "Messages that left on the data socket.", "", {"": publish["sent"]}
     yield counter, "bytes_sent", "Bytes that left on the data socket.", "", {"": publish["bytes"]}

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from gcd_model import ModelError
+from gcd_node.drift import DriftDetector
 from gcd_node.errors import (
     ConfigError,
     EndpointError,
@@ -81,7 +82,8 @@ class Stream:
             first: window id and epoch to go on from: neither may come twice in one life of a node.
             recorder: is shown every frame.
         Raises:
-            ConfigError: see prepare_stream(). OptionError, PoseError: see VirtualView.
+            ConfigError: see prepare_stream(). OptionError, PoseError: see VirtualView. AlignmentError: see
+                DriftDetector.
         """
         self._live, self._health, self._announcer = live, announcer.health, announcer
         self._model, self._recorder = model, recorder
@@ -102,12 +104,17 @@ class Stream:
         self._newest = WindowSlot(lossless=config.source.pace == "lockstep")
         self._watch = SourceWatch(source, reopen, self, config.source)
         self._preview = InputPreview(announcer.sink, lambda: self.context)
-        self.renderer = Renderer(live, announcer, model, self.context_at, on_window)
+        self.drift: DriftDetector | None = None
+        if context.references and config.source.pace == "realtime":
+            self.drift = DriftDetector(live, announcer, context.references, self.notice_change)
+        self.renderer = Renderer(live, announcer, model, self.context_at, on_window, self.drift)
         self.worker = ModelWorker(live, announcer, model, self.renderer)
         self._threads = [
             threading.Thread(target=self._work, name="model", daemon=True),
             threading.Thread(target=read, args=(self._watch, self._builder, self._newest), name="reader", daemon=True),
         ]
+        if self.drift is not None:
+            self._threads.append(threading.Thread(target=self.drift.run, name="drift", daemon=True))
         self._reported: dict[str, int] = {}
         self._state: SourceState = "closed"
         self._stopped = self.over = False
@@ -153,6 +160,7 @@ class Stream:
         camera that does not answer."""
         self._stopped = True
         self.renderer.cancel.set()
+        self._stop_drift()
         self._newest.close()
         self._watch.close()
 
@@ -273,7 +281,12 @@ class Stream:
         finally:
             self._newest.close()
             self._watch.close()
+            self._stop_drift()
             self.over = True
+
+    def _stop_drift(self) -> None:
+        if self.drift is not None:
+            self.drift.stop()
 
 
 def ending(failure: Exception | None, *, stopped: bool) -> tuple[str, SourceState]:

@@ -4,8 +4,8 @@ views are drawn."""
 import hashlib
 import logging
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from gcd_model import (
     Sampler,
     Traits,
 )
+from gcd_node.canonical import Reference, load_references
 from gcd_node.config import ModelSection, NodeConfig
 from gcd_node.errors import ConfigError
 from gcd_node.frame import LensModel, SourceInfo, load_lens
@@ -50,7 +51,7 @@ class StreamContext:
     mount: of the source camera, for a model that uses it; None if nothing was stated.
     ood: what lies outside the trained domain from the start: "fps", "hfov".
     fit: how source pictures become the model's. lens: the calibration in use, maybe for pictures of another size.
-    depth: what takes the place of the live model's own depth; None for that.
+    depth: what takes the place of the live model's own depth; None for that. references: of canonical views, by name.
     """
 
     config: NodeConfig
@@ -64,6 +65,7 @@ class StreamContext:
     fit: Fit | Rectifier
     lens: LensModel | None
     depth: DepthSource | None = None
+    references: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
 
     @cached_property
     def digest(self) -> str:
@@ -83,8 +85,8 @@ def prepare_stream(
     Raises:
         ConfigError: weights that want depth; a frame rate the source cannot give; a source pose in words the model does
             not know; pictures that are too small; a calibration that is unusable, for other pictures, or stated beside
-            hfov_deg; a depth network that cannot be used; in strict mode, a rate or field of view the model was not
-            trained for.
+            hfov_deg; a depth network, or the reference of a canonical view, that cannot be used; in strict mode, a rate
+            or field of view the model was not trained for.
     """
     if traits.splat == "given":
         raise ConfigError(
@@ -116,6 +118,7 @@ def prepare_stream(
         fit=fit,
         lens=lens,
         depth=before.depth if before is not None and before.mount == mount else _depth_network(config, traits, mount),
+        references=load_references(config) if before is None else before.references,
     )
 
 

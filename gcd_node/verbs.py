@@ -19,7 +19,8 @@ from msgspec import UNSET, Meta, UnsetType
 from gcd_client.control import MAX_REQUEST, Code, ControlError, Request, RequestId
 from gcd_client.protocol import LARGEST_INTEGER, MessageError, check_version
 from gcd_node.auth import Role
-from gcd_node.config import Matrix, Pose, Positive, ViewConfig, pose_matrix
+from gcd_node.sources import Positive
+from gcd_node.view_config import Matrix, Pose, ViewConfig, pose_matrix
 
 ViewName: TypeAlias = Annotated[str, Meta(pattern=r"^[a-z0-9_]{1,16}$(?!\n)")]
 _Scale: TypeAlias = Annotated[float, Meta(ge=0, le=100)]
@@ -72,6 +73,12 @@ class SetPose(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def to_config(self) -> ViewConfig:
         """The view as a launch file states it."""
         return ViewConfig(kind="pose", pose=self.pose)
+
+
+class AlignView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Let the pose of a canonical view follow a source camera that was moved; an event tells how that went."""
+
+    view: ViewName
 
 
 class RemoveView(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -146,6 +153,7 @@ VERBS: Mapping[str, Verb] = types.MappingProxyType(
         ),
         "set_view": Verb(arguments=SetView, role="operator"),
         "set_pose": Verb(arguments=SetPose, role="operator"),
+        "align_view": Verb(arguments=AlignView, role="operator"),
         "remove_view": Verb(arguments=RemoveView, role="operator"),
         "set_param": Verb(arguments=SetParam, role="operator"),
     }

@@ -5,18 +5,21 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import get_args
 
 import msgspec
 import torch
 
 from gcd_client.protocol import PREVIEW_ID, PREVIEW_TOPIC, ViewKind, ViewMessage, view_topic
-from gcd_model import CameraMount, OptionError, Orbit, SphericalDelta, Traits, Trajectory
-from gcd_node.config import ModelSection, NodeConfig, PublishConfig, ViewConfig, pose_matrix
+from gcd_model import CameraMount, Intrinsics, OptionError, Orbit, SphericalDelta, Traits, Trajectory
+from gcd_node.canonical import Reference
+from gcd_node.config import ModelSection, NodeConfig, PublishConfig
 from gcd_node.frame import Frame
 from gcd_node.messages import PREVIEW_PERIOD_S, MessageSink, end_message, preview_message
 from gcd_node.preprocess import stated_sphere
 from gcd_node.stream_context import StreamContext, published_kinds
+from gcd_node.view_config import ViewConfig, pose_matrix
 
 _LEAST = 0.9  # of a period between two previews, so that a camera's jitter does not make it miss every second one
 
@@ -59,9 +62,11 @@ class LiveConfig:
         """Of a view there is or has been; 0 for others."""
         return self._revisions.get(view_id, 0)
 
-    def set_view(self, view_id: str, view: ViewConfig) -> int:
-        """Replace or add a view; gives its new revision."""
+    def set_view(self, view_id: str, view: ViewConfig, instead_of: ViewConfig | None = None) -> int | None:
+        """Replace or add a view; gives its new revision. None, and nothing changes: it is no longer `instead_of`."""
         with self._lock:
+            if instead_of is not None and self.config.view.get(view_id) is not instead_of:
+                return None
             self._revisions[view_id] = self._revisions.get(view_id, 0) + 1
             self._replace(view={**self.config.view, view_id: view})
             return self._revisions[view_id]
@@ -90,19 +95,29 @@ class VirtualView:
     """
 
     def __init__(
-        self, view_id: str, config: NodeConfig, traits: Traits, mount: CameraMount | None = None, rev: int = 1
+        self,
+        view_id: str,
+        config: NodeConfig,
+        traits: Traits,
+        mount: CameraMount | None = None,
+        rev: int = 1,
+        lens: Intrinsics | None = None,
     ) -> None:
-        """Check that the checkpoint can give it. mount: of the source camera, None for the trained one.
+        """Check that the checkpoint can give it. mount: of the source camera, None for the trained one. lens: of the
+        view, None for the source's.
 
         Raises:
             ViewRangeError, ViewFixedError: it cannot. PoseError: no camera has that pose. OptionError: an impossible
             orbit, or the motion number cannot be worked out and was not given; or places on a vehicle for a camera that
-            is declared on a sphere.
+            is declared on a sphere; or a canonical view of another model than the live one.
         """
         self.view_id, self.rev = view_id, rev
         self._traits, self._mount, self._source = traits, mount, stated_sphere(config.source.pose)
+        self._lens = lens
         self._move_time = traits.move_time if config.model.move_time is None else config.model.move_time
         view = self._view = config.view[view_id]
+        if view.kind == "canonical" and not traits.live:
+            raise OptionError(f'[view.{view_id}] kind = "canonical" is for the live model; take package:live-small')
         self._goal = SphericalDelta(
             azimuth_deg=view.azimuth_deg, elevation_deg=view.elevation_deg, radius_m=view.radius
         )
@@ -149,7 +164,8 @@ class VirtualView:
             return traits.plan_placed(view.position_m, view.look_at_m, mount=self._mount)
         if view.pose is not None:
             pose = torch.tensor(pose_matrix(view.pose), dtype=torch.float64).view(4, 4)
-            return traits.plan_poses(pose.repeat(traits.config.frames, 1, 1), source=self._source)
+            path = traits.plan_poses(pose.repeat(traits.config.frames, 1, 1), source=self._source)
+            return path if self._lens is None else replace(path, lens=self._lens)
         own = traits.live and self._orbit is None and view.at_source
         return traits.plan_view(
             None if own else goal, source=self._source, move_time=self._move_time, mount=self._mount
@@ -163,16 +179,26 @@ class VirtualViews:
         self._traits = traits
         self._made: dict[str, tuple[CameraMount | None, VirtualView]] = {}
 
-    def sync(self, settings: Settings, mount: CameraMount | None = None) -> list[VirtualView]:
-        """The views now; an orbit whose view has not changed goes on from where it was.
+    def sync(
+        self,
+        settings: Settings,
+        mount: CameraMount | None = None,
+        references: Mapping[str, Reference] = MappingProxyType({}),
+    ) -> list[VirtualView]:
+        """The views now, but for canonical ones whose pose is not known yet; an orbit whose view has not changed goes
+        on from where it was.
 
         Raises: as VirtualView.
         """
-        for view_id, rev in settings.revisions.items():
-            made = self._made.get(view_id)
+        views = settings.config.view
+        drawn = [each for each in settings.revisions if views[each].kind != "canonical" or views[each].pose is not None]
+        for view_id in drawn:
+            made, rev = self._made.get(view_id), settings.revisions[view_id]
             if made is None or (made[0], made[1].rev) != (mount, rev):
-                self._made[view_id] = (mount, VirtualView(view_id, settings.config, self._traits, mount, rev))
-        return [self._made[view_id][1] for view_id in settings.revisions]
+                lens = references[view_id].view if views[view_id].kind == "canonical" and references else None
+                view = VirtualView(view_id, settings.config, self._traits, mount, rev, lens)
+                self._made[view_id] = (mount, view)
+        return [self._made[view_id][1] for view_id in drawn]
 
 
 class EndOfStream:

@@ -23,11 +23,12 @@ from typer.main import get_command
 
 from gcd_client.control import Code, decode_reply
 from gcd_node.cli.main import COMMANDS, new_app
-from gcd_node.config import NodeConfig, ViewConfig, parse_config
+from gcd_node.config import NodeConfig, parse_config
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health
 from gcd_node.sources import SourceConfig, SourcePose
 from gcd_node.verbs import VERBS, RequestError, parse_command
+from gcd_node.view_config import ViewConfig
 from gcd_train.cli.main import app as train_app
 
 ROOT = Path(__file__).parents[1]

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from gcd_model import NonFiniteError, RenderOptions, SourceFeatures, Traits, View
 from gcd_model.config import SVD_14
 from gcd_model.weights.card import FAMILIES
-from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig, ViewConfig
+from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig
 from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.inference import WindowReport
@@ -25,6 +25,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.session import open_session
 from gcd_node.sources import V4l2Source
 from gcd_node.sources.live import LiveCamera
+from gcd_node.view_config import ViewConfig
 
 VIEW = "soak"
 WIDTH, HEIGHT, FPS = 384, 256, 24.0

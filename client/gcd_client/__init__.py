@@ -2,6 +2,7 @@
 write its messages (protocol).
 
 gcd_client.images and .frames need numpy; `view.images`, FramePusher and their like import them when they are used.
+gcd_client.lerobot, a camera for LeRobot's robots, needs lerobot.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,17 +14,22 @@ from gcd_client.subscriber import ReceivedView, StatusSubscriber, ViewSubscriber
 
 if TYPE_CHECKING:
     from gcd_client.frames import FramePusher
+    from gcd_client.lerobot import GcdCamera
 
 __all__ = [
-    "AuthError", "ClientError", "ClientKeys", "ControlClient", "ControlError", "FramePusher", "MessageError",
-    "ReceivedView", "Reply", "SetupError", "StatusMessage", "StatusSubscriber", "ViewHeader", "ViewMessage",
-    "ViewSubscriber", "read_key_pair", "read_public_key",
+    "AuthError", "ClientError", "ClientKeys", "ControlClient", "ControlError", "FramePusher", "GcdCamera",
+    "MessageError", "ReceivedView", "Reply", "SetupError", "StatusMessage", "StatusSubscriber", "ViewHeader",
+    "ViewMessage", "ViewSubscriber", "read_key_pair", "read_public_key",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    if name != "FramePusher":
-        raise AttributeError(f"gcd_client has no {name}")
-    from gcd_client.frames import FramePusher
+    if name == "FramePusher":
+        from gcd_client.frames import FramePusher
 
-    return FramePusher
+        return FramePusher
+    if name == "GcdCamera":  # LeRobot looks for it here, by the name of its config
+        from gcd_client.lerobot import GcdCamera
+
+        return GcdCamera
+    raise AttributeError(f"gcd_client has no {name}")

@@ -24,6 +24,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run:run", "Run the node on a launch file, until its recording ends or it is told to."),
     "serve": ("run:serve", "Serve a model to many nodes, on Ray Serve: one replica a GPU."),
     "check": ("run:check", "Look at all that a launch file needs, before anything is started; loads no weights."),
+    "calibrate-view": (
+        "calibrate:calibrate_view",
+        "Find where the camera of a reference picture stood, for a canonical view.",
+    ),
     "view": ("watch:view", "Watch the views of a node: a live table, and with --save pictures on disk."),
     "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
     "replay": (
@@ -154,6 +158,7 @@ def _exit_code(error: Exception) -> int | None:
     if isinstance(error, OSError) and error.filename:
         return SourceError.exit_code
     codes = {"OptionError": 64, "PoseError": 64, "CheckpointError": 65, "ShapeError": 65, "Cancelled": 130}
+    codes |= {"AlignmentError": 65, "FileError": 78}
     codes["ModelError"] = 70  # the root of them; by name, as their package brings torch
     kinds = [kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "gcd_model.errors"]
     return next((codes[kind] for kind in kinds if kind in codes), None)

@@ -12,6 +12,7 @@ from gcd_model.conditioning import SourceFeatures
 from gcd_model.diffusion import RenderOptions, Sampler
 from gcd_model.engines.onnx_export import is_export
 from gcd_model.errors import (
+    AlignmentError,
     Cancelled,
     CheckpointError,
     DeviceMemoryError,
@@ -31,7 +32,18 @@ from gcd_model.geometry import (
     SphericalDelta,
     Trajectory,
     center_crop_box,
+    invert_rigid,
     nearest_delta,
+)
+from gcd_model.live.alignment import (
+    Alignment,
+    CameraMove,
+    Features,
+    Landmarks,
+    align,
+    features,
+    landmarks,
+    landmarks_of,
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.eyes import PlacedFrame, SeenFrame
@@ -44,16 +56,21 @@ from gcd_model.weights.card import Card
 from gcd_model.weights.load import WeightsReport, convert_weights, inspect_weights
 
 __all__ = [
+    "Alignment",
+    "AlignmentError",
     "Augmentation",
     "CameraMount",
+    "CameraMove",
     "Cancelled",
     "Card",
     "CheckpointError",
     "Clip",
     "DeviceMemoryError",
+    "Features",
     "FileError",
     "FrameSynthesizer",
     "Intrinsics",
+    "Landmarks",
     "ModelError",
     "NonFiniteError",
     "OptionError",
@@ -73,14 +90,19 @@ __all__ = [
     "ViewRangeError",
     "ViewSynthesizer",
     "WeightsReport",
+    "align",
     "center_crop_box",
     "convert_weights",
     "decode_toml",
     "explain_settings_error",
     "export_weights",
+    "features",
     "hatched",
     "inspect_weights",
+    "invert_rigid",
     "is_export",
+    "landmarks",
+    "landmarks_of",
     "load_synthesizer",
     "nearest_delta",
     "placement",

@@ -6,6 +6,7 @@
     │   ├── ViewRangeError    a view lies outside the limits the checkpoint was trained for
     │   └── ViewFixedError    the checkpoint has one fixed view and takes no camera command
     ├── CheckpointError   a file is missing, damaged, hostile or of another architecture
+    ├── AlignmentError    two pictures do not tell where one camera stands in the axes of the other
     ├── FileError         a small text file cannot be read or decoded; also a ValueError
     ├── OptionError       a setting is missing, unknown or contradicts the checkpoint; also a ValueError
     ├── DeviceMemoryError the device ran out of memory; what it held for the call is free again
@@ -45,6 +46,10 @@ class ViewFixedError(PoseError):
 
 class CheckpointError(ModelError):
     """A file is missing, damaged, hostile or of another architecture. Nothing was loaded."""
+
+
+class AlignmentError(ModelError):
+    """Two pictures do not tell where one camera stands in the axes of the other."""
 
 
 class FileError(ModelError, ValueError):

@@ -175,6 +175,7 @@ EXAMPLES: dict[str, dict[str, object]] = {
     "set_view": {"view": "top", "kind": "orbit", "azimuth_deg": 10, "rate_deg_s": 5, "amplitude_deg": 30},
     "set_pose": {"view": "top", "pose": [0, -2, -3, 0, 0, 0, 1]},
     "remove_view": {"view": "top"},
+    "align_view": {"view": "top"},
     "set_param": {"steps": 5, "guidance": [1, 1.5], "seed": 7, "publish": "jpeg", "jpeg_quality": 80},
 }
 

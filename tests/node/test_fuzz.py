@@ -88,6 +88,7 @@ def request(verb: str, args: object, **more: object) -> bytes:
 ARGUMENTS: dict[str, dict[str, object]] = {
     "set_view": {"view": "top", "azimuth_deg": 10.0, "elevation_deg": 5, "radius": 0.5},
     "remove_view": {"view": "top"},
+    "align_view": {"view": "top"},
     "set_param": {"steps": 4, "guidance": [1.0, 1.5], "seed": 7, "samples": 2, "jpeg_quality": 80, "publish": "jpeg"},
 }
 REQUESTS = [

@@ -28,7 +28,7 @@ from gcd_model import (
     load_synthesizer,
 )
 from gcd_node.cli.main import run_app
-from gcd_node.config import ModelSection, NodeConfig, ViewConfig, parse_config
+from gcd_node.config import ModelSection, NodeConfig, parse_config
 from gcd_node.errors import ConfigError, ModelFailedError
 from gcd_node.frame import Frame, SourceInfo
 from gcd_node.lifecycle import Parts
@@ -38,6 +38,7 @@ from gcd_node.replay.run import open_run
 from gcd_node.sources import SourcePose
 from gcd_node.stream_context import prepare_stream
 from gcd_node.verbs import SetView
+from gcd_node.view_config import ViewConfig
 from gcd_node.views import VirtualView
 
 LAUNCH = """

@@ -12,7 +12,7 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from gcd_model.errors import OptionError, PoseError, ShapeError
-from gcd_model.geometry.pose import CameraMount, look_at, pose_from_axes, relative_pose, require_rigid
+from gcd_model.geometry.pose import CameraMount, Intrinsics, look_at, pose_from_axes, relative_pose, require_rigid
 
 Interpolation = Literal["linear", "sine"]
 
@@ -182,12 +182,14 @@ class Trajectory:
     delta: float64 [T, 3], the same as azimuth and elevation in degrees and radius in metres, destination minus source;
         None for a path that is not on the sphere.
     source: where the source camera stands, if that is known or assumed.
+    lens: of the view, which the live model can give another than the source's; None: the source's.
     Raises ShapeError where sizes disagree, PoseError where a pose is not rigid.
     """
 
     source_from_target: Tensor
     delta: Tensor | None = None
     source: Spherical | None = None
+    lens: Intrinsics | None = None
 
     def __post_init__(self) -> None:
         poses, delta = self.source_from_target, self.delta

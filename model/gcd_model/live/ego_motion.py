@@ -7,19 +7,17 @@ drifts less than a sum of steps. Every sighting's depth improves that place. Ope
 """
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.errors import PoseError
 from gcd_model.geometry import Intrinsics, require_rigid
 from gcd_model.live.config import SKY_M
-
-Array = NDArray[Any]
+from gcd_model.live.pnp import BEHIND_M, OUTLIER, Array, Tracks, inverse, likeliest_pose, projected, unprojected
 
 _LONGEST_STEP_M, _LARGEST_TURN_DEG = 5.0, 45.0
 """Between two frames; beyond, the odometry jumps or the points mislead."""
@@ -40,27 +38,6 @@ _SIGHTINGS = 8
 """A place is never surer than the mean of this many sightings: newer ones count, too."""
 _OTHER_SURFACE = 0.15
 """Relative step of depth from which on a track's pixel shows something else than its point."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Tracks:
-    """N points of the world that are followed.
-
-    place: float32 [N, 2], where the last frame shows them, pixels as OpenCV counts them. point: [N, 3].
-    eye: [N, 3], from where they were seen, on average. share: [N], standard error of its depth, in parts of it.
-    """
-
-    place: Array
-    point: Array
-    eye: Array
-    share: Array
-
-    def __len__(self) -> int:
-        return len(self.place)
-
-    def rows(self, index: Array) -> "Tracks":
-        """Some of them: numbers, or bool [N]."""
-        return Tracks(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
 
 NO_TRACKS = Tracks(place=np.zeros((0, 2), np.float32), point=np.zeros((0, 3)), eye=np.zeros((0, 3)), share=np.zeros(0))
@@ -133,10 +110,8 @@ class EgoMotion:
         inner = torch.zeros(depth.shape, dtype=torch.uint8)
         inside = (slice(_BORDER_PX, -_BORDER_PX),) * 2
         inner[inside] = (static.cpu() & depth.isfinite() & (depth > 0))[inside].to(torch.uint8)
-        share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread.cpu() * _SPREADS).clamp(min=_SUREST)
-        self._last = frame = _Frame(
-            *self._new, depth=depth.double().numpy(), share=share.double().numpy(), usable=inner.numpy()
-        )
+        share = depth_share(depth, spread)
+        self._last = frame = _Frame(*self._new, depth=depth.double().numpy(), share=share, usable=inner.numpy())
         if len(self._tracks):
             column, row = np.rint(self._tracks.place).astype(int).T
             self._tracks = _placed_better(self._tracks, frame, self._pose).rows(frame.usable[row, column] > 0)
@@ -152,6 +127,12 @@ class EgoMotion:
             step = inverse(self._pose) @ pose
             _require_plausible(step, "the picture")
         self._pose, self._step, self._tracks = pose, step, tracks
+
+
+def depth_share(depth: Tensor, spread: Tensor | None) -> Array:
+    """The standard error of each depth, in parts of it, float64; both as `EgoMotion.settle` takes them."""
+    share = torch.full_like(depth, _DEPTH_SHARE) if spread is None else (spread * _SPREADS).clamp(min=_SUREST)
+    return share.cpu().double().numpy()
 
 
 def require_motion(before: Tensor | None, after: Tensor) -> Tensor:
@@ -274,126 +255,3 @@ def _placed_better(tracks: Tracks, frame: _Frame, pose: Array) -> Tracks:
         eye=tracks.eye + gain[:, None] * (pose[:3, 3] - tracks.eye),
         share=np.sqrt(joined),
     )
-
-
-# --- where a camera is that sees points whose places are known, some of them wrongly ---------------------------------
-
-_MOST = 0.75
-"""Share of the tracks that agree with a pose from which on no other is tried."""
-_RANSAC_PX, _RANSAC_ROUNDS = 2.0, 150
-_FLOW_PX = 0.25
-"""Standard error of a followed place."""
-_DOUBTED, OUTLIER, _HOPELESS = 1.5, 4.0, 12.0
-"""In standard errors: from here on a track counts less, not at all, and not even while the pose is still rough."""
-_ROUGH_STEPS, _FINE_STEPS, _SETTLED = 4, 4, 1e-5
-"""Of the least squares; settled once the camera moves by no more than this, metres and radians."""
-BEHIND_M = 0.05
-
-
-def likeliest_pose(tracks: Tracks, lens: Intrinsics, pose: Array, guess: Array) -> tuple[Array, Array]:
-    """The pose with which most tracks agree, and by how many standard errors each differs: [N].
-
-    Going on as before is tried first, then standing, then what RANSAC finds.
-    """
-    best, agreed = (guess, np.full(len(tracks), np.inf)), -1
-    for start in (lambda: guess, lambda: pose, lambda: _consensus(tracks, lens, guess)):
-        refined = _refined(tracks, lens, start())
-        count = int((refined[1] < OUTLIER).sum())
-        if count > agreed:
-            best, agreed = refined, count
-        if agreed > _MOST * len(tracks):
-            break
-    return best
-
-
-def _consensus(tracks: Tracks, lens: Intrinsics, guess: Array) -> Array:
-    """The pose that RANSAC finds; the guess where it finds none."""
-    import cv2
-
-    cv2.setRNGSeed(0)
-    found, turn, step, _ = cv2.solvePnPRansac(
-        tracks.point,
-        tracks.place.astype(np.float64),
-        np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]]),
-        None,
-        iterationsCount=_RANSAC_ROUNDS,
-        reprojectionError=_RANSAC_PX,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )
-    usable = found and np.isfinite(turn).all() and np.isfinite(step).all()
-    return inverse(rigid(turn[:, 0], step[:, 0])) if usable else guess
-
-
-def _refined(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
-    """Robust least squares over all tracks: the pose, and by how many standard errors each track differs from it."""
-    for number in range(_ROUGH_STEPS + _FINE_STEPS):
-        limit = _HOPELESS if number < _ROUGH_STEPS else OUTLIER
-        residual, slope = _reprojection(tracks, lens, pose)
-        distance = np.linalg.norm(residual, axis=1)
-        weight = np.minimum(1.0, _DOUBTED / np.maximum(distance, 1e-9)) * (distance < limit)
-        weighted = (slope * weight[:, None, None]).reshape(-1, 6)
-        normal = weighted.T @ slope.reshape(-1, 6) + 1e-6 * np.eye(6)
-        change = np.linalg.solve(normal, weighted.T @ residual.reshape(-1))
-        pose = pose @ inverse(rigid(change[3:], change[:3]))
-        if number >= _ROUGH_STEPS and np.abs(change).max() < _SETTLED:
-            break
-    distance = np.linalg.norm(_reprojection(tracks, lens, pose)[0], axis=1)
-    behind = projected(tracks.point, pose, lens)[0][:, 2] <= BEHIND_M
-    return pose, np.where(behind, np.inf, distance)
-
-
-def _reprojection(tracks: Tracks, lens: Intrinsics, pose: Array) -> tuple[Array, Array]:
-    """Residuals [N, 2] and their slopes by a step and a turn of the camera [N, 2, 6], in standard errors.
-
-    A wrong depth moves a point along the ray on which it was seen: in that direction of the picture it counts less.
-    """
-    local, place = projected(tracks.point, pose, lens)
-    x, y, z = local.T
-    z = np.maximum(z, BEHIND_M)
-    slope = np.zeros((len(z), 2, 6))  # by the step [0:3], which is the slope by the point, and by the turn [3:6]
-    slope[:, 0, 0], slope[:, 0, 2] = lens.fx / z, -lens.fx * x / z**2
-    slope[:, 1, 1], slope[:, 1, 2] = lens.fy / z, -lens.fy * y / z**2
-    right, down, ahead = np.moveaxis(slope[:, :, :3], 2, 0)  # each [N, 2]
-    x, y, z = x[:, None], y[:, None], z[:, None]
-    slope[:, :, 3], slope[:, :, 4], slope[:, :, 5] = y * ahead - z * down, z * right - x * ahead, x * down - y * right
-    ray = (tracks.point - tracks.eye) @ pose[:3, :3]
-    blur = (slope[:, :, :3] @ ray[:, :, None])[:, :, 0] * tracks.share[:, None]
-    size = np.linalg.norm(blur, axis=1)[:, None]
-    along = blur / np.maximum(size, 1e-9)
-    excess = (1 - _FLOW_PX / np.hypot(_FLOW_PX, size)) * along
-    residual = tracks.place - place
-    residual = residual - excess * (along * residual).sum(1, keepdims=True)
-    slope = slope - excess[:, :, None] * (along[:, None] @ slope)
-    return residual / _FLOW_PX, slope / _FLOW_PX
-
-
-def unprojected(place: Array, depth: Array, lens: Intrinsics, pose: Array) -> Array:
-    """Points of the world, [N, 3], from their places in a picture, [N, 2], and their depths, [N]."""
-    x, y = (place[:, 0] + 0.5 - lens.cx) / lens.fx, (place[:, 1] + 0.5 - lens.cy) / lens.fy
-    return np.stack([x * depth, y * depth, depth], axis=1) @ pose[:3, :3].T + pose[:3, 3]
-
-
-def projected(point: Array, pose: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """In the camera's axes [N, 3], and in its picture [N, 2] as OpenCV counts pixels."""
-    local = (point - pose[:3, 3]) @ pose[:3, :3]
-    z = np.maximum(local[:, 2], BEHIND_M)
-    return local, np.stack(
-        [local[:, 0] / z * lens.fx + lens.cx - 0.5, local[:, 1] / z * lens.fy + lens.cy - 0.5], axis=1
-    )
-
-
-def rigid(rotation: Array, translation: Array) -> Array:
-    """rotation: [3], its axis times its angle."""
-    import cv2
-
-    a_from_b = np.eye(4)
-    a_from_b[:3, :3], a_from_b[:3, 3] = cv2.Rodrigues(rotation)[0], translation
-    return a_from_b
-
-
-def inverse(a_from_b: Array) -> Array:
-    """Of a rigid transform, [4, 4]."""
-    b_from_a = np.eye(4)
-    b_from_a[:3, :3] = a_from_b[:3, :3].T
-    b_from_a[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
-    return b_from_a

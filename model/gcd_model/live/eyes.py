@@ -215,12 +215,12 @@ _SAME_SURFACE = 0.05
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class PlacedFrame:
-    """A seen frame and its views before anything is painted. targets: world_from_target [4, 4]. lens: of the views.
+    """A seen frame and its views before anything is painted. targets: world_from_target [4, 4]. lenses: of the views.
     splats: all that was seen, as each target shows it."""
 
     seen: SeenFrame
     targets: tuple[Tensor, ...]
-    lens: Intrinsics
+    lenses: tuple[Intrinsics, ...]
     splats: tuple[Splat, ...]
 
 
@@ -263,19 +263,25 @@ class SeenWorld:
         self._static = self._fresh.rows(static.flatten()[known.flatten()])
 
     @torch.inference_mode()
-    def place(self, frame: SeenFrame, poses: Sequence[Tensor], target_lens: Intrinsics | None = None) -> PlacedFrame:
+    def place(
+        self, frame: SeenFrame, poses: Sequence[Tensor], target_lenses: Sequence[Intrinsics | None] | None = None
+    ) -> PlacedFrame:
         """Take in a frame, and splat all of it from every target.
 
-        poses: source_from_target [4, 4] of each view, metres. target_lens: of the views; None: the source's.
+        poses: source_from_target [4, 4] of each view, metres. target_lenses: of each view; None: the source's.
         """
         if frame.begins:
             self.reset()
-        seen, pose, lens = frame.geometry, frame.world_from_source, target_lens or frame.lens
+        seen, pose = frame.geometry, frame.world_from_source
+        lenses = tuple(each or frame.lens for each in target_lenses or [None] * len(poses))
         self.look(frame.picture, seen.metres, seen.labels, seen.static, frame.lens, pose)
         targets = tuple(pose @ each for each in poses)
         points = self._fresh.joined(self._memory)
-        splats = tuple(splat(points, each, lens, len(self._config.classes), self._now) for each in targets)
-        return PlacedFrame(seen=frame, targets=targets, lens=lens, splats=splats)
+        splats = tuple(
+            splat(points, each, lens, len(self._config.classes), self._now)
+            for each, lens in zip(targets, lenses, strict=True)
+        )
+        return PlacedFrame(seen=frame, targets=targets, lenses=lenses, splats=splats)
 
     def splat(self, world_from_target: Tensor, lens: Intrinsics) -> Splat:
         """All of it as a target camera sees it, in one depth test."""

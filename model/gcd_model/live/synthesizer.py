@@ -5,7 +5,7 @@ Painted where nothing was seen, and every pixel says which.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,7 +17,7 @@ from gcd_model.diffusion import RenderOptions, watched
 from gcd_model.errors import NonFiniteError, ShapeError
 from gcd_model.geometry import CameraMount, Intrinsics, Trajectory, invert_rigid
 from gcd_model.live.blocks import likeliest
-from gcd_model.live.config import SKY_M, LiveConfig
+from gcd_model.live.config import SIZE_FACTOR, SKY_M, LiveConfig
 from gcd_model.live.depth_net import plane_depth
 from gcd_model.live.eyes import Eyes, Floor, PlacedFrame, SeenFrame, SeenWorld
 from gcd_model.live.paint_net import Painted, Seen, camera_features, filled, seen_of
@@ -72,11 +72,11 @@ class Painter:
         views = range(len(frame.targets))
         self._painted = {i: each for i, each in self._painted.items() if i in views and not frame.seen.begins}
         known = [self._known(i, frame) for i in views]
-        return tuple(self._view(i, known[i], frame.targets[i], frame.lens) for i in views)
+        return tuple(self._view(i, known[i], frame.targets[i], frame.lenses[i]) for i in views)
 
     def _known(self, index: int, frame: PlacedFrame) -> Seen:
         """What is known of a view: its splat, what was painted a frame ago, its rays and its floor."""
-        target, source, lens = frame.targets[index], frame.seen.world_from_source, frame.lens
+        target, source, lens = frame.targets[index], frame.seen.world_from_source, frame.lenses[index]
         painted, carried = self._painted.get(index), None
         if painted is not None and len(painted):
             carried = splat(painted, target, lens, len(self._config.classes), 0.0)
@@ -231,8 +231,9 @@ class LiveSynthesizer:
             yield self._eyes.see(frame, lens=lens, depth=depth, odometry=pose, floor=floor)
 
     def _placed(self, seen: Iterable[SeenFrame], trajectories: Sequence[Trajectory]) -> Iterator[PlacedFrame]:
+        lenses = [None if path.lens is None else _padded(path.lens) for path in trajectories]
         for t, frame in enumerate(seen):
-            yield self._world.place(frame, [path.source_from_target[t].cpu() for path in trajectories])
+            yield self._world.place(frame, [path.source_from_target[t].cpu() for path in trajectories], lenses)
 
     @out_of_memory_is_our_error
     def paint(
@@ -274,17 +275,18 @@ class LiveSynthesizer:
     ) -> View:
         """One view of all draws, frame by frame each; what is no draw, such as depth, is the first one's."""
         draws += draws[:1] * (options.samples - len(draws))
+        inside = ... if path.lens is None else (..., slice(path.lens.height), slice(path.lens.width))
 
         def joined(name: str) -> Tensor:
-            return torch.stack([getattr(each, name) for each in draws[0]])
+            return torch.stack([getattr(each, name)[inside] for each in draws[0]])
 
-        pixels = torch.stack([torch.stack([(each.picture + 1) / 2 for each in frames]) for frames in draws])
+        pixels = torch.stack([torch.stack([(each.picture[inside] + 1) / 2 for each in frames]) for frames in draws])
         return View(
             samples=(whole_levels(pixels) if options.whole_levels else pixels).cpu(),
             latents=torch.zeros(*pixels.shape[:2], 0, 1, 1),
             trajectory=path,
             motion_bucket=self.traits.motion_bucket(path) if options.motion_bucket is None else options.motion_bucket,
-            classes=torch.stack([torch.stack([each.classes for each in frames]) for frames in draws]).cpu(),
+            classes=torch.stack([torch.stack([each.classes[inside] for each in frames]) for frames in draws]).cpu(),
             uncertainty_scale=self.traits.uncertainty_scale,
             visibility=joined("visibility").cpu(),
             inverse_depth=joined("inverse_depth").float().cpu(),
@@ -292,6 +294,12 @@ class LiveSynthesizer:
             ood=ood,
             lost=tuple(lost),
         )
+
+
+def _padded(lens: Intrinsics) -> Intrinsics:
+    """Of the next larger picture that the networks take; what was added is at its right and lower edges."""
+    width, height = (-(-side // SIZE_FACTOR) * SIZE_FACTOR for side in (lens.width, lens.height))
+    return replace(lens, width=width, height=height)
 
 
 def lens_of(clip: Clip) -> Intrinsics:

@@ -140,7 +140,7 @@ def frames_of(
     lens, target_lens = source.lenses[0], clip.lens("target")
     moves = invert_rigid(clip.poses("source")) @ clip.poses("target")
     seen = (eyes.see(frame, lens=lens, floor=floor) for frame, floor in zip(source.video, floors, strict=True))
-    return [painter.paint(world.place(each, [move], target_lens))[0] for each, move in zip(seen, moves, strict=True)]
+    return [painter.paint(world.place(each, [move], [target_lens]))[0] for each, move in zip(seen, moves, strict=True)]
 
 
 class SpreadHistogram:
