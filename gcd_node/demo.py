@@ -18,7 +18,6 @@ from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConf
 from gcd_node.errors import NodeError
 from gcd_node.frame import Image
 from gcd_node.image_io import enlarged, make_folder, sheet, spread, strip, write_png, write_video
-from gcd_node.inference import WindowReport
 from gcd_node.messages import ontology
 from gcd_node.pipeline import Summary
 from gcd_node.publisher import Publisher
@@ -26,6 +25,7 @@ from gcd_node.session import open_session, run_until_signal
 from gcd_node.sources import FileSource, SourcePose
 from gcd_node.sources.files import read_picture
 from gcd_node.view_config import ViewConfig
+from gcd_node.work import WindowReport
 
 VIEW_ID = "topdown"
 WEIGHTS = "package:live-small"

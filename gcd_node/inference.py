@@ -3,9 +3,8 @@
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -15,70 +14,23 @@ from gcd_model import (
     DeviceMemoryError,
     FrameSynthesizer,
     NonFiniteError,
-    PlacedFrame,
-    PoseError,
     RenderOptions,
     SeenFrame,
     SourceFeatures,
-    Trajectory,
     View,
 )
 from gcd_node.drift import DriftDetector
 from gcd_node.encoded_frames import EncodedFrames, window_seed
 from gcd_node.errors import DepthError, RemoteError
-from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns, world_flags
+from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns
 from gcd_node.model import Failure, FailureCounter, ModelSlot, Pulse, model_errors, oom_levels, render_grey, tried
-from gcd_node.status import Announcer, Condition
+from gcd_node.status import Announcer
 from gcd_node.stream_context import StreamContext, drawing_options, sampler_in_use
-from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualView, VirtualViews
+from gcd_node.views import EndOfStream, LiveConfig, Settings, VirtualViews
 from gcd_node.window import FrameWindow, PartialWindow
+from gcd_node.work import Job, Known, Placed, Seen, WindowReport, WorkConditions, WorkCounts
 
 _LOG = logging.getLogger(__name__)
-_KEPT = 1000  # a node runs for weeks
-_HOLD_S = 1.0
-_OTHER_WORLD = "this is another world than the model learned from: depth and classes are guesses"
-_WORK_REASONS = ("DEPTH_BAD", "ODOMETRY_BAD", "MOTION_LOST", "world")
-
-
-@dataclass(slots=True)
-class WorkCounts:
-    """What the model thread has done. render_s: inference times of the latest windows. age_ms: theirs, at publish."""
-
-    windows: int = 0
-    nan_windows: int = 0
-    last_window_id: int = -1
-    render_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
-    age_ms: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class WindowReport:
-    """A window that was just published, for observers. render_s, age_ms: see WorkCounts."""
-
-    window: FrameWindow
-    render_s: float
-    age_ms: float
-
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Job:
-    """One window and everything that was decided for it when it was taken. paths: of its views. started_ns: when that
-    was, on the monotonic clock. memory: the model's, which began anew so many times."""
-
-    window: FrameWindow
-    settings: Settings
-    context: StreamContext
-    views: list[VirtualView]
-    paths: list[Trajectory]
-    started_ns: int
-    memory: int
-
-
-Seen = SourceFeatures | Sequence[SeenFrame] | Failure
-"""What is known of a window, frame by frame if the model works so; or what that failed with."""
-_Known = SourceFeatures | Sequence[PlacedFrame]
-Placed = _Known | Failure
-"""The same, and of its views."""
 
 
 class Renderer:
@@ -108,16 +60,12 @@ class Renderer:
         self._failures = FailureCounter(announcer)
         self._given_up = self._failures.given_up
         self.pulse = Pulse(announcer.health, self._given_up)
-        self._encoded = EncodedFrames(self.pulse.beat, self._count_bad_depth, self._tell_odometry)
+        self._shown = WorkConditions(announcer, frame_by_frame=model.streams)
+        self._encoded = EncodedFrames(self.pulse.beat, self._shown.bad_depth, self._shown.odometry)
         self._seeing, self._placing = threading.Lock(), threading.Lock()
         """Held by whoever encodes or makes the model forget, and by whoever places; both, in this order, by whoever
         exchanges the model."""
         self._memory = 0
-        hold_s = _HOLD_S if model.streams else 0.0
-        self._bad_depth, self._bad_odometry, self._lost_motion, self._other_world = (
-            Condition(code, announcer, hold_s=hold_s) for code in _WORK_REASONS
-        )
-        self._remote_late = Condition("REMOTE_LATE", announcer, hold_s=0.0, over="REMOTE_BACK")
         self._epoch = -1
         self._latest: tuple[StreamContext, StreamContext] | None = None
 
@@ -237,7 +185,7 @@ class Renderer:
         if guessed and context.config.model.on_bad_depth == "stop":
             raise DepthError(f"the depth of {guessed} frames of this window cannot be used; it is not rendered")
         if not guessed:
-            self._bad_depth.update(None)
+            self._shown.bad_depth(None)
         seen = synthesizer.see(features) if isinstance(synthesizer, FrameSynthesizer) else features
         self._health.stage("encode", time.monotonic() - started_s)
         return seen
@@ -308,7 +256,7 @@ class Renderer:
         if self.cancel.is_set():  # a model that ignores cancel: nothing may follow the end
             raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
-        self._tell_source(context, views[0])
+        self._shown.source(context, views[0])
         for virtual, view in zip(job.views, views, strict=True):
             rendered = Rendered(
                 window=job.window,
@@ -328,7 +276,7 @@ class Renderer:
         self._health.stage("publish", (time.monotonic_ns() - ended_ns) / 1e9)
         self._count(job, (ended_ns - job.started_ns) / 1e9)
 
-    def _drawn(self, job: Job, seed: int, placed: _Known) -> tuple[StreamContext, int, list[View]]:
+    def _drawn(self, job: Job, seed: int, placed: Known) -> tuple[StreamContext, int, list[View]]:
         """The views, in how many steps, and in whose context: the model's, or where that computes elsewhere and is late
         its fallback's. Raises RemoteError: it has none."""
         section, halved = job.context.config.model, "half the steps" in self._given_up
@@ -336,17 +284,17 @@ class Renderer:
         try:
             views = self._draw(job, seed, placed, steps if halved else section.steps)
         except RemoteError as error:
-            self._remote_late.update({"message": str(error)})
+            self._shown.remote_late(error)
             if (fallback := self._model.local) is None:
                 raise
         else:
-            self._remote_late.update(None)
+            self._shown.remote_late(None)
             return job.context, steps, views
         context, steps = replace(job.context, traits=fallback.traits), fallback.traits.config.sampling.steps
         features = EncodedFrames(self.pulse.beat).features(fallback, job.window, context)
         return context, steps, fallback.render(features, job.paths, self._options(job.settings, seed, steps=steps))
 
-    def _draw(self, job: Job, seed: int, placed: _Known, steps: int | None) -> list[View]:
+    def _draw(self, job: Job, seed: int, placed: Known, steps: int | None) -> list[View]:
         started_s = time.monotonic()
         options = self._options(job.settings, seed, steps=steps)
         self.pulse.beat()
@@ -375,24 +323,6 @@ class Renderer:
 
     def _step_done(self, _done: int, _steps: int) -> None:
         self.pulse.beat()
-
-    # What windows show, and cost.
-
-    def _count_bad_depth(self, error: DepthError) -> None:
-        """Of one frame."""
-        self._health.count("bad_depths")
-        self._bad_depth.update({"message": str(error)})
-
-    def _tell_odometry(self, error: PoseError | None) -> None:
-        """Of one frame: None if it can be used."""
-        self._bad_odometry.update(None if error is None else {"message": str(error)})
-
-    def _tell_source(self, context: StreamContext, view: View) -> None:
-        """Whether the model knows such a source, and how it moved; the same for all views of a window."""
-        self._lost_motion.update({"message": view.lost[0], "frames": len(view.lost)} if view.lost else None)
-        self._health.ood_score = view.ood
-        is_foreign = bool(world_flags(context.traits, view))
-        self._other_world.update({"message": _OTHER_WORLD, "ood_score": view.ood} if is_foreign else None)
 
     def _count(self, job: Job, seconds: float) -> None:
         age_ms = (time.monotonic_ns() - newest_ns(job.context, job.window)) / 1e6

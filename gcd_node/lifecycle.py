@@ -22,13 +22,13 @@ from msgspec.structs import replace
 
 from gcd_model import Traits
 from gcd_node.frame import FrameSource, SourceInfo
-from gcd_node.inference import WindowReport
 from gcd_node.model import LoadModel, ModelSlot
 from gcd_node.pipeline import MODEL_FAILED, Stream, Summary
 from gcd_node.recorder import Recorder
 from gcd_node.sources import LIVE_KINDS, OakSource, SourceConfig
 from gcd_node.status import Announcer
 from gcd_node.views import LiveConfig, VirtualViews
+from gcd_node.work import WindowReport
 
 _LOG = logging.getLogger(__name__)
 _LOOK_S, _HURRY_S = 0.1, 2.0

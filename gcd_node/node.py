@@ -14,7 +14,6 @@ from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig
 from gcd_node.errors import NodeError, RemoteError, SourceAbsentError, SourceError, SourceLostError
 from gcd_node.health import THREAD_DIED, Health, Level
-from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import PATHS, Lifecycle, Parts, State, Transitions, Verb
 from gcd_node.messages import MessageSink
 from gcd_node.pipeline import Summary
@@ -25,6 +24,7 @@ from gcd_node.sources.live import backoff_s
 from gcd_node.status import Announcer
 from gcd_node.verbs import Outcome
 from gcd_node.views import LiveConfig
+from gcd_node.work import WindowReport
 
 _LOG = logging.getLogger(__name__)
 _TICK_S = 0.1

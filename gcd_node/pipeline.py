@@ -18,7 +18,7 @@ from gcd_node.errors import (
 )
 from gcd_node.frame import Frame, FrameSource, SourceInfo
 from gcd_node.health import Level, SourceState
-from gcd_node.inference import Renderer, WindowReport, WorkCounts
+from gcd_node.inference import Renderer
 from gcd_node.model import ModelSlot
 from gcd_node.recorder import Recorder
 from gcd_node.sources.live import Opener, SourceWatch
@@ -26,6 +26,7 @@ from gcd_node.status import Announcer, metadata
 from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.views import InputPreview, LiveConfig
 from gcd_node.window import Reason, WindowBuilder, WindowSlot, read
+from gcd_node.work import WindowReport, WorkCounts
 from gcd_node.worker import ModelWorker
 
 _STOP_DELAY_MS = 100

@@ -20,7 +20,6 @@ from gcd_node.config import ModelSection, NodeConfig, ViewerConfig
 from gcd_node.control import ControlServer
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health, Level
-from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.node import Node
 from gcd_node.pipeline import Summary
@@ -28,6 +27,7 @@ from gcd_node.publisher import Publisher
 from gcd_node.remote import open_remote
 from gcd_node.service import ServiceManager, listen
 from gcd_node.sources import LIVE_KINDS, open_source
+from gcd_node.work import WindowReport
 
 _LOG = logging.getLogger(__name__)
 

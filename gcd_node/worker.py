@@ -15,11 +15,12 @@ from typing import TypeVar
 
 from gcd_model import Cancelled, DeviceMemoryError, NonFiniteError
 from gcd_node.health import IDLE, Level
-from gcd_node.inference import Job, Placed, Renderer, Seen
+from gcd_node.inference import Renderer
 from gcd_node.model import IdleTimer, ModelSlot, interruptible, model_errors
 from gcd_node.status import Announcer
 from gcd_node.views import LiveConfig
 from gcd_node.window import PartialWindow, WindowSlot
+from gcd_node.work import Job, Placed, Seen
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")

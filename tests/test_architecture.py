@@ -21,16 +21,16 @@ OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "w
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
-    ("client/gcd_client", 7, 1_383),
-    ("model/gcd_model", 41, 9_501),
-    ("tests/model", 27, 6_206),
-    ("gcd_node", 59, 13_508),
-    ("tests/node", 37, 10_733),
-    ("train/gcd_train", 115, 26_772),
-    ("tests/train", 72, 14_621),
+    ("client/gcd_client", 8, 1_581),
+    ("model/gcd_model", 43, 9_819),
+    ("tests/model", 28, 6_295),
+    ("gcd_node", 67, 15_113),
+    ("tests/node", 42, 12_010),
+    ("train/gcd_train", 116, 27_362),
+    ("tests/train", 72, 14_962),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is
-new alone: lately the paper's other methods, AnyViewBench and the splat as a condition."""
+new alone: lately canonical views, a fleet behind Ray Serve, and novel views in LeRobot sets and ROS 2 bags."""
 MOST_DOCS, MOST_README = (14, 1_900), 90
 
 

@@ -18,7 +18,6 @@ from gcd_model.weights.card import FAMILIES
 from gcd_node.config import ControlConfig, ModelSection, NodeConfig, PublishConfig
 from gcd_node.errors import NodeError, SourceAbsentError, SourceLostError
 from gcd_node.frame import Frame, SourceInfo
-from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.node import Node
 from gcd_node.publisher import Publisher
@@ -26,6 +25,7 @@ from gcd_node.session import open_session
 from gcd_node.sources import V4l2Source
 from gcd_node.sources.live import LiveCamera
 from gcd_node.view_config import ViewConfig
+from gcd_node.work import WindowReport
 
 VIEW = "soak"
 WIDTH, HEIGHT, FPS = 384, 256, 24.0

@@ -23,8 +23,8 @@ from gcd_node.errors import UsageError
 from gcd_node.service import ServiceManager, background_logging
 
 if TYPE_CHECKING:
-    from gcd_node.inference import WindowReport
     from gcd_node.pipeline import Summary
+    from gcd_node.work import WindowReport
 
 ConfigPath: TypeAlias = Annotated[Path, Argument(metavar="CONFIG", help="A launch file, such as launch/demo.toml.")]
 Changes: TypeAlias = Annotated[

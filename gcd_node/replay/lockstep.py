@@ -23,7 +23,6 @@ from gcd_node.config import LifeConfig, NodeConfig
 from gcd_node.errors import ConfigError, ModelFailedError, OutputError, SourceError
 from gcd_node.frame import FrameSource
 from gcd_node.image_io import write_whole
-from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import PublisherStats
 from gcd_node.node import Node
@@ -45,6 +44,7 @@ from gcd_node.ros_messages import McapFile, RosMessage, view_messages, write_bag
 from gcd_node.session import load_model, model_threads
 from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
 from gcd_node.stream_context import config_digest
+from gcd_node.work import WindowReport
 
 PARTS = Parts(open_source=open_source, load_model=load_model)
 """What a launch file names, as `gcd-node run` opens it."""

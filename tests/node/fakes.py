@@ -36,11 +36,11 @@ from gcd_node.config import NodeConfig, parse_config
 from gcd_node.control import ControlServer
 from gcd_node.errors import NodeError
 from gcd_node.frame import Frame, FrameSource, SourceInfo
-from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.messages import MessageSink, PublisherStats
 from gcd_node.node import Node
 from gcd_node.verbs import Command, Outcome, RequestError
+from gcd_node.work import WindowReport
 
 HEIGHT, WIDTH = 64, 96
 

@@ -41,7 +41,6 @@ from gcd_node.errors import (
     UsageError,
 )
 from gcd_node.frame import Frame
-from gcd_node.inference import WindowReport
 from gcd_node.lifecycle import Parts
 from gcd_node.replay import lockstep
 from gcd_node.replay.compare import Tolerance, compare, report_text
@@ -49,6 +48,7 @@ from gcd_node.replay.lockstep import digest_of, lockstep_config, replay, replay_
 from gcd_node.replay.run import MANIFEST, RunFolder, encode_manifest, keep_pixels, new_folder, open_run, pixel_digest
 from gcd_node.sources import open_source
 from gcd_node.stream_context import config_digest
+from gcd_node.work import WindowReport
 
 WINDOWS, FRAMES = 3, 14
 SOURCE = 'kind = "synthetic"\nframes = 42'

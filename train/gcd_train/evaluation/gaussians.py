@@ -230,8 +230,17 @@ class GaussianSplatting(PerScene):
         self, points: Tensor, colours: Tensor, bounds: SceneBounds, frames: int, generator: torch.Generator
     ) -> MovedGaussians:
         """Before training. points: [N, 3], metres; colours: [N, 3] in [0, 1]; frames: T of the clip."""
-        sizes = {"features": self.features, "side": self.side, "hidden": self.hidden, "least": self.least}
-        return MovedGaussians(points, colours, bounds, frames=frames, generator=generator, **sizes).to(self.place)
+        return MovedGaussians(
+            points,
+            colours,
+            bounds,
+            frames=frames,
+            features=self.features,
+            side=self.side,
+            hidden=self.hidden,
+            least=self.least,
+            generator=generator,
+        ).to(self.place)
 
     def optimiser(self, scene: MovedGaussians) -> torch.optim.Adam:
         """A group for each kind of a Gaussian's values, and for planes, heads and background."""

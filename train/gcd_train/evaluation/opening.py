@@ -180,12 +180,8 @@ def open_clips(
 def _open_episodes(options: ClipOptions, model: Traits | None) -> tuple[EvaluationSet, tuple[str, ...]]:
     """Episodes of AnyViewBench, or of our scenes in its layout."""
     others = [getattr(options, name) for name in (*_OF_SCENES, "listed") if name != "camera"]
-    pair = tuple(options.camera or ())
-    if (
-        any(each is not None and each is not False for each in others)
-        or len(options.data) > 1
-        or len(pair) not in (0, 2)
-    ):
+    stated, pair = any(each is not None and each is not False for each in others), tuple(options.camera or ())
+    if stated or len(options.data) > 1 or len(pair) not in (0, 2):
         raise RecipeError(
             "AnyViewBench is one --data with --split, --limit, --frames and, for other cameras than its own, --camera "
             "INPUT --camera TARGET; leave out all other choices"
