@@ -18,6 +18,7 @@ _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
 Matrix: TypeAlias = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 Pose: TypeAlias = tuple[float, ...]
 _FARTHEST_M = 10_000.0
+_FARTHEST_CELL_M, _MOST_CELLS = 200.0, 512
 _HIDDEN = "***"
 Table: TypeAlias = dict[str, object]
 """A TOML table: keys to plain values, lists and tables."""
@@ -139,6 +140,22 @@ class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         later = ("position_m", "look_at_m", "pose")
         plain: dict[str, object] = msgspec.to_builtins(self)
         return {name: value for name, value in plain.items() if name not in later or value is not None}
+
+
+class GridConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A bird's-eye grid about the vehicle. extent_m: x from, x to, y from, y to; x ahead, y left of the vehicle's
+    origin. seconds: for how long what is out of sight is remembered."""
+
+    extent_m: tuple[float, float, float, float] = (-10.0, 30.0, -20.0, 20.0)
+    cell_m: Annotated[float, Meta(ge=0.05, le=5)] = 0.5
+    seconds: Annotated[float, Meta(ge=0, le=60)] = 2.0
+
+    def __post_init__(self) -> None:
+        sides = [(high - low) / self.cell_m for low, high in (self.extent_m[:2], self.extent_m[2:])]
+        if not all(1 <= side <= _MOST_CELLS and abs(side - round(side)) < 1e-6 for side in sides):
+            raise ValueError(f"extent_m is x from, x to, y from, y to, 1 to {_MOST_CELLS} whole cells of cell_m each")
+        if max(map(abs, self.extent_m)) > _FARTHEST_CELL_M:
+            raise ValueError(f"a grid reaches at most {_FARTHEST_CELL_M:g} m from the vehicle, got {self.extent_m}")
 
 
 def pose_matrix(pose: Pose) -> Matrix:
@@ -275,6 +292,7 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     source: SourceConfig
     model: ModelSection
     view: Annotated[dict[ViewId, ViewConfig], Meta(min_length=1, max_length=64)]
+    grid: Annotated[dict[ViewId, GridConfig], Meta(max_length=8)] = {}
     window: WindowConfig = WindowConfig()
     publish: PublishConfig = PublishConfig()
     control: ControlConfig = ControlConfig()

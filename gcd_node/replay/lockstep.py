@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from msgspec.structs import replace
 
-from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
+from gcd_client.protocol import DataMessage, EndMessage, GridMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
 from gcd_model import Traits
 from gcd_node.config import LifeConfig, NodeConfig
 from gcd_node.errors import ConfigError, ModelFailedError, SourceError
@@ -114,7 +114,7 @@ def replay(
 class RunWriter:
     """A message sink that needs no reader: keeps the windows of a lockstep node and their maps.
 
-    Single frames are part of their window, and deviations of its samples: neither is kept.
+    Single frames are part of their window, and deviations of its samples: neither is kept; grids are not, either.
     """
 
     def __init__(self, folder: Path, on_window: Callable[[WindowReport], None] | None) -> None:
@@ -127,11 +127,12 @@ class RunWriter:
 
     _ood: tuple[str, ...]
 
-    def send(self, message: ViewMessage) -> bool:
+    def send(self, message: DataMessage) -> bool:
         """Take a view; see MessageSink. Raises OutputError."""
-        header, kind = message.header, kind_of(message.topic)
-        if kind not in ("win", "cls", "vis", "depth"):
+        kind = kind_of(message.topic)
+        if isinstance(message, GridMessage) or kind not in ("win", "cls", "vis", "depth"):
             return True
+        header = message.header
         frames, height, width, channels = header.shape
         shape = (frames, height, width, 3) if channels == 3 else (frames, height, -1)
         pixels = np.frombuffer(message.payload, np.uint8).reshape(shape)
