@@ -164,11 +164,18 @@ class GridHeader(CapturedHeader, frozen=True, kw_only=True):
     """
 
     shape: Annotated[tuple[_Side, ...], Meta(min_length=2, max_length=2)]
-    cell_m: Annotated[Number, Meta(gt=0)]
+    cell_m: Annotated[float, Meta(gt=0, le=LARGEST_INTEGER)]
     origin_m: tuple[Number, Number]
     classes: tuple[ClassRecord, ...]
     synthetic: bool = False
     proto: str = GRID_PROTO
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not len(self.t_capture_ns) == len(self.src.seq) == 1:
+            raise MessageError("a grid has one entry in t_capture and in src.seq")
+        if not 0 < len(self.classes) == len({each.id for each in self.classes}):
+            raise MessageError("the classes of a grid must be distinct")
 
 
 class ViewMessage(msgspec.Struct, frozen=True, kw_only=True):

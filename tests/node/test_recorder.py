@@ -40,7 +40,7 @@ from gcd_node.frame import Frame, FrameSource, LensModel, SourceInfo
 from gcd_node.health import Level
 from gcd_node.node import Node
 from gcd_node.recorder import Recorder
-from gcd_node.ros_messages import McapFile, note_messages, view_messages
+from gcd_node.ros_messages import McapFile, data_messages, note_messages
 from gcd_node.sources import open_source
 from gcd_node.sources.logs import LogSource, pose_of
 
@@ -491,7 +491,7 @@ def test_frames_of_a_view_follow_each_other_as_they_were_taken_and_a_status_is_a
     message = window()
     at_ns, frames = message.header.t_publish_ns, message.header.shape[0]
     for source, step_ns in (('kind = "v4l2"', SECOND_NS // 10), (LOCKSTEP, 0)):
-        told = view_messages(message, fake_config("view.top={}", source=source))
+        told = data_messages(message, fake_config("view.top={}", source=source))
         made = [each.log_ns for each in told if each.topic.endswith("/image")]
         assert made == [at_ns + i * step_ns for i in range(frames)]
     parts = {
