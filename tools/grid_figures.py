@@ -269,7 +269,7 @@ def picture(grid: Grid, truth: tuple[Array, Array, Array]) -> Array:
 
 
 def enlarged(drawn: Array) -> Array:
-    """With x up and y to the left, as from above; a white line at the left."""
+    """With x up and y to the left, as from above."""
     up = np.ascontiguousarray(np.swapaxes(drawn, 0, 1)[::-1, ::-1])
     return cv2.copyMakeBorder(
         cv2.resize(up, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST), 0, 0, 6, 0, cv2.BORDER_CONSTANT
