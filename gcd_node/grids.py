@@ -36,8 +36,8 @@ class Grids:
             started_ns = time.monotonic_ns()
             made = self._mappers.get(grid_id)
             if made is None or made[0] != mount:
-                spec = {"extent_m": config.extent_m, "cell_m": config.cell_m, "seconds": config.seconds}
-                made = self._mappers[grid_id] = mount, GridMapper(mount, **spec)
+                mapper = GridMapper(mount, extent_m=config.extent_m, cell_m=config.cell_m, seconds=config.seconds)
+                made = self._mappers[grid_id] = mount, mapper
             stamps_s = [stamp_ns / 1e9 for stamp_ns in window.stamps_ns]
             grids = [made[1].update(each.seen, at) for each, at in zip(placed, stamps_s, strict=True)]
             score = placed[-1].seen.geometry.ood

@@ -314,7 +314,8 @@ def to_text(header: OriginHeader, fields: Mapping[str, Any]) -> bytes:
 
 def flags_of(message: Message) -> int:
     """The prefix bits that follow from the content."""
-    content = {EndMessage: END_OF_STREAM, StatusMessage: 0}.get(type(message), HAS_PAYLOAD)
+    ended, note = isinstance(message, EndMessage), isinstance(message, StatusMessage)
+    content = END_OF_STREAM if ended else 0 if note else HAS_PAYLOAD
     return content | (REPLAY_CLOCK if getattr(message.header, "clock", "") == "replay" else 0)
 
 
