@@ -179,7 +179,7 @@ class GridMapper:
         beside = beside[:-2] | beside[1:-1] | beside[2:]
         beside = (beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]).ravel()[numbers]
         free &= ~beside.reshape(height, 2, width, 2).any(axis=(1, 3))
-        newest = np.where(taken | ~occupied[..., None], age_s, np.inf).argmin(axis=-1, keepdims=True)
+        newest = np.where(taken | ~taken.any(axis=-1, keepdims=True), age_s, np.inf).argmin(axis=-1, keepdims=True)
         youngest_s, seen = age_s.min(axis=-1), np.isfinite(age_s).any(axis=-1)
         heights = np.where(np.isfinite(age_s), cells["height"], -np.inf).max(axis=-1)
         return Grid(
