@@ -15,6 +15,7 @@ from gcd_node.view_config import ViewConfig, ViewId, prepare_views
 
 NotNegative: TypeAlias = Annotated[float, Meta(ge=0)]
 _LEAST_ROTATE_MB, _LEAST_ROTATE_S = 0.1, 1.0
+_FARTHEST_CELL_M, _MOST_CELLS = 200.0, 512
 _HIDDEN = "***"
 Table: TypeAlias = dict[str, object]
 """A TOML table: keys to plain values, lists and tables."""
@@ -94,6 +95,22 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         low, high = self.guidance_interval or (0.0, 0.0)
         if low > high:
             raise ValueError(f"guidance_interval goes from a noise level up to another, got {low:g} to {high:g}")
+
+
+class GridConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A bird's-eye grid about the vehicle. extent_m: x from, x to, y from, y to; x ahead, y left of the vehicle's
+    origin. seconds: for how long what is out of sight is remembered."""
+
+    extent_m: tuple[float, float, float, float] = (-10.0, 30.0, -20.0, 20.0)
+    cell_m: Annotated[float, Meta(ge=0.05, le=5)] = 0.5
+    seconds: Annotated[float, Meta(ge=0, le=60)] = 2.0
+
+    def __post_init__(self) -> None:
+        sides = [(high - low) / self.cell_m for low, high in (self.extent_m[:2], self.extent_m[2:])]
+        if not all(1 <= side <= _MOST_CELLS and abs(side - round(side)) < 1e-6 for side in sides):
+            raise ValueError(f"extent_m is x from, x to, y from, y to, 1 to {_MOST_CELLS} whole cells of cell_m each")
+        if max(map(abs, self.extent_m)) > _FARTHEST_CELL_M:
+            raise ValueError(f"a grid reaches at most {_FARTHEST_CELL_M:g} m from the vehicle, got {self.extent_m}")
 
 
 class PublishConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -208,6 +225,7 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     source: SourceConfig
     model: ModelSection
     view: Annotated[dict[ViewId, ViewConfig], Meta(min_length=1, max_length=64)]
+    grid: Annotated[dict[ViewId, GridConfig], Meta(max_length=8)] = {}
     window: WindowConfig = WindowConfig()
     publish: PublishConfig = PublishConfig()
     control: ControlConfig = ControlConfig()

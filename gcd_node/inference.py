@@ -22,6 +22,7 @@ from gcd_model import (
 from gcd_node.drift import DriftDetector
 from gcd_node.encoded_frames import EncodedFrames, window_seed
 from gcd_node.errors import DepthError, RemoteError
+from gcd_node.grids import Grids
 from gcd_node.messages import Rendered, messages, newest_ns, utc_offset_ns
 from gcd_node.model import Failure, FailureCounter, ModelSlot, Pulse, model_errors, oom_levels, render_grey, tried
 from gcd_node.status import Announcer
@@ -55,6 +56,7 @@ class Renderer:
         self._model, self._context_at, self._on_window = model, context_at, on_window
         self._live, self._health, self._drift = live, announcer.health, drift
         self._out = EndOfStream(live, announcer.sink, lambda: context_at(-1))
+        self._grids = Grids(live.config.grid, announcer.sink, lambda: context_at(-1))
         self._views = VirtualViews(model.traits)
         self._views.sync(live.settings(), context_at(-1).mount, context_at(-1).references)
         self._failures = FailureCounter(announcer)
@@ -102,13 +104,16 @@ class Renderer:
                 return None
 
     def place(self, job: Job, seen: Seen) -> Placed | None:
-        """What is known of each view before anything is painted: the model's memory goes on by a window. None if that
-        began anew since the window was seen."""
+        """What is known of each view before anything is painted: the model's memory goes on by a window, and grids are
+        sent. None if that began anew since the window was seen."""
         if isinstance(seen, SourceFeatures | Failure):
             return seen
         with self._placing, model_errors():
             self.pulse.beat()
-            return tried(lambda: self._frames.place(seen, job.paths)) if job.memory == self._memory else None
+            placed = tried(lambda: self._frames.place(seen, job.paths)) if job.memory == self._memory else None
+            if placed is not None and not isinstance(placed, Failure):
+                self._grids.publish(job.context, job.window, placed)
+            return placed
 
     def render(self, job: Job, placed: Placed | None) -> None:
         """Its views, drawn and sent; one retry, with another seed or with less asked; else counted, and not published,
@@ -135,6 +140,7 @@ class Renderer:
     def announce_end(self, *, delay_ms: int | None) -> None:
         """Send the end of every view. delay_ms: see MessageSink."""
         self._out.announce_all(self.counts.last_window_id, delay_ms=delay_ms)
+        self._grids.announce_end(self.counts.last_window_id, delay_ms=delay_ms)
 
     def _context(self, settings: Settings, epoch: int) -> StreamContext:
         """With what is in force now; the same object while nothing changes, as its digest is costly."""

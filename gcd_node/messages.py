@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from gcd_client.images import VISIBILITY, encode_jpegs, payload_of
 from gcd_client.protocol import (
+    GRID_PROTO,
     MAPS_PROTO,
     PREVIEW_ID,
     PREVIEW_TOPIC,
     PROTO,
     ClassRecord,
+    DataMessage,
     EndHeader,
     EndMessage,
     FrameRole,
@@ -154,6 +156,7 @@ def preview_message(context: StreamContext, frame: Frame, arrival_ns: int, epoch
         model=_NO_MODEL,
         pose=(PoseDelta(az_deg=0.0, el_deg=0.0, r=0.0),),
         source_from_view=(_IDENTITY,),
+        pose_units="scene" if context.traits.family is None else context.traits.family.pose_units,
         intrinsics=None if camera is None else camera_matrix(camera),
         offsets=offsets,
         synthetic=False,
@@ -172,10 +175,11 @@ def camera_matrix(intrinsics: Intrinsics) -> tuple[float, ...]:
     return (intrinsics.fx, 0.0, cx, 0.0, intrinsics.fy, cy, 0.0, 0.0, 1.0)
 
 
-def world_flags(traits: Traits, view: View) -> tuple[str, ...]:
-    """Whether the source shows another world than the model's training did; never for a model that cannot tell."""
+def world_flags(traits: Traits, score: float | None) -> tuple[str, ...]:
+    """Whether the source shows another world than the model's training did, by `View.ood`; never for a model that
+    cannot tell."""
     threshold = traits.ood_threshold
-    return ("world",) if threshold is not None and view.ood is not None and view.ood > threshold else ()
+    return ("world",) if threshold is not None and score is not None and score > threshold else ()
 
 
 # Headers.
@@ -183,7 +187,6 @@ def world_flags(traits: Traits, view: View) -> tuple[str, ...]:
 
 def _common(context: StreamContext) -> dict[str, Any]:
     """Fields of every message of a stream."""
-    family = context.traits.family
     return {
         "node_id": context.config.node_id,
         "boot_id": context.boot_id,
@@ -191,32 +194,27 @@ def _common(context: StreamContext) -> dict[str, Any]:
         "t_capture_unc_us": context.source.stamp_uncertainty_us,
         "src_frame_id": context.source.optical_frame,
         "cfg_digest": context.digest,
-        "pose_units": "scene" if family is None else family.pose_units,
     }
 
 
-def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
-    window, view, traits, source = rendered.window, rendered.view, context.traits, context.source
-    path, offset_ns = view.trajectory, rendered.utc_offset_ns
-    camera = path.lens or context.intrinsics
+def captured(
+    context: StreamContext, window: FrameWindow, inferred_ns: tuple[int, int], offset_ns: int
+) -> dict[str, Any]:
+    """Fields of every message of a window that leaves now. inferred_ns: from when to when, on the monotonic clock.
+    offset_ns: see utc_offset_ns()."""
+    traits, source = context.traits, context.source
     now_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
-    period_ms = 1000.0 * (context.config.window.stride or path.frames) / window.fps
+    period_ms = 1000.0 * (context.config.window.stride or len(window.stamps_ns)) / window.fps
     to_utc_ns = offset_ns if source.clock == "realtime" else 0
-    roles: tuple[FrameRole, ...] = tuple(
-        "at_goal" if at_goal and traits.knows_camera else "in_transit" for at_goal in path.at_goal
-    )
-    return ViewHeader(
-        **_common(context),
-        t_publish_ns=now_ns,
-        view_id=rendered.view_id,
-        view_rev=rendered.view_rev,
-        window_id=window.window_id,
-        t_capture_ns=tuple(stamp_ns + to_utc_ns for stamp_ns in window.stamps_ns),
-        t_infer_start_ns=rendered.started_ns + offset_ns,
-        t_infer_end_ns=rendered.ended_ns + offset_ns,
-        age_ms=(monotonic_ns - newest_ns(context, window)) / 1e6,
-        valid_for_ms=round(2 * period_ms),
-        src=SourceRecord(
+    return _common(context) | {
+        "t_publish_ns": now_ns,
+        "window_id": window.window_id,
+        "t_capture_ns": tuple(stamp_ns + to_utc_ns for stamp_ns in window.stamps_ns),
+        "t_infer_start_ns": inferred_ns[0] + offset_ns,
+        "t_infer_end_ns": inferred_ns[1] + offset_ns,
+        "age_ms": (monotonic_ns - newest_ns(context, window)) / 1e6,
+        "valid_for_ms": round(2 * period_ms),
+        "src": SourceRecord(
             kind=source.kind,
             id=source.id,
             seq=window.seqs,
@@ -226,26 +224,41 @@ def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
             resize=context.fit.resize,
             epoch=window.epoch,
         ),
-        frame_id=f"{rendered.view_id}_optical",
-        frame_role=roles,
-        shape=(path.frames, *view.video.shape[-2:], 3),
-        encoding="rgb8",
-        quality=QualityRecord(
-            nan_frames=0,
-            ood=(*context.ood, *_input_flags(window), *world_flags(traits, view), *rendered.flags),
-            steps=rendered.steps,
-            seed=rendered.seed,
-            ood_score=view.ood,
-        ),
-        model=ModelRecord(
+        "model": ModelRecord(
             name=traits.name,
             family=family_name(traits),
             sha256_12=traits.sha256_12,
             precision=traits.precision,
             device=traits.device,
         ),
+    }
+
+
+def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
+    window, view, traits = rendered.window, rendered.view, context.traits
+    path = view.trajectory
+    camera = path.lens or context.intrinsics
+    roles: tuple[FrameRole, ...] = tuple(
+        "at_goal" if at_goal and traits.knows_camera else "in_transit" for at_goal in path.at_goal
+    )
+    return ViewHeader(
+        **captured(context, window, (rendered.started_ns, rendered.ended_ns), rendered.utc_offset_ns),
+        view_id=rendered.view_id,
+        view_rev=rendered.view_rev,
+        frame_id=f"{rendered.view_id}_optical",
+        frame_role=roles,
+        shape=(path.frames, *view.video.shape[-2:], 3),
+        encoding="rgb8",
+        quality=QualityRecord(
+            nan_frames=0,
+            ood=(*context.ood, *input_flags(window), *world_flags(traits, view.ood), *rendered.flags),
+            steps=rendered.steps,
+            seed=rendered.seed,
+            ood_score=view.ood,
+        ),
         pose=_deltas(path),
         source_from_view=_matrices(path) if traits.knows_camera else None,
+        pose_units="scene" if traits.family is None else traits.family.pose_units,
         src_pose=source_pose(context),
         intrinsics=None if camera is None else camera_matrix(camera),
     )
@@ -253,7 +266,7 @@ def _header(context: StreamContext, rendered: Rendered) -> ViewHeader:
 
 def _proto(kind: str) -> str:
     """The minor version in which the kind came."""
-    return MAPS_PROTO if kind in ("vis", "depth") else PROTO
+    return {"vis": MAPS_PROTO, "depth": MAPS_PROTO, "grid": GRID_PROTO}.get(kind, PROTO)
 
 
 @functools.lru_cache(maxsize=_PATHS)
@@ -268,7 +281,7 @@ def _matrices(path: Trajectory) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in path.source_from_target.flatten(1).tolist())
 
 
-def _input_flags(window: FrameWindow) -> tuple[str, ...]:
+def input_flags(window: FrameWindow) -> tuple[str, ...]:
     """What is wrong with the input picture itself (docs/node.md, F13)."""
     is_exposed = 8 <= float(window.images[:, ::16, ::8].mean()) <= 247
     return (*(() if is_exposed else ("exposure",)), *(("static",) if window.static else ()))
@@ -360,8 +373,8 @@ class PublisherStats:
 class MessageSink(Protocol):
     """Where the node's messages go: a Publisher, the files of a replay, or a list in a test."""
 
-    def send(self, message: ViewMessage) -> object:
-        """Hand over a view."""
+    def send(self, message: DataMessage) -> object:
+        """Hand over a view or a grid."""
         ...
 
     def preview(self, made: Callable[[], ViewMessage]) -> None:

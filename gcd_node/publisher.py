@@ -23,7 +23,9 @@ from gcd_client.protocol import (
     TOPIC_BYTES,
     WELCOME,
     ClientError,
+    DataMessage,
     EndMessage,
+    Message,
     OriginHeader,
     StatusMessage,
     StatusTopic,
@@ -99,7 +101,7 @@ class Publisher:
         self._thread = threading.Thread(target=self._serve, name="publisher", daemon=True)
         self._thread.start()
 
-    def send(self, message: ViewMessage) -> bool:
+    def send(self, message: DataMessage) -> bool:
         """Number, encode and hand over one message; its own `sequence` is replaced.
 
         Realtime never waits: with a full queue the message is dropped and counted. Lockstep waits for room.
@@ -203,7 +205,7 @@ class Publisher:
                 raise
             _LOG.error("the publisher had failed too: %s", failure)
 
-    def _encoded(self, message: ViewMessage | EndMessage | StatusMessage) -> bytes:
+    def _encoded(self, message: Message) -> bytes:
         key = (message.header.boot_id, message.topic)
         is_local = self.endpoint.startswith("ipc://")
         numbered = replace(message, sequence=self._sequences[key])

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gcd_client.protocol import PROTO, EndMessage, OriginHeader, StatusTopic, ViewMessage
+from gcd_client.protocol import PROTO, DataMessage, EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_node.auth import Client, EventSink
 from gcd_node.config import NodeConfig, RecordConfig, to_toml
 from gcd_node.errors import NodeError
@@ -31,10 +31,10 @@ from gcd_node.ros_messages import (
     IMAGE_TOPIC,
     McapFile,
     command_messages,
+    data_messages,
+    data_topic,
     input_messages,
     note_messages,
-    view_messages,
-    view_topic,
     write_bag_metadata,
 )
 
@@ -193,10 +193,10 @@ class Recorder:
 
     # What goes out; see MessageSink.
 
-    def send(self, message: ViewMessage) -> object:
-        sent, topic = self._sink.send(message), view_topic(message)
+    def send(self, message: DataMessage) -> object:
+        sent, topic = self._sink.send(message), data_topic(message)
         if topic is not None and "views" in self._config.record.what:
-            self._put(topic, len(message.payload), lambda file: file.write(view_messages(message, self._config)))
+            self._put(topic, len(message.payload), lambda file: file.write(data_messages(message, self._config)))
         return sent
 
     def preview(self, made: Callable[[], ViewMessage]) -> None:

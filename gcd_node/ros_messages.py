@@ -24,8 +24,17 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from numpy.typing import NDArray
 
-from gcd_client.images import depth_m, encode_jpegs, images
-from gcd_client.protocol import OriginHeader, StatusTopic, ViewHeader, ViewMessage, kind_of, to_text
+from gcd_client.images import depth_m, encode_jpegs, images, layers
+from gcd_client.protocol import (
+    DataMessage,
+    GridMessage,
+    OriginHeader,
+    StatusTopic,
+    ViewHeader,
+    ViewMessage,
+    kind_of,
+    to_text,
+)
 from gcd_node.auth import Client
 from gcd_node.config import NodeConfig, RecordConfig
 from gcd_node.frame import Frame, SourceInfo
@@ -181,13 +190,42 @@ def input_messages(frame: Frame, info: SourceInfo, log_ns: int, record: RecordCo
         yield RosMessage(topic=topic, fields=fields, log_ns=log_ns, sent_ns=log_ns, sequence=frame.seq)
 
 
-def view_topic(message: ViewMessage) -> str | None:
-    """Where the pixels of a view go; None if another message of its window has them."""
+def data_topic(message: DataMessage) -> str | None:
+    """Where the pixels of a view or the cells of a grid go; None if another message of its window has them."""
+    if isinstance(message, GridMessage):
+        return f"/{message.topic}"
     name = _VIEW_NAMES.get(kind_of(message.topic)) if message.topic.startswith("view/") else None
     return None if name is None else f"/view/{message.header.view_id}/{name}"
 
 
-def view_messages(message: ViewMessage, config: NodeConfig) -> Iterator[RosMessage]:
+def data_messages(message: DataMessage, config: NodeConfig) -> Iterator[RosMessage]:
+    """What a view or a grid becomes. Raises MessageError: it cannot be decoded."""
+    return _grid_messages(message) if isinstance(message, GridMessage) else _view_messages(message, config)
+
+
+def _grid_messages(message: GridMessage) -> Iterator[RosMessage]:
+    """Its occupancy."""
+    header, at_ns = message.header, message.header.t_publish_ns
+    height, width = header.shape
+    place = dict(zip("xy", header.origin_m, strict=True))
+    origin = _make(
+        "geometry_msgs/msg/Pose",
+        position=_make("geometry_msgs/msg/Point", **place, z=0.0),
+        orientation=_make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    head = _header(header.t_capture_ns[0], header.frame_id)
+    fields = {"map_load_time": head.stamp, "resolution": header.cell_m, "width": width, "height": height}
+    grid = _make(
+        "nav_msgs/msg/OccupancyGrid",
+        header=head,
+        info=_make("nav_msgs/msg/MapMetaData", **fields, origin=origin),
+        data=layers(message).occupancy.reshape(-1),
+    )
+    topic, sequence = data_topic(message) or "", header.src.seq[0]
+    yield RosMessage(topic=topic, fields=grid, log_ns=at_ns, sent_ns=at_ns, sequence=sequence)
+
+
+def _view_messages(message: ViewMessage, config: NodeConfig) -> Iterator[RosMessage]:
     """A window: its frames and their camera, its header, age and poses. Raises MessageError: it cannot be decoded.
 
     It leaves the node as one; on the time line its frames follow each other as they were taken, from then on, and end
@@ -210,7 +248,7 @@ def view_messages(message: ViewMessage, config: NodeConfig) -> Iterator[RosMessa
     step_s = (config.window.stride or frames) / (frames * header.src.fps_cond) if paced else 0.0
     pictures = _pictures(message, heads, config.record.jpeg_quality)
     for index, (head, picture) in enumerate(zip(heads, pictures, strict=True)):
-        parts = {view_topic(message) or "": picture}
+        parts = {data_topic(message) or "": picture}
         if kind == "win" and header.intrinsics is not None:
             parts[f"{place}/camera_info"] = _camera_info(head, (header.shape[2], header.shape[1]), header.intrinsics)
         log_ns, sequence = at_ns + round(index * step_s * 1e9), header.src.seq[min(index, len(header.src.seq) - 1)]

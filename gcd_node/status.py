@@ -115,6 +115,7 @@ def metadata(context: StreamContext, settings: Settings) -> dict[str, object]:
         "views": list(settings.revisions),
         "view_revs": dict(settings.revisions),
         "kinds": list(published_kinds(context)),
+        "grids": list(context.config.grid),
         **calibration(context),
         "classes": [to_json(each) for each in ontology(traits)],
         "size": [traits.config.width, traits.config.height],

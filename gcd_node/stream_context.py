@@ -102,6 +102,8 @@ def prepare_stream(
         mount = stated_mount(config.source.pose, None if camera is None else camera.hfov_deg, traits)
     except OptionError as error:
         raise ConfigError(f"[source.pose]: {error}") from error
+    if config.grid and mount is None:  # which other models than the live one have no use for
+        raise ConfigError("[grid]: needs the live model and the ground: state height_m and tilt_deg in [source.pose]")
     is_foreign_field = _is_foreign_field(camera, traits) or (isinstance(fit, Fit) and lens is not None)
     flags = {"fps": is_foreign_rate, "hfov": is_foreign_field}
     ood = tuple(name for name, is_raised in flags.items() if is_raised)

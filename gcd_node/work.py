@@ -86,7 +86,7 @@ class WorkConditions:
         """Whether the model knows such a source, and how it moved; the same for all views of a window."""
         self._motion.update({"message": view.lost[0], "frames": len(view.lost)} if view.lost else None)
         self._health.ood_score = view.ood
-        is_foreign = bool(world_flags(context.traits, view))
+        is_foreign = bool(world_flags(context.traits, view.ood))
         self._world.update({"message": _OTHER_WORLD, "ood_score": view.ood} if is_foreign else None)
 
     def remote_late(self, error: RemoteError | None) -> None:

@@ -21,16 +21,16 @@ OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "w
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
-    ("client/gcd_client", 8, 1_581),
-    ("model/gcd_model", 43, 9_819),
-    ("tests/model", 28, 6_295),
-    ("gcd_node", 67, 15_113),
-    ("tests/node", 42, 12_010),
+    ("client/gcd_client", 9, 1_816),
+    ("model/gcd_model", 44, 10_108),
+    ("tests/model", 29, 6_416),
+    ("gcd_node", 68, 15_271),
+    ("tests/node", 43, 12_074),
     ("train/gcd_train", 116, 27_362),
     ("tests/train", 72, 14_962),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is
-new alone: lately canonical views, a fleet behind Ray Serve, and novel views in LeRobot sets and ROS 2 bags."""
+new alone: lately canonical views, grids, a fleet behind Ray Serve, and novel views in LeRobot sets and ROS 2 bags."""
 MOST_DOCS, MOST_README = (14, 1_900), 90
 
 

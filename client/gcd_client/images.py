@@ -1,14 +1,15 @@
-"""Pixels of a message as arrays: raw and JPEG pictures, class maps, visibility, inverse depth; each in colour."""
+"""Pixels of a message as arrays: raw and JPEG pictures, class maps, visibility, inverse depth; each in colour. And the
+cells of a grid."""
 
 import struct
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcd_client.endpoints import SetupError
-from gcd_client.protocol import ClassRecord, MessageError, ViewMessage
+from gcd_client.protocol import ClassRecord, GridMessage, MessageError, ViewMessage
 
 PAINTED, SEEN_BEFORE, SEEN_NOW = 0, 1, 2  # pixels of kind vis
 VISIBILITY = (
@@ -16,6 +17,7 @@ VISIBILITY = (
     ClassRecord(id=SEEN_BEFORE, name="seen_before", colour=(147, 197, 253)),
     ClassRecord(id=SEEN_NOW, name="seen_now", colour=(29, 78, 216)),
 )
+UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # occupancy of a cell, as in nav_msgs/OccupancyGrid
 _MIDDLE_GREY = 0.1  # 1/m: 10 m away is shown at half brightness
 
 
@@ -74,6 +76,48 @@ def paint(numbers: NDArray[np.uint8], classes: Sequence[ClassRecord]) -> NDArray
     painted = palette[numbers]
     painted.flags.writeable = False
     return painted
+
+
+class GridLayers(NamedTuple):
+    """The cells of a grid, [H, W] each: rows along y, columns along x.
+
+    occupancy: int8, UNKNOWN, FREE or OCCUPIED. visibility: uint8, SEEN_NOW, SEEN_BEFORE or 0, never seen. classes:
+    uint8. height_m: float32, over the ground. age_ms: uint16, since it was seen. 0 in cells that were never seen.
+    """
+
+    occupancy: NDArray[np.int8]
+    visibility: NDArray[np.uint8]
+    classes: NDArray[np.uint8]
+    height_m: NDArray[np.float32]
+    age_ms: NDArray[np.uint16]
+
+
+_LAYERS = ("i1", "u1", "u1", "<f2", "<u2")
+
+
+def layers(message: GridMessage) -> GridLayers:
+    """Raises MessageError: a value that no such layer has, such as NaN; or free or occupied, and never seen."""
+    shape, payload, at, found = message.header.shape, message.payload, 0, list[NDArray[Any]]()
+    for kind in map(np.dtype, _LAYERS):
+        size = shape[0] * shape[1]
+        found.append(np.frombuffer(payload, kind, size, at).reshape(shape))
+        at += size * kind.itemsize
+    occupancy, visibility, classes, height_m, age_ms = found
+    known, numbers = occupancy != UNKNOWN, [each.id for each in message.header.classes]
+    if not (
+        np.isin(occupancy, (UNKNOWN, FREE, OCCUPIED)).all()
+        and (visibility <= SEEN_NOW).all()
+        and visibility[known].all()
+        and np.isin(classes[visibility > 0], numbers).all()
+        and np.isfinite(height_m).all()
+    ):
+        raise MessageError(f"{message.topic} holds cells that contradict themselves")
+    return GridLayers(occupancy, visibility, classes, height_m.astype(np.float32), age_ms)
+
+
+def grid_payload(cells: GridLayers) -> bytes:
+    """Inverse of layers()."""
+    return b"".join(layer.astype(kind).tobytes() for layer, kind in zip(cells, _LAYERS, strict=True))
 
 
 def payload_of(pixels: NDArray[np.uint8]) -> memoryview:

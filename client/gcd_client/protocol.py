@@ -13,25 +13,36 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_args
 import msgspec
 from msgspec import Meta, field
 
-PROTO, MAPS_PROTO, PUSH_PROTO = "gcd/1.0", "gcd/1.1", "gcd/1.2"  # of a message: the first minor that has its kind
+from gcd_client.records import LARGEST_INTEGER as LARGEST_INTEGER
+from gcd_client.records import (
+    ClassRecord,
+    MessageError,
+    ModelRecord,
+    Nanosec,
+    Number,
+    PoseDelta,
+    QualityRecord,
+    Record,
+    SourcePoseRecord,
+    SourceRecord,
+    Whole,
+)
+from gcd_client.records import ClientError as ClientError
+
+PROTO, MAPS_PROTO, PUSH_PROTO, GRID_PROTO = (f"gcd/1.{minor}" for minor in range(4))  # the first minor that has a kind
 PREFIX = struct.Struct("<32s4sHHQQII")  # topic, magic, header length / 16, flags, payload length, sequence, CRC32, 0
 MAGIC, TOPIC_BYTES, MAX_HEADER, MAX_PAYLOAD = b"GCD1", 32, 64 * 1024, 64 * 1024 * 1024
 HAS_PAYLOAD, END_OF_STREAM, REPLAY_CLOCK = 1, 2, 4  # flags; readers ignore others
 WELCOME = bytes(PREFIX.size)  # sent to each new subscriber; not a message
 PREVIEW_ID, PREVIEW_TOPIC = "src", "src/frm"  # the input, in place of a view
-LARGEST_INTEGER = 2**53 - 1  # larger JSON integers change silently in readers that hold numbers as doubles
+CELL_BYTES = 7  # of a grid, all layers together
 
 Part: TypeAlias = bytes | memoryview
 ViewKind: TypeAlias = Literal["win", "frm", "std", "cls", "vis", "depth"]
 StatusTopic: TypeAlias = Literal["status", "event", "meta"]
 FrameRole: TypeAlias = Literal["in_transit", "at_goal"]
-
-Whole: TypeAlias = Annotated[int, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
-Number: TypeAlias = Annotated[float, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
-Byte: TypeAlias = Annotated[int, Meta(ge=0, le=255)]
-Nanosec: TypeAlias = Annotated[int, Meta(ge=0, lt=1_000_000_000)]
-Colour: TypeAlias = Annotated[tuple[Byte, ...], Meta(min_length=3, max_length=3)]
-Shape: TypeAlias = Annotated[tuple[Annotated[int, Meta(ge=1, le=65535)], ...], Meta(min_length=4, max_length=4)]
+_Side: TypeAlias = Annotated[int, Meta(ge=1, le=65535)]
+Shape: TypeAlias = Annotated[tuple[_Side, ...], Meta(min_length=4, max_length=4)]
 Matrix3: TypeAlias = Annotated[tuple[Number, ...], Meta(min_length=9, max_length=9)]
 Matrix4: TypeAlias = Annotated[tuple[Number, ...], Meta(min_length=16, max_length=16)]
 
@@ -40,92 +51,9 @@ _TIMES = ("t_publish", "t_infer_start", "t_infer_end")  # [sec, nanosec] in JSON
 _CHANNELS = {"rgb8": 3, "jpeg": 3, "class8": 1, "mono8": 1, "invdepth16": 1}
 _OF_KIND = {"cls": "class8", "vis": "class8", "depth": "invdepth16"}
 _KINDS = "|".join(get_args(ViewKind))
-_VIEW_TOPIC = re.compile(rf"view/(?!{PREVIEW_ID}/)([a-z0-9_]{{1,16}})/(?:{_KINDS})|({PREVIEW_ID})/frm")
+_ID = rf"((?!{PREVIEW_ID}(?:/|$))[a-z0-9_]{{1,16}})"
+_DATA_TOPIC = re.compile(rf"view/{_ID}/(?:{_KINDS})|({PREVIEW_ID})/frm|grid/{_ID}")
 _VERSION = re.compile(r"gcd/1\.[0-9]{1,4}")
-
-
-class ClientError(Exception):
-    """Root of this package's errors. exit_code: for command lines, as in sysexits."""
-
-    exit_code = 70
-
-
-class MessageError(ClientError):
-    """Bytes that are not a valid message of this protocol."""
-
-    exit_code = 65
-
-
-class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """A header, or a part of one. Text is printable."""
-
-    def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
-            value = getattr(self, name)
-            for text in value if isinstance(value, tuple) else (value,):
-                if isinstance(text, str) and not text.isprintable():
-                    raise MessageError(f"{name} must be printable text, got {text!a:.60}")
-
-
-class SourceRecord(Record, frozen=True, kw_only=True):
-    """The source of the input frames. seq: its own frame numbers, gaps included, one for each entry of t_capture.
-    dropped: frames lost so far. fps_in, fps_cond: of the source, and as the model was told. resize: how frames were
-    resized. epoch: rises when the source was lost and came back, or its clock or format jumped."""
-
-    kind: str
-    id: str
-    seq: tuple[Whole, ...]
-    dropped: Whole
-    fps_in: Number
-    fps_cond: Number
-    resize: str
-    epoch: Whole = 0
-
-
-class PoseDelta(Record, frozen=True, kw_only=True):
-    """Destination minus source on the sphere; degrees, and r in `pose_units`."""
-
-    az_deg: Number
-    el_deg: Number
-    r: Number
-
-
-class SourcePoseRecord(Record, frozen=True, kw_only=True):
-    """Pose of the source camera; assumed: not measured."""
-
-    el_deg: Number
-    r: Number
-    assumed: bool
-
-
-class QualityRecord(Record, frozen=True, kw_only=True, omit_defaults=True):
-    """nan_frames: frames with non-finite values. ood: what is outside the trained domain: "fps", "hfov", "exposure",
-    "static", "world". ood_score: unlikeness to the training, 0 to 1; None: the model does not estimate it.
-    steps, seed: of the sampler."""
-
-    nan_frames: Whole
-    ood: tuple[str, ...]
-    steps: Whole
-    seed: Whole
-    ood_score: Number | None = None
-
-
-class ModelRecord(Record, frozen=True, kw_only=True):
-    """The model that drew the pixels. sha256_12: first 12 hex digits of the weights' SHA-256."""
-
-    name: str
-    family: str
-    sha256_12: str
-    precision: str
-    device: str
-
-
-class ClassRecord(Record, frozen=True, kw_only=True):
-    """A class of a class map: its number in the pixels, a name, an RGB colour for display."""
-
-    id: Byte
-    name: str
-    colour: Colour
 
 
 class OriginHeader(Record, frozen=True, kw_only=True):
@@ -146,18 +74,12 @@ class EndHeader(OriginHeader, frozen=True, kw_only=True):
     clock: Literal["realtime", "ptp", "replay"]
 
 
-class ViewHeader(OriginHeader, frozen=True, kw_only=True):
-    """What a reader must know of a view's pixels, T frames of shape [T, H, W, C].
+class CapturedHeader(OriginHeader, frozen=True, kw_only=True):
+    """Of a message that was made of input frames.
 
-    t_capture_ns: T mid-exposure stamps (or 1) in the domain `clock`, with uncertainty t_capture_unc_us.
+    t_capture_ns: mid-exposure stamps in the domain `clock`, with uncertainty t_capture_unc_us.
     age_ms: of the newest input frame at publish. valid_for_ms: ignore the message this long after t_publish_ns.
-    pose: T differences. source_from_view (T_src_dst): T row-major 4x4 matrices. Both in pose_units; None: unknown.
-    intrinsics (K): row-major 3x3, pixels of the generated image; None: unknown.
-    offsets: T+1 byte positions in a JPEG payload. scale: of kind `std`, value = u8 * scale. range: lowest and highest
-        level or class number. dtype: "f16" (little-endian) with encoding "invdepth16", else "u8". classes: of "class8".
-    synthetic: the pixels are generated, never evidence of free space. cfg_digest: names the node's configuration.
-
-    Raises MessageError where counts, encoding and shape do not fit together.
+    cfg_digest: names the node's configuration.
     """
 
     view_id: str
@@ -173,12 +95,26 @@ class ViewHeader(OriginHeader, frozen=True, kw_only=True):
     src: SourceRecord
     frame_id: str
     src_frame_id: str
-    frame_role: tuple[FrameRole, ...]
-    shape: Shape
-    encoding: Literal["rgb8", "jpeg", "class8", "mono8", "invdepth16"]
     quality: QualityRecord
     model: ModelRecord
     cfg_digest: str
+
+
+class ViewHeader(CapturedHeader, frozen=True, kw_only=True):
+    """What a reader must know of a view's pixels, T frames of shape [T, H, W, C], with T stamps or 1.
+
+    pose: T differences. source_from_view (T_src_dst): T row-major 4x4 matrices. Both in pose_units; None: unknown.
+    intrinsics (K): row-major 3x3, pixels of the generated image; None: unknown.
+    offsets: T+1 byte positions in a JPEG payload. scale: of kind `std`, value = u8 * scale. range: lowest and highest
+        level or class number. dtype: "f16" (little-endian) with encoding "invdepth16", else "u8". classes: of "class8".
+    synthetic: the pixels are generated, never evidence of free space.
+
+    Raises MessageError where counts, encoding and shape do not fit together.
+    """
+
+    frame_role: tuple[FrameRole, ...]
+    shape: Shape
+    encoding: Literal["rgb8", "jpeg", "class8", "mono8", "invdepth16"]
     pose: tuple[PoseDelta, ...] | None = None
     source_from_view: tuple[Matrix4, ...] | None = field(default=None, name="T_src_dst")
     pose_units: Literal["m", "scene"] = "scene"
@@ -220,6 +156,28 @@ class ViewHeader(OriginHeader, frozen=True, kw_only=True):
         return values if self.offsets is None else self.offsets[-1]
 
 
+class GridHeader(CapturedHeader, frozen=True, kw_only=True):
+    """What a reader must know of a grid: [H, W] cells about the vehicle, rows along y, columns along x.
+
+    view_id: the grid's. frame_id: x ahead, y left, z up, origin on the ground. origin_m: x and y of the outer corner of
+    the first cell. classes: what the numbers of the class layer mean. synthetic: nothing in it is painted.
+    """
+
+    shape: Annotated[tuple[_Side, ...], Meta(min_length=2, max_length=2)]
+    cell_m: Annotated[float, Meta(gt=0, le=LARGEST_INTEGER)]
+    origin_m: tuple[Number, Number]
+    classes: tuple[ClassRecord, ...]
+    synthetic: bool = False
+    proto: str = GRID_PROTO
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not len(self.t_capture_ns) == len(self.src.seq) == 1:
+            raise MessageError("a grid has one entry in t_capture and in src.seq")
+        if not 0 < len(self.classes) == len({each.id for each in self.classes}):
+            raise MessageError("the classes of a grid must be distinct")
+
+
 class ViewMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Pixels of a view. topic: `view/<id>/<kind>` or `src/frm`. sequence: counted on this topic by the publisher.
 
@@ -240,6 +198,21 @@ class ViewMessage(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("a message of kind std needs `scale` in its header")
         if len(self.payload) != self.header.payload_bytes:
             raise MessageError(f"payload must have {self.header.payload_bytes} bytes, got {len(self.payload)}")
+
+
+class GridMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Cells of the topic `grid/<id>`; `gcd_client.images.layers` reads them. Raises MessageError as ViewMessage."""
+
+    topic: str
+    header: GridHeader
+    payload: bytes | memoryview
+    sequence: int = 0
+
+    def __post_init__(self) -> None:
+        _check_view_id(self.topic, self.header.view_id)
+        size = CELL_BYTES * math.prod(self.header.shape)
+        if not is_grid(self.topic) or len(self.payload) != size:
+            raise MessageError(f"{self.topic} of {list(self.header.shape)} has {size} bytes, got {len(self.payload)}")
 
 
 class EndMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -263,14 +236,15 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 Header = TypeVar("Header", bound=OriginHeader)
-Message: TypeAlias = ViewMessage | EndMessage | StatusMessage
+DataMessage: TypeAlias = ViewMessage | GridMessage
+Message: TypeAlias = DataMessage | EndMessage | StatusMessage
 
 
 def encode(message: Message, *, checksum: bool = True) -> bytes:
     """One ZeroMQ part. checksum: False for bytes that stay in this machine's memory: computing it takes longer than
     sending them. Raises MessageError: the header is not plain JSON with finite numbers, or longer than 64 KiB."""
     text = to_text(message.header, message.fields if isinstance(message, StatusMessage) else {})
-    payload = (message.payload,) if isinstance(message, ViewMessage) else ()
+    payload = (message.payload,) if isinstance(message, DataMessage) else ()
     return pack(topic_key(message.topic), flags_of(message), message.sequence, text, *payload, checksum=checksum)
 
 
@@ -340,27 +314,40 @@ def to_text(header: OriginHeader, fields: Mapping[str, Any]) -> bytes:
 
 def flags_of(message: Message) -> int:
     """The prefix bits that follow from the content."""
-    content = {ViewMessage: HAS_PAYLOAD, EndMessage: END_OF_STREAM, StatusMessage: 0}[type(message)]
+    ended, note = isinstance(message, EndMessage), isinstance(message, StatusMessage)
+    content = END_OF_STREAM if ended else 0 if note else HAS_PAYLOAD
     return content | (REPLAY_CLOCK if getattr(message.header, "clock", "") == "replay" else 0)
 
 
 def view_topic(view_id: str, kind: ViewKind) -> str:
     """The topic of a view, or of the preview of the input ("src", "frm"). Raises MessageError for others."""
     topic = PREVIEW_TOPIC if (view_id, kind) == (PREVIEW_ID, "frm") else f"view/{view_id}/{kind}"
-    if _VIEW_TOPIC.fullmatch(topic) is None:
+    if _DATA_TOPIC.fullmatch(topic) is None:
         raise MessageError(f"a view id is 1 to 16 of a-z, 0-9 and _, or src of kind frm; got {view_id!a:.60}, {kind}")
     return topic
 
 
+def grid_topic(grid_id: str) -> str:
+    """The topic of a grid. Raises MessageError for others."""
+    topic_key(topic := f"grid/{grid_id}")
+    return topic
+
+
+def is_grid(topic: str) -> bool:
+    """Whether it is the topic of a grid, if it is one at all."""
+    return topic.startswith("grid/")
+
+
 def kind_of(topic: str) -> str:
-    """The last part of a view's topic: its ViewKind."""
-    return topic.rpartition("/")[2]
+    """The last part of a view's topic: its ViewKind; of a grid's its first, "grid"."""
+    return "grid" if is_grid(topic) else topic.rpartition("/")[2]
 
 
 def topic_key(topic: str) -> bytes:
     """What to subscribe to for this topic alone: 32 bytes, NUL-padded, so no topic is a prefix of another."""
-    if _VIEW_TOPIC.fullmatch(topic) is None and topic not in get_args(StatusTopic):
-        raise MessageError(f"a topic is view/<id>/{_KINDS}, {PREVIEW_TOPIC}, status, event, meta; got {topic!a:.60}")
+    if _DATA_TOPIC.fullmatch(topic) is None and topic not in get_args(StatusTopic):
+        known = f"view/<id>/{_KINDS}, grid/<id>, {PREVIEW_TOPIC}, status, event, meta"
+        raise MessageError(f"a topic is {known}; got {topic!a:.60}")
     return topic.encode("ascii").ljust(TOPIC_BYTES, b"\0")
 
 
@@ -376,6 +363,8 @@ def _message(topic: str, content: dict[str, Any], payload: memoryview, sequence:
         return StatusMessage(topic=topic, header=_header(OriginHeader, content), fields=fields, sequence=sequence)
     if ends:
         return EndMessage(topic=topic, header=_header(EndHeader, content), sequence=sequence)
+    if is_grid(topic):
+        return GridMessage(topic=topic, header=_header(GridHeader, content), payload=payload, sequence=sequence)
     return ViewMessage(topic=topic, header=_header(ViewHeader, content), payload=payload, sequence=sequence)
 
 
@@ -394,6 +383,6 @@ def _nanoseconds(pair: Any) -> int:
 
 
 def _check_view_id(topic: str, view_id: str) -> None:
-    match = _VIEW_TOPIC.fullmatch(topic)
+    match = _DATA_TOPIC.fullmatch(topic)
     if match is None or view_id not in match.groups():
         raise MessageError(f"topic {topic!a:.60} does not belong to view_id {view_id!a:.60}")

@@ -1,4 +1,4 @@
-"""Receives views and status messages, checked and newest first.
+"""Receives views, grids and status messages, checked and newest first.
 
     with ViewSubscriber("ipc", "topdown", max_age_ms=1000) as views:
         for view in views:
@@ -17,30 +17,66 @@ import zmq
 
 from gcd_client import protocol
 from gcd_client.endpoints import Client, ClientKeys, Connection, SetupError, Steps, resolve_endpoint
-from gcd_client.protocol import EndMessage, Message, StatusMessage, StatusTopic, ViewHeader, ViewKind, ViewMessage
+from gcd_client.protocol import (
+    DataMessage,
+    EndMessage,
+    GridHeader,
+    GridMessage,
+    Message,
+    StatusMessage,
+    StatusTopic,
+    ViewHeader,
+    ViewKind,
+    ViewMessage,
+)
 
 if TYPE_CHECKING:  # numpy takes longer to import than all the rest
     import numpy as np
     from numpy.typing import NDArray
 
+    from gcd_client.images import GridLayers
+
 Item = TypeVar("Item")
 _STOP_MS = 200.0
 
 
-class ReceivedView(msgspec.Struct, frozen=True, kw_only=True):
-    """A view and how it arrived.
+class _Received(msgspec.Struct, frozen=True, kw_only=True):
+    """How a message arrived.
 
     age_ms: of its newest input frame now: age at publish, plus the time since by both machines' wall clocks.
     expired: more than `valid_for_ms` after publish; a planner must ignore it.
     skipped: messages of this topic that were published since the last one received here, but not received.
-    restarted: the first view after a restart of the node; forget what was tied to the old one.
+    restarted: the first one after a restart of the node; forget what was tied to the old one.
     """
 
-    message: ViewMessage
     age_ms: float
     expired: bool
     skipped: int
     restarted: bool
+
+
+class ReceivedGrid(_Received, frozen=True, kw_only=True):
+    """A grid and how it arrived."""
+
+    message: GridMessage
+
+    @property
+    def header(self) -> GridHeader:
+        """The message's header."""
+        return self.message.header
+
+    @property
+    def layers(self) -> "GridLayers":
+        """Its cells; see gcd_client.images."""
+        from gcd_client.images import layers
+
+        return layers(self.message)
+
+
+class ReceivedView(_Received, frozen=True, kw_only=True):
+    """A view and how it arrived."""
+
+    message: ViewMessage
 
     @property
     def header(self) -> ViewHeader:
@@ -144,7 +180,82 @@ class _Stream(msgspec.Struct, kw_only=True):
     ended: bool = False
 
 
-class ViewSubscriber(Subscriber[ReceivedView]):
+class DataSubscriber(Subscriber[Item]):
+    """What subscribers of views and of grids share.
+
+    It counts messages: received; skipped, by gaps in the sequence; outdated, of an older view_rev or a repeated
+    sequence; stale, older than max_age_ms; and restarts of the node.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        topics: set[bytes],
+        conflate: bool,
+        max_payload: int,
+        keys: ClientKeys | None,
+        max_age_ms: float | None,
+    ) -> None:
+        super().__init__(resolve_endpoint(endpoint, "data"), topics, conflate, max_payload, keys)
+        self._max_age_ms, self._boot_id, self._restarted = max_age_ms, "", False
+        self._streams: dict[str, _Stream] = {}
+        self.received = self.skipped = self.outdated = self.stale = self.restarts = 0
+
+    @property
+    def ended(self) -> bool:
+        """Whether every topic seen has ended; false again once a new message comes."""
+        return bool(self._streams) and all(stream.ended for stream in self._streams.values())
+
+    def _wants(self, topic: str) -> bool:
+        """Whether it is one of its topics."""
+        raise NotImplementedError
+
+    def _item(self, message: DataMessage, how: _Received) -> Item | None:
+        """What is handed out. how: it arrived."""
+        raise NotImplementedError
+
+    def _accept(self, message: Message) -> Item | None:
+        if isinstance(message, StatusMessage) or not self._wants(message.topic):
+            return None
+        if self._boot_id not in ("", message.header.boot_id):
+            self._streams.clear()
+            self._restarted, self.restarts = True, self.restarts + 1
+        self._boot_id = message.header.boot_id
+        if isinstance(message, EndMessage):
+            stream = self._streams.setdefault(message.topic, _Stream(sequence=message.sequence))
+            stream.sequence, stream.ended = message.sequence, True
+            return None
+        skipped = self._advance(message)
+        return None if skipped is None else self._received(message, skipped)
+
+    def _advance(self, message: DataMessage) -> int | None:
+        """How many messages were missed before this one; None: it is outdated."""
+        revision = message.header.view_rev
+        stream = self._streams.setdefault(message.topic, _Stream(sequence=message.sequence - 1, view_rev=revision))
+        skipped = message.sequence - stream.sequence - 1
+        if skipped < 0 or revision < stream.view_rev:
+            stream.sequence = max(stream.sequence, message.sequence)
+            self.outdated += 1
+            return None
+        stream.sequence, stream.view_rev, stream.ended = message.sequence, revision, False
+        self.skipped += skipped
+        return skipped
+
+    def _received(self, message: DataMessage, skipped: int) -> Item | None:
+        header = message.header
+        since_ms = max(0.0, (time.time_ns() - header.t_publish_ns) / 1e6)  # clocks of two machines may disagree
+        age_ms = header.age_ms + since_ms
+        if self._max_age_ms is not None and age_ms > self._max_age_ms:
+            self.stale += 1
+            return None
+        restarted, self._restarted = self._restarted, False
+        self.received += 1
+        expired = since_ms > header.valid_for_ms
+        how = _Received(age_ms=age_ms, expired=expired, skipped=skipped, restarted=restarted)
+        return self._item(message, how)
+
+
+class ViewSubscriber(DataSubscriber[ReceivedView]):
     """Views of one node.
 
     endpoint: "ipc" for the node on this machine, or ipc://PATH, tcp://HOST:PORT.
@@ -155,9 +266,6 @@ class ViewSubscriber(Subscriber[ReceivedView]):
     conflate: keep only the newest message, so that a slow reader never works on old ones.
     max_age_ms: older views are left out; None: no limit. max_payload: largest payload accepted, bytes.
     keys: for a node that asks for them.
-
-    It counts views: received; skipped, by gaps in the sequence; outdated, of an older view_rev or a repeated sequence;
-    stale, older than max_age_ms; and restarts of the node.
 
     Raises:
         SetupError: no such endpoint, or all views or kinds are to be conflated. MessageError: no such view id.
@@ -178,55 +286,42 @@ class ViewSubscriber(Subscriber[ReceivedView]):
         if conflate and (view is None or len(kinds) > 1 or None in kinds):
             raise SetupError("a conflated socket keeps one message: name a view and a kind, or set conflate=False")
         topics = {_subscription(view, each) for each in kinds}
-        super().__init__(resolve_endpoint(endpoint, "data"), topics, conflate, max_payload, keys)
+        super().__init__(endpoint, topics, conflate, max_payload, keys, max_age_ms)
         self._suffixes = tuple("" if each is None else f"/{each}" for each in kinds)
-        self._max_age_ms, self._boot_id, self._restarted = max_age_ms, "", False
-        self._streams: dict[str, _Stream] = {}
-        self.received = self.skipped = self.outdated = self.stale = self.restarts = 0
 
-    @property
-    def ended(self) -> bool:
-        """Whether every view seen has ended; false again once a new message comes."""
-        return bool(self._streams) and all(stream.ended for stream in self._streams.values())
+    def _wants(self, topic: str) -> bool:
+        return topic.endswith(self._suffixes)
 
-    def _accept(self, message: Message) -> ReceivedView | None:
-        if isinstance(message, StatusMessage) or not message.topic.endswith(self._suffixes):
-            return None
-        if self._boot_id not in ("", message.header.boot_id):
-            self._streams.clear()
-            self._restarted, self.restarts = True, self.restarts + 1
-        self._boot_id = message.header.boot_id
-        if isinstance(message, EndMessage):
-            stream = self._streams.setdefault(message.topic, _Stream(sequence=message.sequence))
-            stream.sequence, stream.ended = message.sequence, True
-            return None
-        skipped = self._advance(message)
-        return None if skipped is None else self._received(message, skipped)
+    def _item(self, message: DataMessage, how: _Received) -> ReceivedView | None:
+        return (
+            ReceivedView(message=message, **msgspec.structs.asdict(how)) if isinstance(message, ViewMessage) else None
+        )
 
-    def _advance(self, message: ViewMessage) -> int | None:
-        """How many messages were missed before this one; None: it is outdated."""
-        revision = message.header.view_rev
-        stream = self._streams.setdefault(message.topic, _Stream(sequence=message.sequence - 1, view_rev=revision))
-        skipped = message.sequence - stream.sequence - 1
-        if skipped < 0 or revision < stream.view_rev:
-            stream.sequence = max(stream.sequence, message.sequence)
-            self.outdated += 1
-            return None
-        stream.sequence, stream.view_rev, stream.ended = message.sequence, revision, False
-        self.skipped += skipped
-        return skipped
 
-    def _received(self, message: ViewMessage, skipped: int) -> ReceivedView | None:
-        header = message.header
-        since_ms = max(0.0, (time.time_ns() - header.t_publish_ns) / 1e6)  # clocks of two machines may disagree
-        age_ms = header.age_ms + since_ms
-        if self._max_age_ms is not None and age_ms > self._max_age_ms:
-            self.stale += 1
-            return None
-        restarted, self._restarted = self._restarted, False
-        self.received += 1
-        expired = since_ms > header.valid_for_ms
-        return ReceivedView(message=message, age_ms=age_ms, expired=expired, skipped=skipped, restarted=restarted)
+class GridSubscriber(DataSubscriber[ReceivedGrid]):
+    """A grid of one node. grid: its id. For all else see ViewSubscriber. Raises as that."""
+
+    def __init__(
+        self,
+        endpoint: str = "ipc",
+        grid: str = "around",
+        *,
+        conflate: bool = True,
+        max_age_ms: float | None = None,
+        max_payload: int = protocol.MAX_PAYLOAD,
+        keys: ClientKeys | None = None,
+    ) -> None:
+        self._topic = protocol.grid_topic(grid)
+        topics = {protocol.topic_key(self._topic)}
+        super().__init__(endpoint, topics, conflate, max_payload, keys, max_age_ms)
+
+    def _wants(self, topic: str) -> bool:
+        return topic == self._topic
+
+    def _item(self, message: DataMessage, how: _Received) -> ReceivedGrid | None:
+        return (
+            ReceivedGrid(message=message, **msgspec.structs.asdict(how)) if isinstance(message, GridMessage) else None
+        )
 
 
 class StatusSubscriber(Subscriber[StatusMessage]):

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from msgspec.structs import replace
 
-from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
+from gcd_client.protocol import DataMessage, EndMessage, GridMessage, OriginHeader, StatusTopic, ViewMessage, kind_of
 from gcd_model import Traits
 from gcd_node.config import LifeConfig, NodeConfig
 from gcd_node.errors import ConfigError, ModelFailedError, OutputError, SourceError
@@ -40,7 +40,7 @@ from gcd_node.replay.run import (
     open_run,
     pixel_digest,
 )
-from gcd_node.ros_messages import McapFile, RosMessage, view_messages, write_bag_metadata
+from gcd_node.ros_messages import McapFile, RosMessage, data_messages, write_bag_metadata
 from gcd_node.session import load_model, model_threads
 from gcd_node.sources import LiveSource, SourceConfig, SyntheticSource, open_source, resolve_path
 from gcd_node.stream_context import config_digest
@@ -162,14 +162,14 @@ class NullSink:
 
 
 class BagWriter(NullSink):
-    """Writes views into a file. recorded_after_ns: see SourceInfo."""
+    """Writes views and grids into a file. recorded_after_ns: see SourceInfo."""
 
     def __init__(self, file: McapFile, config: NodeConfig) -> None:
         super().__init__()
         self._file, self.recorded_after_ns, self._config = file, 0, config
 
-    def send(self, message: ViewMessage) -> bool:
-        """Take a view; see MessageSink. Raises OutputError."""
+    def send(self, message: DataMessage) -> bool:
+        """Take a view or a grid; see MessageSink. Raises OutputError."""
         if kind_of(message.topic) != "frm":  # a frame is part of its window
             try:
                 self._file.write(self._at_capture(message))
@@ -177,10 +177,10 @@ class BagWriter(NullSink):
                 raise OutputError(f"cannot write {self._file.path}: {error.strerror}; make room on its disk") from error
         return True
 
-    def _at_capture(self, message: ViewMessage) -> Iterator[RosMessage]:
+    def _at_capture(self, message: DataMessage) -> Iterator[RosMessage]:
         """Its ROS messages at the time of their stamps, by image_transport's names. Ages of a replay mean nothing."""
         newest_ns = message.header.t_capture_ns[-1]
-        for each in view_messages(message, self._config):
+        for each in data_messages(message, self._config):
             head = getattr(each.fields, "header", None)
             stamp_ns = newest_ns if head is None else head.stamp.sec * 10**9 + head.stamp.nanosec
             at_ns = stamp_ns + self.recorded_after_ns
@@ -193,7 +193,7 @@ class BagWriter(NullSink):
 class RunWriter(NullSink):
     """Keeps the windows of a lockstep node and their maps.
 
-    Single frames are part of their window, and deviations of its samples: neither is kept.
+    Single frames are part of their window, and deviations of its samples: neither is kept; grids are not, either.
     """
 
     def __init__(self, folder: Path, on_window: Callable[[WindowReport], None] | None) -> None:
@@ -206,11 +206,12 @@ class RunWriter(NullSink):
 
     _ood: tuple[str, ...]
 
-    def send(self, message: ViewMessage) -> bool:
+    def send(self, message: DataMessage) -> bool:
         """Take a view; see MessageSink. Raises OutputError."""
-        header, kind = message.header, kind_of(message.topic)
-        if kind not in ("win", "cls", "vis", "depth"):
+        kind = kind_of(message.topic)
+        if isinstance(message, GridMessage) or kind not in ("win", "cls", "vis", "depth"):
             return True
+        header = message.header
         frames, height, width, channels = header.shape
         shape = (frames, height, width, 3) if channels == 3 else (frames, height, -1)
         pixels = np.frombuffer(message.payload, np.uint8).reshape(shape)

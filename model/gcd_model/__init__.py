@@ -47,6 +47,7 @@ from gcd_model.live.alignment import (
 )
 from gcd_model.live.ego_motion import require_motion
 from gcd_model.live.eyes import PlacedFrame, SeenFrame
+from gcd_model.live.grid import Grid, GridMapper
 from gcd_model.live.synthesizer import visibility_of
 from gcd_model.loading import export_weights, load_synthesizer, placement, weights_path
 from gcd_model.small_files import decode_toml, explain_settings_error, printable, read_json, read_small
@@ -69,6 +70,8 @@ __all__ = [
     "Features",
     "FileError",
     "FrameSynthesizer",
+    "Grid",
+    "GridMapper",
     "Intrinsics",
     "Landmarks",
     "ModelError",

@@ -8,9 +8,15 @@ from typing import Any, ClassVar
 from unittest.mock import MagicMock
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+for name, text in {  # of the package grid_map_msgs, as far as it is sent
+    "GridMapInfo": "float64 resolution\nfloat64 length_x\nfloat64 length_y\ngeometry_msgs/Pose pose",
+    "GridMap": "std_msgs/Header header\ngrid_map_msgs/GridMapInfo info\nstring[] layers\nstring[] basic_layers\n"
+    "std_msgs/Float32MultiArray[] data\nuint16 outer_start_index\nuint16 inner_start_index",
+}.items():
+    STORE.register(get_types_from_msg(text, f"grid_map_msgs/msg/{name}"))
 
 
 def message_class(name: str) -> type:

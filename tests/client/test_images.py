@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from wire_messages import CLASSES, class_map, depth, pixels, view_header, window
+from wire_messages import CLASSES, cells, class_map, depth, grid, pixels, view_header, window
 
-from gcd_client.images import colours, decode_jpegs, depth_m, encode_jpegs, images, inverse_depth
+from gcd_client.images import GridLayers, colours, decode_jpegs, depth_m, encode_jpegs, images, inverse_depth, layers
 from gcd_client.protocol import MessageError, ViewMessage, decode, encode
 
 
@@ -42,6 +42,23 @@ def test_nearer_is_brighter_and_no_depth_is_black() -> None:
     shown = colours(depth(inverse=np.array([[[0, 0.005, 0.1, 1, 65504]]], "<f2")))[0, 0, :, 0]
     assert (np.diff(shown.astype(int)) > 0).all()
     assert shown[0] == 0
+
+
+def test_cells_of_a_grid_come_back_as_they_were_sent() -> None:
+    message = decode(encode(grid()))
+    for sent, read in zip(cells(), layers(message), strict=True):
+        assert (sent.dtype, sent.tolist()) == (read.dtype, read.tolist())
+
+
+@pytest.mark.parametrize(
+    ("layer", "value"),
+    [("occupancy", 50), ("visibility", 3), ("visibility", 0), ("classes", 9), ("height_m", math.nan)],
+)
+def test_cells_that_contradict_themselves_are_refused(layer: str, value: float) -> None:
+    broken = cells()._asdict()
+    broken[layer] = np.full_like(broken[layer], value)
+    with pytest.raises(MessageError):
+        layers(grid(GridLayers(**broken)))
 
 
 def test_a_class_map_is_shown_in_the_colours_of_its_ontology() -> None:

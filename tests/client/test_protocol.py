@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from wire_messages import class_map, depth, end, origin, pixels, view_header, visibility, window
+from wire_messages import class_map, depth, end, grid, origin, pixels, view_header, visibility, window
 
 from gcd_client.images import payload_of
 from gcd_client.protocol import (
     MAGIC,
     PREFIX,
+    DataMessage,
     EndMessage,
     Message,
     MessageError,
@@ -60,6 +61,8 @@ MESSAGES: dict[str, Message] = {
     "jpeg": jpeg(),
     "no camera": unknown_camera(),
     "end": end(window_id=9),
+    "grid": grid(),
+    "grid end": EndMessage(topic="grid/around", header=replace(end().header, view_id="around", proto="gcd/1.3")),
     "status": status({"state": "active", "reasons": ["SRC_LOST"], "level": 2, "t_infer_start": "any field is allowed"}),
 }
 
@@ -77,7 +80,7 @@ def raw(header: bytes, payload: bytes = b"", *, topic: bytes = b"view/top/win", 
     return PREFIX.pack(topic, MAGIC, len(header) // 16, flags, len(payload), 0, crc, 0) + header + payload
 
 
-def changed(message: ViewMessage, changes: Mapping[str, Any], *, removed: str = "") -> bytes:
+def changed(message: DataMessage, changes: Mapping[str, Any], *, removed: str = "") -> bytes:
     """The message with other header values."""
     header, payload = split(encode(message))
     header = {key: value for key, value in (header | changes).items() if key != removed}
@@ -193,17 +196,21 @@ BAD_CLASSES = [
     for change in ({"id": 256}, {"id": -1}, {"colour": [0, 0, 256]}, {"colour": [0, 0]}, {"name": "\x7f"})
 ]
 BAD_OFFSETS = ([0, 5], [1, 5, 100], [0, 100, 100], [0, 101, 100], [-5, 0, 100], [], [0, 5, 10**9], None)
-BAD_HEADERS: list[tuple[ViewMessage, str, Any]] = [
+BAD_HEADERS: list[tuple[DataMessage, str, Any]] = [
     *((window(), key, value) for key, values in BAD_VALUES.items() for value in values),
     *((class_map(), "classes", classes) for classes in (None, [], {}, [CLASS, CLASS], [{"id": 1, "name": "a"}])),
     *((class_map(), "classes", [each]) for each in BAD_CLASSES),
     *((jpeg(), "offsets", offsets) for offsets in BAD_OFFSETS),
     (spread(), "scale", None),
+    *((grid(), "shape", shape) for shape in ([3, 3], [6], [2, 3, 1], [2, -3])),
+    *((grid(), "cell_m", cell_m) for cell_m in (0, -1.0, None)),
+    *((grid(), key, value) for key, value in (("view_id", "other"), ("origin_m", [0.0]), ("classes", [CLASS, CLASS]))),
+    (grid(), "t_capture", [[1, 2], [3, 4]]),
 ]
 
 
 @pytest.mark.parametrize(("message", "key", "value"), BAD_HEADERS, ids=lambda value: str(value)[:30])
-def test_a_wrong_header_value_is_refused(message: ViewMessage, key: str, value: object) -> None:
+def test_a_wrong_header_value_is_refused(message: DataMessage, key: str, value: object) -> None:
     with pytest.raises(MessageError):
         decode(changed(message, {key: value}))
 
@@ -283,8 +290,8 @@ def test_what_a_header_cannot_hold_is_refused_when_encoding() -> None:
 def test_the_protocol_page_names_every_header_key() -> None:
     header = split(encode(jpeg()))[0]
     nested = [*header["src"], *header["quality"], *header["model"], *header["pose"][0], *header["src_pose"]]
-    classes = split(encode(class_map()))[0]["classes"]
-    assert [key for key in (*header, *nested, "scale", "classes", *classes[0]) if f"`{key}`" not in PAGE] == []
+    classes, cells = split(encode(class_map()))[0]["classes"], split(encode(grid()))[0]
+    assert [key for key in (*header, *nested, "scale", "classes", *classes[0], *cells) if f"`{key}`" not in PAGE] == []
 
 
 def test_the_example_on_the_protocol_page_is_a_message() -> None:

@@ -25,7 +25,19 @@ from fakes import Steady
 from msgspec.structs import replace
 from rig import Rig
 from ros_stand_in import ROS, STORE, RosNode
-from wire_messages import CLASSES, OTHER_BOOT, class_map, depth, jpeg_window, numbers, origin, visibility, window
+from wire_messages import (
+    CLASSES,
+    OTHER_BOOT,
+    cells,
+    class_map,
+    depth,
+    grid,
+    jpeg_window,
+    numbers,
+    origin,
+    visibility,
+    window,
+)
 
 from gcd_client import AuthError, ViewSubscriber
 from gcd_client.images import depth_m
@@ -114,8 +126,25 @@ def test_states_and_transitions_are_those_of_ros_and_of_the_node() -> None:
     assert messages.to_verb(transition(id=99, label="")) is None
 
 
-def meta(*views: str) -> StatusMessage:
-    return StatusMessage(topic="meta", header=origin(), fields={"views": list(views)})
+def test_a_grid_map_is_read_by_its_own_rule_and_an_occupancy_grid_by_its_own() -> None:
+    """Of the cell at x = 0.25, y = 2.25: the third of the first row, seen before, 0.25 m high."""
+    occupancy, made = messages.to_occupancy_grid(grid(), "base"), messages.to_grid_map(grid(), "base")
+    assert (occupancy.info.width, occupancy.info.height, occupancy.info.resolution) == (3, 2, 0.5)
+    assert (occupancy.info.origin.position.x, occupancy.info.origin.position.y) == (-1.0, 2.0)
+    assert occupancy.data.tolist() == cells().occupancy.ravel().tolist()
+    planes = dict(zip(made.layers, made.data, strict=True))
+    (column, row), info = planes["elevation"].layout.dim, made.info
+    assert [(each.label, each.size) for each in (column, row)] == [("column_index", 2), ("row_index", 3)]
+    i = int((info.pose.position.x + info.length_x / 2 - 0.25) / info.resolution)
+    j = int((info.pose.position.y + info.length_y / 2 - 2.25) / info.resolution)
+    assert {name: plane.data[j * row.stride + i] for name, plane in planes.items() if name != "occupancy"} == {
+        "elevation": 0.25, "class": 1, "visibility": 1, "age": np.float32(0.9)
+    }  # fmt: skip
+    assert np.isnan(planes["occupancy"].data[j * row.stride + i])
+
+
+def meta(*views: str, grids: tuple[str, ...] = ()) -> StatusMessage:
+    return StatusMessage(topic="meta", header=origin(), fields={"views": list(views), "grids": list(grids)})
 
 
 @dataclass
@@ -125,6 +154,7 @@ class Bench:
     node: Any
     folder: Path
     sequence: int = 0
+    grids: tuple[str, ...] = ()
 
     def start(self) -> None:
         """The gcd node."""
@@ -142,7 +172,7 @@ class Bench:
         while not holds():
             assert time.monotonic() < deadline_s, "it did not come about"
             self.sequence += 1
-            for message in (status(), meta("top"), *sent):
+            for message in (status(), meta("top", grids=self.grids), *sent):
                 socket = self.sockets["status" if isinstance(message, StatusMessage) else "data"]
                 socket.send(encode(replace(message, sequence=self.sequence)))
             self.node.tick()
@@ -206,6 +236,16 @@ def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node
     assert [(each["id"], each["name"], tuple(each["colour"])) for each in json.loads(latched.data)] == [
         (each.id, each.name, each.colour) for each in CLASSES
     ]
+
+
+def test_a_grid_becomes_topics_of_its_own_in_the_frame_of_the_vehicle(bench: Bench) -> None:
+    topics = {f"~/grid_around/{name}" for name in ("occupancy", "grid_map", "class_names")}
+    bench.grids = ("around",)
+    bench.until(lambda: topics <= set(bench.node.published), grid())
+    headers = [bench.out(f"~/grid_around/{name}")[0].header for name in ("occupancy", "grid_map")]
+    assert {each.frame_id for each in headers} == {"base_link"}
+    stale = grid(t_publish_ns=time.time_ns() - 10**10, valid_for_ms=500)
+    bench.until(lambda: bench.diagnostic(2).counts.get("grid.expired", "0") != "0", stale)
 
 
 def test_what_is_old_or_on_its_way_is_never_published(bench: Bench) -> None:

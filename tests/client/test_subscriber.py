@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import zmq
 from msgspec.structs import replace
-from wire_messages import CLASSES, OTHER_BOOT, class_map, end, numbers, origin, pixels, window
+from wire_messages import CLASSES, OTHER_BOOT, cells, class_map, end, grid, numbers, origin, pixels, window
 
 import gcd_client
-from gcd_client import ReceivedView, SetupError, StatusMessage, StatusSubscriber, ViewSubscriber
-from gcd_client.protocol import Message, encode, topic_key
+from gcd_client import GridSubscriber, ReceivedView, SetupError, StatusMessage, StatusSubscriber, ViewSubscriber
+from gcd_client.protocol import EndMessage, Message, encode, topic_key
 
 pytestmark = pytest.mark.timeout(30)
 
@@ -204,6 +204,19 @@ def test_all_kinds_of_one_view_leave_other_views_out(sender: Sender) -> None:
         sender.numbered(1, end())
         found = [(view.message.topic, view.header.window_id) for view in views]
     assert found == [("view/top/win", 1), ("view/top/cls", 1)]
+
+
+def test_a_grid_arrives_alone_until_it_ends(sender: Sender) -> None:
+    with GridSubscriber(sender.endpoint, "around", conflate=False, max_age_ms=60_000) as grids:
+        sender.wait()
+        sender.send(window(), grid(view_id="around2"))
+        for sequence, age_ms in ((0, 1.0), (3, 1e6), (4, 2.0)):
+            sender.numbered(sequence, grid(age_ms=age_ms))
+        sender.numbered(5, EndMessage(topic="grid/around", header=replace(end().header, view_id="around")))
+        received = list(grids)
+    assert [(each.header.age_ms, each.skipped) for each in received] == [(1.0, 0), (2.0, 0)]
+    assert received[0].layers.occupancy.tolist() == cells().occupancy.tolist()
+    assert (grids.received, grids.stale, grids.skipped, grids.damaged, grids.ended) == (2, 1, 2, 0, True)
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,14 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from gcd_client.images import VISIBILITY, encode_jpegs, payload_of
+from gcd_client.images import VISIBILITY, GridLayers, encode_jpegs, grid_payload, payload_of
 from gcd_client.protocol import (
     MAPS_PROTO,
     ClassRecord,
     EndHeader,
     EndMessage,
+    GridHeader,
+    GridMessage,
     ModelRecord,
     OriginHeader,
     PoseDelta,
@@ -25,6 +27,7 @@ from gcd_client.protocol import (
     ViewHeader,
     ViewKind,
     ViewMessage,
+    grid_topic,
     view_topic,
 )
 from gcd_client.subscriber import ReceivedView
@@ -148,6 +151,26 @@ def depth(window_id: int = 0, *, inverse: NDArray[np.float16] | None = None) -> 
     header = replace(view_header(window_id=window_id, shape=(*inverse.shape, 1)), proto=MAPS_PROTO)
     header = replace(header, encoding="invdepth16", dtype="f16", range=(0, 65504))
     return ViewMessage(topic="view/top/depth", header=header, payload=payload_of(inverse.view(np.uint8)))
+
+
+def cells() -> GridLayers:
+    """Two rows of three: what is free, occupied and unknown, and what was seen of it."""
+    return GridLayers(
+        np.array([[0, 100, -1], [0, 100, -1]], np.int8),
+        np.array([[2, 1, 1], [2, 2, 0]], np.uint8),
+        np.array([[1, 7, 1], [1, 7, 0]], np.uint8),
+        np.array([[0.125, 1.5, 0.25], [0, 2, 0]], np.float32),
+        np.array([[0, 400, 900], [0, 0, 0]], np.uint16),
+    )
+
+
+def grid(layers: GridLayers | None = None, **changes: Any) -> GridMessage:
+    """Grid `around` of CLASSES; changes: of the header."""
+    layers, view = cells() if layers is None else layers, view_header(shape=(1, 4, 6, 3))
+    shared = {name: getattr(view, name) for name in GridHeader.__struct_fields__ if hasattr(view, name)}
+    own = {"view_id": "around", "frame_id": "base_link", "shape": (2, 3), "cell_m": 0.5, "origin_m": (-1.0, 2.0)}
+    header = GridHeader(**shared | own | {"classes": CLASSES, "synthetic": False, "proto": "gcd/1.3"} | changes)
+    return GridMessage(topic=grid_topic(header.view_id), header=header, payload=grid_payload(layers))
 
 
 def end(*, view_id: str = "top", window_id: int = 0, boot_id: str = BOOT, kind: ViewKind = "win") -> EndMessage:

@@ -15,7 +15,7 @@ from cameras import until
 from msgspec.structs import replace as struct_replace
 
 from gcd_client.control import Code
-from gcd_client.protocol import EndMessage, OriginHeader, StatusTopic, ViewMessage
+from gcd_client.protocol import DataMessage, EndMessage, OriginHeader, StatusTopic, ViewMessage
 from gcd_model import (
     Augmentation,
     Clip,
@@ -191,11 +191,11 @@ def made_node(
 class Box:
     """An outbox that keeps what it gets."""
 
-    views: list[ViewMessage] = field(default_factory=list)
+    views: list[Any] = field(default_factory=list)  # and grids
     ends: list[EndMessage] = field(default_factory=list)
     notes: list[tuple[str, Mapping[str, Any]]] = field(default_factory=list)
 
-    def send(self, message: ViewMessage) -> bool:
+    def send(self, message: DataMessage) -> bool:
         self.views.append(message)
         return True
 

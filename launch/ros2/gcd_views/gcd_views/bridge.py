@@ -1,4 +1,4 @@
-"""A ROS 2 node beside a gcd node: its views as topics, its status as diagnostics, its lifecycle as services.
+"""A ROS 2 node beside a gcd node: its views and grids as topics, its status as diagnostics, its lifecycle as services.
 
     ros2 run gcd_views gcd_views --ros-args -r __node:=gcd -p data:=ipc:///run/gcd/topdown/data \\
         -p status:=ipc:///run/gcd/topdown/status -p control:=ipc:///run/gcd/topdown/control
@@ -16,7 +16,9 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from grid_map_msgs.msg import GridMap
 from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
+from nav_msgs.msg import OccupancyGrid
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
@@ -30,6 +32,8 @@ from gcd_client import (
     ClientError,
     ClientKeys,
     ControlClient,
+    GridSubscriber,
+    ReceivedGrid,
     ReceivedView,
     SetupError,
     StatusMessage,
@@ -39,7 +43,8 @@ from gcd_client import (
     read_public_key,
 )
 from gcd_client.endpoints import resolve_endpoint
-from gcd_client.protocol import PREVIEW_ID, ViewKind, to_text, view_topic
+from gcd_client.protocol import PREVIEW_ID, ViewKind, grid_topic, to_text, view_topic
+from gcd_client.subscriber import DataSubscriber
 from gcd_views import messages
 
 SILENT_AFTER_S = 3.0  # a node speaks once a second
@@ -59,7 +64,8 @@ class Settings:
 
     data, status, control: the gcd node's endpoints; "ipc" finds those of a node of the same user.
     keys: for a node that asks for them.
-    source_frame: TF frame of the source camera on this robot (x right, y down, z ahead).
+    source_frame: TF frame of the source camera on this robot (x right, y down, z ahead). base_frame: of grids, on the
+        ground below the vehicle's origin (x ahead, y left).
     max_age_ms: older pictures are not published; None: no limit but the node's own `valid_for_ms`.
     metres_per_unit: of the scene units of models that know no metres; 0: their views get no TF.
     """
@@ -69,6 +75,7 @@ class Settings:
     control: str
     keys: ClientKeys | None
     source_frame: str
+    base_frame: str
     max_age_ms: float | None
     metres_per_unit: float
 
@@ -102,13 +109,15 @@ class ViewReader(Reader):
         view_id: str,
         kind: ViewKind,
         settings: Settings,
-        publish: Callable[[ReceivedView, int], None],
+        publish: Callable[[Any, int], None],
         stop: threading.Event,
     ) -> None:
         super().__init__(f"{view_id} {kind}", stop)
-        self.kind, self.published, self.expired = kind, 0, 0
+        self.published, self.expired = 0, 0
+        self.kind: str = kind
+        self._kind: ViewKind = kind
         self._view_id, self._settings, self._publish = view_id, settings, publish
-        self._views: ViewSubscriber | None = None
+        self._views: DataSubscriber[Any] | None = None
 
     def counts(self) -> dict[str, int]:
         """What became of the messages; all but the first two since the last connection."""
@@ -118,10 +127,7 @@ class ViewReader(Reader):
         return counts | {name: getattr(views, name) for name in ("stale", "damaged", "skipped", "restarts")}
 
     def _read(self) -> None:
-        settings = self._settings
-        with ViewSubscriber(
-            settings.data, self._view_id, self.kind, max_age_ms=settings.max_age_ms, keys=settings.keys
-        ) as self._views:
+        with self._connect() as self._views:
             while not self._stop_event.is_set():
                 damaged = self._views.damaged
                 view = self._views.receive(_POLL_MS)
@@ -130,8 +136,18 @@ class ViewReader(Reader):
                 if view is not None:
                     self._pass_on(view)
 
-    def _pass_on(self, view: ReceivedView) -> None:
-        index = messages.newest_at_goal(view.header)
+    def _connect(self) -> DataSubscriber[Any]:
+        settings = self._settings
+        return ViewSubscriber(
+            settings.data, self._view_id, self._kind, max_age_ms=settings.max_age_ms, keys=settings.keys
+        )
+
+    def _index(self, view: Any) -> int | None:
+        """Which of its frames is published."""
+        return messages.newest_at_goal(view.header)
+
+    def _pass_on(self, view: Any) -> None:
+        index = self._index(view)
         if view.expired:
             self.expired += 1
         elif index is None:
@@ -145,14 +161,32 @@ class ViewReader(Reader):
                 self.published, self.trouble = self.published + 1, ""
 
 
+class GridReader(ViewReader):
+    """The same of a grid."""
+
+    def __init__(
+        self, grid_id: str, settings: Settings, publish: Callable[[ReceivedGrid, int], None], stop: threading.Event
+    ) -> None:
+        super().__init__(grid_id, "win", settings, publish, stop)
+        self.kind = "grid"
+
+    def _connect(self) -> DataSubscriber[Any]:
+        settings = self._settings
+        return GridSubscriber(settings.data, self._view_id, max_age_ms=settings.max_age_ms, keys=settings.keys)
+
+    def _index(self, view: Any) -> int | None:
+        return 0
+
+
 class StatusReader(Reader):
-    """Keeps the last status and the ids of the views of the gcd node, and gives each event to `on_event`."""
+    """Keeps the last status and the ids of the views and grids of the gcd node, and gives each event to `on_event`."""
 
     def __init__(self, settings: Settings, on_event: Callable[[StatusMessage], None], stop: threading.Event) -> None:
         super().__init__("status", stop)
         self._on_event = on_event
         self.status: StatusMessage | None = None
         self.views: tuple[str, ...] = ()
+        self.grids: tuple[str, ...] = ()
         self._settings, self._heard_s = settings, 0.0
 
     @property
@@ -172,7 +206,10 @@ class StatusReader(Reader):
                     views = tuple(note.fields.get("views", ()))
                     for each in views:
                         view_topic(each, "win")  # raises MessageError: no id of a view
-                    self.views = views
+                    grids = tuple(note.fields.get("grids", ()))
+                    for each in grids:
+                        grid_topic(each)  # the same of a grid
+                    self.views, self.grids = views, grids
                 elif note.topic == "event":
                     self._on_event(note)
                 else:  # the last one is repeated to whoever subscribes: it may be old
@@ -226,13 +263,34 @@ class ViewTopics:
         self._maps[kind].publish(messages.to_image(view.message, index, self._frame_id))
 
 
+class GridTopics:
+    """The same of a grid."""
+
+    def __init__(self, node: Node, grid_id: str, settings: Settings, stop: threading.Event) -> None:
+        folder, self._frame_id, self._last_names = f"~/grid_{grid_id}", settings.base_frame, ""
+        self._occupancy = node.create_publisher(OccupancyGrid, f"{folder}/occupancy", _NEWEST)
+        self._grid_map = node.create_publisher(GridMap, f"{folder}/grid_map", _NEWEST)
+        self._class_names = node.create_publisher(String, f"{folder}/class_names", _LATCHED)
+        self.readers: list[ViewReader] = [GridReader(grid_id, settings, self._publish, stop)]
+        self.readers[0].start()
+
+    def _publish(self, grid: ReceivedGrid, _: int) -> None:
+        names = messages.to_class_names(grid.header)
+        if names.data != self._last_names:
+            self._last_names = names.data
+            self._class_names.publish(names)
+        self._occupancy.publish(messages.to_occupancy_grid(grid.message, self._frame_id))
+        if self._grid_map.get_subscription_count():
+            self._grid_map.publish(messages.to_grid_map(grid.message, self._frame_id))
+
+
 class GcdViews(Node):
     """The ROS 2 node. Raises ClientError: a parameter is wrong."""
 
     def __init__(self) -> None:
         super().__init__("gcd")
         self._settings, self._stop_event = self._read_parameters(), threading.Event()
-        self._topics: dict[str, ViewTopics] = {}
+        self._topics: dict[str, ViewTopics | GridTopics] = {}
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _STREAM)
         self._source = self.create_publisher(CompressedImage, f"~/{PREVIEW_ID}/image/compressed", _NEWEST)
         self._source_reader: ViewReader | None = None
@@ -284,6 +342,7 @@ class GcdViews(Node):
             control=resolve_endpoint(text("control", "ipc"), "control"),
             keys=keys,
             source_frame=text("source_frame"),
+            base_frame=text("base_frame", "base_link"),
             max_age_ms=number("max_age_ms") or None,
             metres_per_unit=number("metres_per_unit"),
         )
@@ -295,6 +354,9 @@ class GcdViews(Node):
         if self._source_reader is None and self._source.get_subscription_count():  # the node codes it for somebody only
             self._source_reader = ViewReader(PREVIEW_ID, "frm", self._settings, self._publish_source, self._stop_event)
             self._source_reader.start()
+        for grid_id in self._status.grids:
+            if f"grid {grid_id}" not in self._topics:
+                self._topics[f"grid {grid_id}"] = GridTopics(self, grid_id, self._settings, self._stop_event)
         header = Header(stamp=messages.to_time(time.time_ns()))
         self._diagnostics.publish(DiagnosticArray(header=header, status=self._all_diagnostics()))
 

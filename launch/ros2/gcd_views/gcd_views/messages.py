@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
+from grid_map_msgs.msg import GridMap, GridMapInfo
 from lifecycle_msgs.msg import State, Transition, TransitionDescription
+from nav_msgs.msg import MapMetaData, OccupancyGrid
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Header, String
+from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension, MultiArrayLayout, String
 
-from gcd_client import StatusMessage, ViewHeader, ViewMessage
-from gcd_client.images import decode_jpegs, depth_m, images
+from gcd_client import GridHeader, GridMessage, StatusMessage, ViewHeader, ViewMessage
+from gcd_client.images import UNKNOWN, decode_jpegs, depth_m, images, layers
 
 OK, WARN, ERROR, STALE = (bytes([level]) for level in range(4))  # levels of a DiagnosticStatus: one byte each
 
@@ -38,7 +40,7 @@ def to_time(stamp_ns: int) -> Time:
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
-def to_header(header: ViewHeader, index: int, frame_id: str) -> Header:
+def to_header(header: ViewHeader | GridHeader, index: int, frame_id: str) -> Header:
     """The stamp of a frame: when its input was captured, not when it was published."""
     stamps_ns = header.t_capture_ns
     return Header(stamp=to_time(stamps_ns[min(index, len(stamps_ns) - 1)]), frame_id=frame_id)
@@ -94,7 +96,7 @@ def to_camera_info(header: ViewHeader, index: int, frame_id: str) -> CameraInfo:
     )
 
 
-def to_class_names(header: ViewHeader) -> String:
+def to_class_names(header: ViewHeader | GridHeader) -> String:
     """What the numbers of a class map mean: a JSON list of objects with id, name and colour (red, green, blue)."""
     classes = header.classes or ()
     return String(data=json.dumps([{"id": each.id, "name": each.name, "colour": each.colour} for each in classes]))
@@ -133,6 +135,61 @@ def to_quaternion(rotation: NDArray[np.float64]) -> Quaternion:
     q = np.linalg.eigh(symmetric)[1][:, -1]
     x, y, z, w = (math.copysign(1.0, q[3]) * q).tolist()
     return Quaternion(x=x, y=y, z=z, w=w)
+
+
+# --- grids -------------------------------------------------------------------------------------------------------
+
+
+def to_occupancy_grid(message: GridMessage, frame_id: str) -> OccupancyGrid:
+    """0 free, 100 occupied, -1 unknown. Raises MessageError: its cells contradict themselves."""
+    header = to_header(message.header, 0, frame_id)
+    (height, width), (x, y) = message.header.shape, message.header.origin_m
+    info = MapMetaData(
+        map_load_time=header.stamp,
+        resolution=message.header.cell_m,
+        width=width,
+        height=height,
+        origin=Pose(position=Point(x=x, y=y), orientation=Quaternion(w=1.0)),
+    )
+    return OccupancyGrid(header=header, info=info, data=array("b", layers(message).occupancy.tobytes()))
+
+
+def to_grid_map(message: GridMessage, frame_id: str) -> GridMap:
+    """All layers, NaN where nothing was seen; `age` in seconds. Raises as to_occupancy_grid().
+
+    A grid map begins with the largest x and y, and counts columns, which go right, slower than rows.
+    """
+    header, cells = message.header, layers(message)
+    (height, width), (x, y) = header.shape, header.origin_m
+    length_x, length_y = width * header.cell_m, height * header.cell_m
+    seen, known = cells.visibility > 0, cells.occupancy != UNKNOWN
+    planes = {
+        "occupancy": np.where(known, cells.occupancy / 100, np.nan),
+        "elevation": np.where(seen, cells.height_m, np.nan),
+        "class": np.where(seen, cells.classes, np.nan),
+        "visibility": cells.visibility,
+        "age": np.where(seen, cells.age_ms / 1000, np.nan),
+    }
+    sides = (("column_index", height, height * width), ("row_index", width, width))
+    layout = MultiArrayLayout(
+        dim=[MultiArrayDimension(label=label, size=size, stride=stride) for label, size, stride in sides]
+    )
+    centre = Point(x=x + length_x / 2, y=y + length_y / 2)
+    return GridMap(
+        header=to_header(header, 0, frame_id),
+        info=GridMapInfo(
+            resolution=header.cell_m,
+            length_x=length_x,
+            length_y=length_y,
+            pose=Pose(position=centre, orientation=Quaternion(w=1.0)),
+        ),
+        layers=list(planes),
+        basic_layers=["elevation"],
+        data=[
+            Float32MultiArray(layout=layout, data=array("f", plane[::-1, ::-1].astype(np.float32).tobytes()))
+            for plane in planes.values()
+        ],
+    )
 
 
 # --- diagnostics -------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ ARGUMENTS = {
     "keys": ("", "Folder of this client's key pair, for a node with keys."),
     "node_key": ("", "File of the node's public key."),
     "source_frame": ("", "TF frame of the source camera on this robot; empty: <name>/<kind of source>_optical."),
+    "base_frame": ("base_link", "TF frame of the vehicle, in which grids lie."),
     "max_age_ms": ("0", "Views older than this are not published; 0: as long as the node says they are valid."),
     "metres_per_unit": ("0", "Length of a scene unit, for models that know no metres; 0: no TF for their views."),
 }
@@ -29,7 +30,7 @@ def generate_launch_description() -> LaunchDescription:
     """One bridge; start several with different names for several gcd nodes."""
     given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     values = {name: given[name] for name in ("max_age_ms", "metres_per_unit")}
-    texts = {name: given[name] for name in ("source_frame", "keys", "node_key")}
+    texts = {name: given[name] for name in ("source_frame", "base_frame", "keys", "node_key")}
     folder, host = given["folder"], given["host"]
     for port, channel in enumerate(("data", "status", "control"), 5580):
         here = ["'ipc://", folder, f"/{channel}' if '", folder, "' else 'ipc'"]
