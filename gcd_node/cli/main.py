@@ -32,7 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "viewer": ("watch:viewer", "Serve the page for a running node; ends with Ctrl-C."),
     "replay": (
         "run:replay_launch",
-        "Replay a launch file's recording in lockstep into a run that can be compared, or a ROS 2 bag.",
+        "Replay a launch file's recording in lockstep into a run that can be compared, or into a ROS 2 bag.",
     ),
     "diff": ("run:diff", "Compare two runs: identical, or how far apart, where first, and what they were made from."),
     "status": ("watch:status", "Watch how a node does: states, rates, ages, drops, stage times and events."),

@@ -221,7 +221,7 @@ def test_the_command_shows_good_videos_and_names_bad_ones(tmp_path: Path, weight
     ("more", "code", "said"),
     [
         (["--angles", "30,15"], 78, "takes no camera command"),
-        (["--angles", "left"], 78, "--angles wants AZIMUTH,ELEVATION,RADIUS"),
+        (["--angles", "left"], 78, "--angles AZIMUTH,ELEVATION,RADIUS wants numbers"),
         (["--source-elevation-deg", "50"], 78, "has no use for --source-elevation-deg"),
         (["--source-radius", "-1"], 78, "radius must be positive"),
         ([], 66, "none of 1 videos can be shown"),
