@@ -6,6 +6,7 @@ Everything is in metres and in the frame of the table: x away from the robot, z 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +64,10 @@ class Move(NamedTuple):
 
     shift_m: float
     turn_deg: float
+
+    def __str__(self) -> str:
+        told = (f"{100 * self.shift_m:g} cm" if self.shift_m else "", f"{self.turn_deg:g}°" if self.turn_deg else "")
+        return " and ".join(filter(None, told))
 
     def camera(self, seed: int) -> Doubles:
         """table_from_camera [4, 4]."""
@@ -187,9 +192,11 @@ class Bench:
 def _setting(random: Random) -> tuple[Setting, list[int]]:
     """A table with three things that may be taken from any side, each of one colour, and the colours' numbers."""
     numbers, placed = random.permutation(len(COLOURS))[:_THINGS].tolist(), list[Placed]()
-    for _ in range(_TRIES):
+    for tries in count():
         if len(placed) == _THINGS:
             break
+        if tries % _TRIES == _TRIES - 1:  # these leave no room for another one
+            placed.clear()
         thing, (x, y) = random_thing(random, 2 * OPEN_M - 0.022), _spot(random)
         room_m = thing.radius_m + FINGER_ROOM_M - 0.02
         gaps = [math.dist((x, y), each.place[:2]) - each.thing.radius_m for each in placed]
@@ -197,7 +204,7 @@ def _setting(random: Random) -> tuple[Setting, list[int]]:
             painted = _painted(thing, list(COLOURS.values())[numbers[len(placed)]])
             placed.append(Placed(thing=painted, place=(x, y, thing.size[2] / 2 + 0.002), yaw=0.0))
     arm = random_arm(np.random.default_rng(_ARM_SEED))
-    return Setting(arm=arm, table=random_table(random), clutter=(), things=tuple(placed)), numbers[: len(placed)]
+    return Setting(arm=arm, table=random_table(random), clutter=(), things=tuple(placed)), numbers
 
 
 def _painted(thing: TableThing, colour: Colour) -> TableThing:
