@@ -37,8 +37,8 @@ from gcd_train.scenes.renderer import Renderer
 FIRST_EPISODE, EPISODES = 1_000_000, 100
 _NOISE_M, _NOISY = 0.03, 0.5
 _HELD_OUT, _BATCH, _RATE = 20, 32, 2e-3
-_WEIGHTS, _MIDDLE_M = torch.tensor([1.0, 1.0, 0.2, 0.1]), 0.06
-"""Of the losses; and the height over the table of what is sought in the picture."""
+_WEIGHTS, _GRIPS, _MIDDLE_M = torch.tensor([1.0, 1.0, 0.2, 0.1]), 4.0, 0.06
+"""Weights of the losses, and of decisions to grip, which are few; and the height over the table of what is sought in the picture."""
 _MIDDLE, _SPREAD = torch.tensor([0.03, 0.0, 0.12]), 0.1
 
 
@@ -157,7 +157,8 @@ def losses(told: tuple[Tensor, Tensor], actions: Tensor) -> Tensor:
     cells = _cells(shares.shape[2], shares.shape[1])
     away = (cells - pixels[:, None, None] * cells.shape[0] / HEIGHT).square().sum(-1)  # [K, h, w]
     seen = -((-away).flatten(1).softmax(1) * shares[free].flatten(1)).sum(1).mean()
-    return torch.stack([place, opening, F.binary_cross_entropy_with_logits(out[:, 4], actions[:, 4]), seen])
+    grip = F.binary_cross_entropy_with_logits(out[:, 4], actions[:, 4], pos_weight=torch.tensor(_GRIPS))
+    return torch.stack([place, opening, grip, seen])
 
 
 def jittered(pictures: Tensor) -> Tensor:

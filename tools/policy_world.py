@@ -141,7 +141,7 @@ class Robot(Simulation):
         if self._closed:
             return Action(np.array([x, y, level + _LIFT_M]), opening, True)
         away = math.hypot(tool[0] - x, tool[1] - y)
-        if away < _AT_M and abs(tool[2] - level) < _AT_M:
+        if away < _AT_M and abs(tool[2] - level) < 1.5 * _AT_M:
             return Action(np.array([x, y, level]), opening, True)
         above = max(level + 0.1, _TRAVEL_M) - level
         return Action(np.array([x, y, level + above * min(max((away - 0.01) / _NEAR_M, 0.0), 1.0)]), opening, False)
