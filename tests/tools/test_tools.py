@@ -50,3 +50,17 @@ def test_a_short_soak_ends_with_nothing_left_behind(tmp_path: Path) -> None:
     assert report["codes"]["OK"] > 0
     assert "INTERNAL" not in report["codes"]
     assert report["memory_mb"]["last"] - report["memory_mb"]["first"] < 100
+
+
+def test_a_policy_learns_and_is_tried_with_its_camera_moved(tmp_path: Path) -> None:
+    out = ["--out", str(tmp_path)]
+    ran("policy_study.py", "demonstrations", *out, "--count", "4")
+    ran("policy_study.py", "train", *out, "--cpu-minutes", "0.05")
+    ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--groups", "1")
+    rows = (tmp_path / "episodes.jsonl").read_text()
+    assert {json.loads(row)["view"] for row in rows.splitlines()} > {"none", "homography", "canonical-learned"}
+    ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--groups", "1")
+    assert (tmp_path / "episodes.jsonl").read_text() == rows
+    ran("policy_study.py", "report", *out)
+    assert (tmp_path / "report.png").exists()
+    assert "of 1 |" in (tmp_path / "report.md").read_text()

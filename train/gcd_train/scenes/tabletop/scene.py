@@ -41,7 +41,7 @@ from gcd_train.scenes.tabletop.simulation import Motion, Simulation
 from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TableThing, TabletopClass
 
 UNITS_A_METRE = 10.0
-_EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
+TABLE_EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
 _TABLE = 1
 """The scene's body that carries table, clutter and, one number further each, the bodies of the physics model."""
 _TABLE_Z_M = -0.12
@@ -124,7 +124,7 @@ def tabletop_episode(seed: int, *, frames: int = 60, skipped_s: float | None = N
             "task": task,
         },
         objects=tuple(objects),
-        extent=_EXTENT,
+        extent=TABLE_EXTENT,
     )
     return Episode(
         scene=scene,
@@ -142,7 +142,7 @@ def _counted(
 
     Their instances are their numbers from 1 on. Clutter stands on the table's body.
     """
-    parts = [piece.of(instance=0, body=_TABLE) for part in setting.table for piece in _drawn(part)]
+    parts = [piece.of(instance=0, body=_TABLE) for part in setting.table for piece in drawn(part)]
     objects: list[SceneObject] = []
     tracks = _in_world(motion.tracks, setting.clutter, world_from_table)
     rows: list[tuple[TableThing, int, TabletopClass, int, Placed | None]] = []
@@ -153,7 +153,7 @@ def _counted(
     bodies = motion.tracks.positions.shape[1]
     rows += [(each.thing, 0, TabletopClass.CLUTTER, bodies + k, each) for k, each in enumerate(setting.clutter)]
     for instance, (thing, body, label, track, stands) in enumerate(rows, start=1):
-        pieces = [piece.of(instance=instance, body=_TABLE + body) for part in thing.parts for piece in _drawn(part)]
+        pieces = [piece.of(instance=instance, body=_TABLE + body) for part in thing.parts for piece in drawn(part)]
         if stands is not None:
             pieces = [piece.placed(*_scaled(stands.place), stands.yaw) for piece in pieces]
         parts += pieces
@@ -175,7 +175,7 @@ def _in_world(moving: Tracks, clutter: tuple[Placed, ...], world_from_table: Dou
     )
 
 
-def _drawn(part: Part) -> Iterator[Part]:
+def drawn(part: Part) -> Iterator[Part]:
     """What is drawn of a part, in scene units; a capsule is a cylinder and two spheres."""
     paint = replace(part.paint, grain_m=part.paint.grain_m * UNITS_A_METRE)
     scaled = replace(part, centre=_scaled(part.centre), size=_scaled(part.size), paint=paint)
