@@ -233,14 +233,14 @@ def note(topic: StatusTopic) -> StatusMessage:
 
 
 GOLDEN: dict[str, tuple[Message, str]] = {
-    "win": (stamped(window()), "6f9c25e8e887e5dd"),
-    "frm": (stamped(window(kind="frm", images=np.zeros((1, 4, 6, 3), np.uint8))), "a2d48a39d5e10f7d"),
-    "jpeg": (view("view/top/win", 100, encoding="jpeg", offsets=(0, 40, 100)), "3dfe1948ac65e671"),
-    "std": (view("view/top/std", 0, shape=(2, 4, 6, 1), scale=0.25), "c3b614c9d4032aa6"),
-    "cls": (stamped(class_map()), "20282abcca4d372a"),
-    "vis": (stamped(visibility()), "0bf890c50f60cad5"),
-    "depth": (stamped(depth()), "03e65644266df55a"),
-    "src": (view("src/frm", 0, shape=(1, 4, 6, 3)), "c1f9e5a5e28ef029"),
+    "win": (stamped(window()), "4d12cf4ff755ac91"),
+    "frm": (stamped(window(kind="frm", images=np.zeros((1, 4, 6, 3), np.uint8))), "89de8e59abd3d1f1"),
+    "jpeg": (view("view/top/win", 100, encoding="jpeg", offsets=(0, 40, 100)), "ea0fe3b62a00cc41"),
+    "std": (view("view/top/std", 0, shape=(2, 4, 6, 1), scale=0.25), "7cb36ae925cf0efc"),
+    "cls": (stamped(class_map()), "5283ef0584cae2e3"),
+    "vis": (stamped(visibility()), "132f81b0965b5552"),
+    "depth": (stamped(depth()), "c3882be336048266"),
+    "src": (view("src/frm", 0, shape=(1, 4, 6, 3)), "00aa41f3f299f889"),
     "end": (stamped(end()), "8ab29cecdf73e2a2"),
     "status": (note("status"), "78b8489d084c92e7"),
     "event": (note("event"), "8de3aded17024dc4"),
