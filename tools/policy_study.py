@@ -38,7 +38,7 @@ FIRST_EPISODE, EPISODES = 1_000_000, 100
 _NOISE_M, _NOISY = 0.03, 0.5
 _HELD_OUT, _BATCH, _RATE = 20, 32, 2e-3
 _WEIGHTS, _GRIPS, _MIDDLE_M = torch.tensor([1.0, 1.0, 0.2, 0.1]), 4.0, 0.06
-"""Weights of the losses, and of decisions to grip, which are few; and the height over the table of what is sought in the picture."""
+"""Weights of the losses, and of decisions to grip, which are few; height over the table of what pictures show."""
 _MIDDLE, _SPREAD = torch.tensor([0.03, 0.0, 0.12]), 0.1
 
 
@@ -371,7 +371,7 @@ def _draw(cells: dict[tuple[Move, str], dict[int, bool]], moves: Sequence[Move],
         errors = np.abs([[each[1] - each[0], each[2] - each[0]] for _, each in shown]).T
         axes.bar(x, y, 0.15, yerr=errors, label=view, capsize=2)
     share, low, high = _interval(cells[TRAINED, "none"])
-    axes.axhspan(low, high, color="0.9")
+    axes.axhspan(low, high, color="0.9", zorder=0)
     axes.axhline(share, color="0.4", label="trained camera")
     axes.set_xticks(range(len(moves) - 1), [_COLUMNS[move] for move in moves[1:]])
     axes.set_ylabel("things lifted, %")
