@@ -15,7 +15,7 @@ from gcd_train.evaluation.gaussians import GaussianSplatting, MovedGaussians, fi
 from gcd_train.evaluation.hexplane import SPACE, TIME, HexPlane, HexPlanes, resampled
 from gcd_train.evaluation.per_scene import Camera, PerScene, SceneBounds
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
-from gcd_train.evaluation.rasteriser import rotations
+from gcd_train.evaluation.rasteriser import NEAREST_M, rotations
 
 LENS = Intrinsics.from_hfov(53.0, 24, 16)
 FRAMES = 2
@@ -246,8 +246,8 @@ def test_the_first_updates_after_the_warm_up_move_little() -> None:
         for share in (1.0, 0.94)
     )
     moved = (begun(-1.0).means - begun(None).means).norm(dim=1).mean()
-    assert 0.0 < moved < 0.03 * bounds.half_m
-    assert (begun.planes.space - still.planes.space).abs().max() < 0.03
+    assert 0.0 < moved < 0.005 * bounds.half_m
+    assert (begun.planes.space - still.planes.space).abs().max() < 0.002
 
 
 def test_a_camera_that_turns_in_place_learns_something() -> None:
@@ -256,5 +256,7 @@ def test_a_camera_that_turns_in_place_learns_something() -> None:
     clip = source_clip()
     path = Trajectory(source_from_target=torch.stack([torch.eye(4, dtype=torch.float64), turned]))
     clip = replace(clip, cameras=replace(clip.cameras, trajectory=path))
+    bounds = SceneBounds.around(clip.cameras.ground_from_source @ clip.cameras.source_from_target)
+    assert bounds.reach * bounds.half_m > 2 * NEAREST_M  # there is room in which Gaussians are drawn
     made = replace(TINY_GAUSSIANS, updates=40).predict(clip).video
     assert psnr_db(made[0], colours(video(SOURCE))[0]) > 12.0
