@@ -11,6 +11,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -43,9 +44,13 @@ def rehearsed(config: NodeConfig, folder: Path) -> NodeConfig:
     common = {name: getattr(config.source, name) for name in stated}
     here = {name: f"ipc://{folder}/{name}" for name in ("data", "status", "control")}
     random = f"random:{config.model.family or 'live'}"
+    reference = folder / "training.png"
+    cv2.imwrite(str(reference), np.zeros((224, 224, 3), np.uint8))
+    views = {name: replace(each, reference=each.reference and str(reference)) for name, each in config.view.items()}
     return replace(
         config,
         source=SyntheticSource(**common | {"loop": False}, frames=1),
+        view=views,
         model=replace(config.model, weights=random, family=None, device="cpu"),
         publish=replace(config.publish, data=here["data"], status=here["status"]),
         control=replace(config.control, endpoint=here["control"]),
