@@ -76,7 +76,7 @@ def _config(
     """Of a launch file, with the one canonical view that is looked for instead of its own."""
     if (hfov_deg is None) == (calibration is None):
         raise UsageError("state the lens of the reference: --hfov-deg or --calibration")
-    view: dict[str, object] = {"kind": "canonical", "reference": str(reference)}
+    view: dict[str, object] = {"kind": "canonical", "reference": str(reference), "pose": [0, 0, 0, 0, 0, 0, 1]}
     view |= {"hfov_deg": hfov_deg} if calibration is None else {"calibration": str(calibration)}
     try:
         content = decode_toml(read_small(path))
