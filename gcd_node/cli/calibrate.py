@@ -37,12 +37,14 @@ _FINEST, _FINER = 4, 2.0  # times the model's size, and times as fine as the ref
 
 def calibrate_view(
     reference: Annotated[
-        Path, Argument(help="A picture of the training camera, as the policy was given it; a folder.")
+        Path, Argument(help="A picture of the training camera, as the policy was given it; or a folder of them.")
     ],
-    source: Annotated[Path, Option(metavar="CONFIG", help="A launch file, for its [source] and [model].")],
-    hfov_deg: Annotated[float | None, Option(help="Horizontal field of view of the reference, degrees.")] = None,
+    source: Annotated[Path, Option(metavar="CONFIG", help=r"A launch file, for its \[source] and \[model].")],
+    hfov_deg: Annotated[
+        float | None, Option(min=1, max=179, help="Horizontal field of view of the reference, degrees.")
+    ] = None,
     calibration: Annotated[Path | None, Option(help="Instead: its ROS camera_info YAML file.")] = None,
-    out: Annotated[Path, Option(help="File for the pose, which [view.NAME] pose names.")] = Path("canonical.toml"),
+    out: Annotated[Path, Option(help=r"File for the pose: \[view.NAME] pose = its path.")] = Path("canonical.toml"),
     frames: Annotated[int, Option(min=1, help="Frames of the source to look at, 0.2 s apart.")] = 5,
     changes: Changes = None,
 ) -> None:
@@ -82,7 +84,8 @@ def _config(
         content = decode_toml(read_small(path))
     except FileError as error:
         raise ConfigError(f"the launch file {path} {error}; give the path of a TOML file") from error
-    return parse_config(tomli_w.dumps({**content, "view": {_VIEW: view}}), str(path), changes)
+    found = {_VIEW: view | {"pose": [0, 0, 0, 0, 0, 0, 1]}}  # in lockstep a view needs one
+    return parse_config(tomli_w.dumps({**content, "view": found}), str(path), changes)
 
 
 def _landmarks(config: NodeConfig, count: int) -> tuple[list[Landmarks], Reference]:

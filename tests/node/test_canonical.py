@@ -232,7 +232,7 @@ def test_calibrate_view_writes_a_pose_or_says_in_its_exit_code_why_not(
     write_png(folder / "same.png", shot(HERE)[0])
     write_png(folder / "other.png", shot(HERE, seed=3)[0])
     launch = folder / "launch.toml"
-    source = f'[source]\nkind = "folder"\npath = "{folder}/source"\nfps = 5.0\nhfov_deg = 60.0\n'
+    source = f'[source]\nkind = "folder"\npace = "lockstep"\npath = "{folder}/source"\nfps = 5.0\nhfov_deg = 60.0\n'
     (folder / "no_lens.toml").write_text(source.replace("hfov_deg = 60.0\n", "") + '[model]\nweights = "random:live"\n')
     launch.write_text(source + '[model]\nweights = "package:live-small"\nthreads = 1\n[view.main]\n')
 
