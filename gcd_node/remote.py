@@ -128,7 +128,7 @@ class Exchange(threading.Thread):
         """Nobody waits any more: the service sees the connection end."""
         if self._socket is not None:
             with suppress(OSError, ValueError):
-                self._socket.shutdown(socket.SHUT_RDWR)
+                socket.socket.shutdown(self._socket, socket.SHUT_RDWR)  # TLS's own would let the thread go on in clear
 
 
 # The model.
@@ -144,11 +144,17 @@ class RemoteSynthesizer:
     """
 
     def __init__(
-        self, service: Service, traits: Traits, *, deadline_s: float, fallback: ViewSynthesizer | None = None
+        self,
+        service: Service,
+        traits: Traits,
+        model: str,
+        *,
+        deadline_s: float,
+        fallback: ViewSynthesizer | None = None,
     ) -> None:
-        """deadline_s: from a window that is whole to its views."""
+        """model: see ModelReply. deadline_s: from a window that is taken to its views."""
         self.traits, self.fallback = traits, fallback
-        self._service, self._deadline_s = service, deadline_s
+        self._service, self._deadline_s, self._model = service, deadline_s, model
         self._stream, self._windows = uuid.uuid4().hex, 0
         self._late = ""  # why the last window came to nothing
         self._probe: Exchange | None = None
@@ -197,7 +203,7 @@ class RemoteSynthesizer:
         return WindowHeader(
             stream=self._stream,
             window=self._windows,
-            weights=self.traits.sha256_12,
+            model=self._model,
             deadline_ms=round(1000 * self._deadline_s),
             shape=(features.frames, config.height, config.width),
             on_sphere=tuple(path.delta is not None for path in paths),
@@ -247,7 +253,8 @@ def open_remote(section: ModelSection) -> RemoteSynthesizer:
         or not all(map(str.isprintable, words))
     ):
         raise RemoteError(f"{service.address} has a model that is not for windows of video; see `gcd-node serve`")
-    return RemoteSynthesizer(service, traits, deadline_s=section.deadline_s, fallback=_fallback(section, traits))
+    fallback = _fallback(section, traits)
+    return RemoteSynthesizer(service, traits, reply.model, deadline_s=section.deadline_s, fallback=fallback)
 
 
 def _service(section: ModelSection) -> Service:
@@ -278,4 +285,6 @@ def _fallback(section: ModelSection, remote: Traits) -> ViewSynthesizer | None:
         raise ConfigError(f"[model] fallback: {error}") from error
     if not loaded.traits.live:
         raise ConfigError(f'[model] fallback is the live model or "drop", got {loaded.traits.name}')
+    if not remote.knows_camera:
+        raise ConfigError(f'[model] fallback: nobody knows where the view of {remote.name} stands; leave "drop"')
     return loaded
