@@ -56,6 +56,7 @@ _AT_ONCE = 16  # requests that a replica takes, one in work and the others waiti
 _LONGEST_REQUEST_S = 30.0
 _STUCK_S = 2 * _LONGEST_REQUEST_S  # a window is given up by its deadline, between two steps
 _MOST_VIEWS = 64
+_USED = 0.8  # of the time until a deadline; the way back takes some, too
 _ROUTER: Any = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
 
 
@@ -120,6 +121,7 @@ class Replica:
         if traits.live:
             raise ConfigError(f"[model] weights: {traits.name} is made for a robot's own machine; run it there")
         self._device, self._begun_s = asyncio.Lock(), math.inf  # when the window in work was begun
+        self._queued, self._pace_s = 0, 0.0  # views in work or waiting; and how long one took last, seconds
         self._newest: dict[str, threading.Event] = {}  # what gives up each stream's newest window
         size = 3 * traits.config.frames * traits.config.height * traits.config.width
         self.most = PREFIX.size + MAX_HEADER + size + 152 * traits.config.frames * _MOST_VIEWS
@@ -173,12 +175,20 @@ class Replica:
         self, header: WindowHeader, pictures: NDArray[np.uint8], paths: list[Trajectory]
     ) -> bytes:
         """Its views, by its deadline and unless a newer one of its stream comes. Raises RefusedError."""
+        views_due = header.drawing.samples * len(paths)
+        self._require_time(header, views_due)
         give_up = threading.Event()
         if (older := self._newest.get(header.stream)) is not None:
             older.set()
         self._newest[header.stream] = give_up
+        self._queued += views_due
         work = asyncio.create_task(self._in_turn(header, pictures, paths, give_up))
-        work.add_done_callback(lambda done: done.cancelled() or done.exception())  # where nobody waits any more
+
+        def is_done(done: asyncio.Task[bytes]) -> None:
+            self._queued -= views_due
+            _ = done.cancelled() or done.exception()  # where nobody waits any more
+
+        work.add_done_callback(is_done)
         try:
             return await asyncio.wait_for(asyncio.shield(work), header.deadline_ms / 1000)
         except TimeoutError as error:
@@ -187,6 +197,14 @@ class Replica:
             give_up.set()
             if self._newest.get(header.stream) is give_up:
                 del self._newest[header.stream]
+
+    def _require_time(self, header: WindowHeader, views_due: int) -> None:
+        """Refuse at once what would be late. Windows are rendered in the order in which they come: with more streams
+        than a replica can serve each would be begun a little before its deadline, and none finished by it."""
+        spent_s = max(0.0, time.monotonic() - self._begun_s)
+        due_s = self._pace_s * (self._queued + views_due) - spent_s
+        if self._queued and due_s > _USED * header.deadline_ms / 1000:
+            raise RefusedError(503, f"too busy: it would take {due_s:.2f} s")
 
     async def _in_turn(
         self, header: WindowHeader, pictures: NDArray[np.uint8], paths: list[Trajectory], give_up: threading.Event
@@ -203,7 +221,9 @@ class Replica:
             except ModelError as error:
                 raise RefusedError(422, str(error)) from error
             finally:
-                self._begun_s = math.inf
+                spent_s, self._begun_s = time.monotonic() - self._begun_s, math.inf
+                pace_s = spent_s / (header.drawing.samples * len(paths))
+                self._pace_s = max(pace_s, self._pace_s) if give_up.is_set() else pace_s  # given up before its end
 
     def _rendered(
         self, header: WindowHeader, pictures: NDArray[np.uint8], paths: list[Trajectory], give_up: threading.Event

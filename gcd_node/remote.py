@@ -156,7 +156,7 @@ class RemoteSynthesizer:
         self.traits, self.fallback = traits, fallback
         self._service, self._deadline_s, self._model = service, deadline_s, model
         self._stream, self._windows = uuid.uuid4().hex, 0
-        self._late = ""  # why the last window came to nothing
+        self._late = ""  # why the last window was waited for in vain
         self._probe: Exchange | None = None
 
     def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> RemoteFeatures:
@@ -188,12 +188,13 @@ class RemoteSynthesizer:
             if self._probe is None:
                 self._probe = self._service.exchange(self._deadline_s, most, body, self._stream)
             raise RemoteError(self._late)
+        exchange = self._service.exchange(self._deadline_s, most, body, self._stream)
         try:
-            reply = self._service.exchange(self._deadline_s, most, body, self._stream).result(options.cancel)
-            views = read_views(reply, header, trajectories, self.traits)
+            views = read_views(exchange.result(options.cancel), header, trajectories, self.traits)
         except (RemoteError, MessageError) as error:
-            self._late = str(error)
-            raise RemoteError(self._late) from error
+            is_quick = exchange.until_s - time.monotonic() > self._deadline_s / 2  # a refusal costs no wait: ask again
+            self._late = "" if is_quick else str(error)
+            raise RemoteError(str(error)) from error
         self._late = ""
         return views
 

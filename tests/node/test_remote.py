@@ -394,6 +394,19 @@ def test_of_a_stream_the_newest_window_wins_and_streams_do_not_disturb_each_othe
     assert replica._newest == {}
 
 
+def test_more_streams_than_a_replica_can_serve_do_not_keep_it_from_serving_any() -> None:
+    """Who comes first would be served first, and too late: every rendering would be begun and none finished in time."""
+    model = WholeLevels(traits())
+    replica = Replica({"model": {"weights": "fake"}}, lambda _: model)
+    bodies = [body for each in range(2) for body in windows(model, 16, 1, deadline_s=0.5)]
+    model._act = lambda _: time.sleep(0.2)
+    started_s = time.monotonic()
+    answers = asyncio.run(asked(replica, *bodies, pause_s=0.08))
+    could = (time.monotonic() - started_s) / 0.3  # not all of the time is the network's
+    assert sum(isinstance(each, bytes) for each in answers) > could / 2
+    assert {each.status for each in answers if isinstance(each, RefusedError)} <= {503, 504}
+
+
 def test_a_window_that_is_not_rendered_by_its_deadline_is_given_up_and_the_device_is_free_again() -> None:
     def hang(options: RenderOptions) -> None:
         if options.cancel is not None and options.cancel.wait(5):
