@@ -47,8 +47,8 @@ class ModelSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         of engine "remote" the address of a service (`gcd-node serve`), http:// or https://.
     engine: what computes: "torch", "cuda" (compiled, on a GPU), "onnxruntime" (exports) or "remote"; left out, what
         fits weights.
-    deadline_s, fallback, token: of engine "remote": from a whole window to its views; what renders the windows that
-        are not back by then, a live model's weights or "drop"; file of the service's password.
+    deadline_s, fallback, token: of engine "remote": from a window that is taken to its views; what renders the windows
+        that are not back by then, a live model's weights or "drop"; file of the service's password.
     providers: of onnxruntime, by its own names, best first; left out, its CPU one, or on device "cuda" its CUDA one.
     adapter: file of a low-rank adapter trained on these weights; family and move_time are then the adapter's.
     threads: CPU threads for the model, and for OpenCV beside it; leave the rest of the robot its cores.

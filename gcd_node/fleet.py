@@ -7,7 +7,11 @@ waits or is in work is given up, as is one whose deadline has passed, or whose n
 import asyncio
 import contextlib
 import hmac
+import math
+import os
+import socket
 import threading
+import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,19 +41,22 @@ from gcd_node.config import ModelSection
 from gcd_node.errors import ConfigError
 from gcd_node.model import render_grey
 from gcd_node.preprocess import to_clip_tensor
-from gcd_node.remote_messages import ModelReply, WindowHeader, read_window, views_message
+from gcd_node.remote_messages import ModelReply, WindowHeader, model_digest, read_window, views_message
 from gcd_node.session import load_model
 from gcd_node.sources import Count
 
 if TYPE_CHECKING:
     from ray.serve import Application
+    from ray.serve.config import HTTPOptions
     from starlette.requests import Request
     from starlette.responses import Response
 
 _APP = "gcd"
 _AT_ONCE = 16  # requests that a replica takes, one in work and the others waiting; more go to the next replica
 _LONGEST_REQUEST_S = 30.0
+_STUCK_S = 2 * _LONGEST_REQUEST_S  # a window is given up by its deadline, between two steps
 _MOST_VIEWS = 64
+_USED = 0.8  # of the time until a deadline; the way back takes some, too
 _ROUTER: Any = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
 
 
@@ -67,6 +74,11 @@ class ServeSection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     certificate: str | None = None
     key: str | None = None
     replicas: Count | None = None
+
+    @property
+    def url(self) -> str:
+        """What nodes on this machine name."""
+        return f"{'http' if self.certificate is None else 'https'}://{self.http}"
 
     def __post_init__(self) -> None:
         host, _, port = self.http.rpartition(":")
@@ -108,7 +120,8 @@ class Replica:
         self._synthesizer, traits = (model := load(settings.model)), model.traits
         if traits.live:
             raise ConfigError(f"[model] weights: {traits.name} is made for a robot's own machine; run it there")
-        self._device = asyncio.Lock()
+        self._device, self._begun_s = asyncio.Lock(), math.inf  # when the window in work was begun
+        self._queued, self._pace_s = 0, 0.0  # views in work or waiting; and how long one took last, seconds
         self._newest: dict[str, threading.Event] = {}  # what gives up each stream's newest window
         size = 3 * traits.config.frames * traits.config.height * traits.config.width
         self.most = PREFIX.size + MAX_HEADER + size + 152 * traits.config.frames * _MOST_VIEWS
@@ -121,23 +134,29 @@ class Replica:
         from starlette.responses import Response
 
         try:
-            body = None if request.method == "GET" else await self._body(request)
-            return Response(await self.answer(request.headers.get("authorization", ""), body))
+            self.admit(request.headers.get("authorization", ""))
+            return Response(await self.answer(None if request.method == "GET" else await self._body(request)))
         except RefusedError as error:
             return Response(str(error), error.status, media_type="text/plain")
 
-    async def answer(self, authorization: str, body: bytes | None) -> bytes:
-        """The reply to a request. authorization: the header of that name. body: None for what the model is.
+    def check_health(self) -> None:
+        """Of Serve, which replaces a replica that raises: one whose device is stuck, or lost."""
+        if time.monotonic() - self._begun_s > _STUCK_S:
+            raise RuntimeError(f"a window has been in work for more than {_STUCK_S:g} s")
+        if self._synthesizer.traits.device.startswith("cuda"):
+            torch.cuda.current_stream().query()  # raises from the first error on that a process cannot recover from
 
-        Raises RefusedError.
-        """
+    def admit(self, authorization: str) -> None:
+        """Look at a request's header of that name before any of its body is read. Raises RefusedError."""
         if not hmac.compare_digest(authorization.encode(), f"Bearer {self._token}".encode() if self._token else b""):
             raise RefusedError(401, "wrong token: see [model] token")
+
+    async def answer(self, body: bytes | None) -> bytes:
+        """The reply to a request. body: None for what the model is. Raises RefusedError."""
         traits = self._synthesizer.traits
         if body is None:
-            card, device = traits.to_metadata(), traits.device
-            reply = ModelReply(card=card, sha256_12=traits.sha256_12, precision=traits.precision, device=device)
-            return msgspec.json.encode(reply)
+            told = {name: getattr(traits, name) for name in ("sha256_12", "precision", "device")}
+            return msgspec.json.encode(ModelReply(card=traits.to_metadata(), model=model_digest(traits), **told))
         try:
             header, pictures, paths = read_window(body, traits)
         except (MessageError, ModelError) as error:
@@ -156,12 +175,20 @@ class Replica:
         self, header: WindowHeader, pictures: NDArray[np.uint8], paths: list[Trajectory]
     ) -> bytes:
         """Its views, by its deadline and unless a newer one of its stream comes. Raises RefusedError."""
+        views_due = header.drawing.samples * len(paths)
+        self._require_time(header, views_due)
         give_up = threading.Event()
         if (older := self._newest.get(header.stream)) is not None:
             older.set()
         self._newest[header.stream] = give_up
+        self._queued += views_due
         work = asyncio.create_task(self._in_turn(header, pictures, paths, give_up))
-        work.add_done_callback(lambda done: done.cancelled() or done.exception())  # where nobody waits any more
+
+        def is_done(done: asyncio.Task[bytes]) -> None:
+            self._queued -= views_due
+            _ = done.cancelled() or done.exception()  # where nobody waits any more
+
+        work.add_done_callback(is_done)
         try:
             return await asyncio.wait_for(asyncio.shield(work), header.deadline_ms / 1000)
         except TimeoutError as error:
@@ -171,6 +198,14 @@ class Replica:
             if self._newest.get(header.stream) is give_up:
                 del self._newest[header.stream]
 
+    def _require_time(self, header: WindowHeader, views_due: int) -> None:
+        """Refuse at once what would be late. Windows are rendered in the order in which they come: with more streams
+        than a replica can serve each would be begun a little before its deadline, and none finished by it."""
+        spent_s = max(0.0, time.monotonic() - self._begun_s)
+        due_s = self._pace_s * (self._queued + views_due) - spent_s
+        if self._queued and due_s > _USED * header.deadline_ms / 1000:
+            raise RefusedError(503, f"too busy: it would take {due_s:.2f} s")
+
     async def _in_turn(
         self, header: WindowHeader, pictures: NDArray[np.uint8], paths: list[Trajectory], give_up: threading.Event
     ) -> bytes:
@@ -178,12 +213,17 @@ class Replica:
         async with self._device:
             if give_up.is_set():
                 raise RefusedError(409, "given up for a newer window")
+            self._begun_s = time.monotonic()
             try:
                 return await asyncio.to_thread(self._rendered, header, pictures, paths, give_up)
             except Cancelled as error:
                 raise RefusedError(409, "given up for a newer window") from error
             except ModelError as error:
                 raise RefusedError(422, str(error)) from error
+            finally:
+                spent_s, self._begun_s = time.monotonic() - self._begun_s, math.inf
+                pace_s = spent_s / (header.drawing.samples * len(paths))
+                self._pace_s = max(pace_s, self._pace_s) if give_up.is_set() else pace_s  # given up before its end
 
     def _rendered(
         self, header: WindowHeader, pictures: NDArray[np.uint8], paths: list[Trajectory], give_up: threading.Event
@@ -252,6 +292,7 @@ def app(config: dict[str, Any]) -> "Application":
         name="views",
         num_replicas=settings.serve.replicas or gpus or machines,
         max_ongoing_requests=_AT_ONCE,
+        max_queued_requests=4 * _AT_ONCE,  # what waits longer is late
         ray_actor_options={"num_gpus": 1} if on_gpu else {"num_cpus": 1},
         request_router_config=RequestRouterConfig(request_router_class=_ROUTER),
         health_check_period_s=2.0,
@@ -264,15 +305,19 @@ def app(config: dict[str, Any]) -> "Application":
 @contextlib.contextmanager
 def deployed(config: ServiceConfig) -> Generator[bool]:
     """The service on the cluster that runs here or that RAY_ADDRESS names, where it stays; else on a cluster of this
-    machine alone, which ends with the block. Gives whether it is the latter. Raises ConfigError: without the extra."""
+    machine alone, which ends with the block. Gives whether it is the latter.
+
+    Raises ConfigError: without the extra, or without the cluster that is named; the model cannot be loaded there; Serve
+    runs there with another endpoint.
+    """
+    read_token(config.serve)
+    _require_cluster(os.environ.get("RAY_ADDRESS", "auto"))
     try:
         import ray
         from ray import serve
-        from ray.serve.config import HTTPOptions
     except ImportError as error:
         raise ConfigError(f"a service needs the package {error.name}: pip install 'gcd-node[cluster]'") from error
 
-    read_token(config.serve)
     is_own = False
     try:
         ray.init(address="auto", log_to_driver=False)
@@ -280,19 +325,52 @@ def deployed(config: ServiceConfig) -> Generator[bool]:
         is_own = True
         ray.init(include_dashboard=False, log_to_driver=False)
     try:
-        host, _, port = config.serve.http.rpartition(":")
-        options = HTTPOptions(
-            host=host.strip("[]"),
-            port=int(port),
-            request_timeout_s=_LONGEST_REQUEST_S,
-            ssl_certfile=config.serve.certificate,
-            ssl_keyfile=config.serve.key,
-        )
         # With a proxy on every machine, one that dies holds up the replicas that answer it until its death is noticed.
-        serve.start(proxy_location="HeadOnly", http_options=options)
-        serve.run(app(msgspec.to_builtins(config)), name=_APP, route_prefix="/")
+        serve.start(proxy_location="HeadOnly", http_options=_http_options(config.serve))
+        _require_endpoint(config.serve)
+        try:
+            serve.run(app(msgspec.to_builtins(config)), name=_APP, route_prefix="/")
+        except RuntimeError as error:
+            parts = serve.status().applications[_APP].deployments.values()
+            why = next((lines[-1] for part in parts if (lines := part.message.strip(" .\n").splitlines())), str(error))
+            raise ConfigError(f"the service cannot be deployed: {why}") from error
         yield is_own
     finally:
         if is_own:
             serve.shutdown()
         ray.shutdown()
+
+
+def _require_cluster(address: str) -> None:
+    """Ray waits for many minutes for one that is not there. Raises ConfigError."""
+    host, _, port = address.rpartition(":")
+    try:
+        if address != "auto":
+            socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"RAY_ADDRESS is HOST:PORT of a running Ray cluster, got {address!r} ({error})") from error
+
+
+def _http_options(section: ServeSection) -> "HTTPOptions":
+    from ray.serve.config import HTTPOptions
+
+    host, _, port = section.http.rpartition(":")
+    return HTTPOptions(
+        host=host.strip("[]"),
+        port=int(port),
+        request_timeout_s=_LONGEST_REQUEST_S,
+        ssl_certfile=section.certificate,
+        ssl_keyfile=section.key,
+    )
+
+
+def _require_endpoint(section: ServeSection) -> None:
+    """Serve has one endpoint a cluster, and keeps the one it has. Raises ConfigError: that is another."""
+    from ray.serve.context import _get_global_client  # the only place that tells
+
+    now, due = _get_global_client().http_config, _http_options(section)
+    names = ("host", "port", "ssl_certfile", "ssl_keyfile")
+    if other := [f"{name} {getattr(now, name)}" for name in names if getattr(now, name) != getattr(due, name)]:
+        raise ConfigError(
+            f"[serve]: Serve runs on this cluster already, with {', '.join(other)}; state the same, or `serve shutdown`"
+        )

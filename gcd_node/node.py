@@ -236,7 +236,9 @@ class Node:
             self.health.model = "absent"
             self._life.state = State.FINALIZED if verb == "shutdown" else State.UNCONFIGURED
         self._publish_state()
-        self._announcer.event(_code(error).value, Level.ERROR, {"verb": verb, "message": str(error)})
+        is_raised = self._once and self._stop_s is None
+        fields = {"verb": verb, "message": str(error)}
+        self._announcer.event(_code(error).value, Level.ERROR, fields, is_logged=not is_raised)
         self._after_failure(error, verb)
 
     def _succeed(self, verb: Verb, requested: bool) -> None:

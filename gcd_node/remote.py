@@ -128,7 +128,7 @@ class Exchange(threading.Thread):
         """Nobody waits any more: the service sees the connection end."""
         if self._socket is not None:
             with suppress(OSError, ValueError):
-                self._socket.shutdown(socket.SHUT_RDWR)
+                socket.socket.shutdown(self._socket, socket.SHUT_RDWR)  # TLS's own would let the thread go on in clear
 
 
 # The model.
@@ -144,13 +144,19 @@ class RemoteSynthesizer:
     """
 
     def __init__(
-        self, service: Service, traits: Traits, *, deadline_s: float, fallback: ViewSynthesizer | None = None
+        self,
+        service: Service,
+        traits: Traits,
+        model: str,
+        *,
+        deadline_s: float,
+        fallback: ViewSynthesizer | None = None,
     ) -> None:
-        """deadline_s: from a window that is whole to its views."""
+        """model: see ModelReply. deadline_s: from a window that is taken to its views."""
         self.traits, self.fallback = traits, fallback
-        self._service, self._deadline_s = service, deadline_s
+        self._service, self._deadline_s, self._model = service, deadline_s, model
         self._stream, self._windows = uuid.uuid4().hex, 0
-        self._late = ""  # why the last window came to nothing
+        self._late = ""  # why the last window was waited for in vain
         self._probe: Exchange | None = None
 
     def encode(self, clip: Clip, augmentation: Augmentation | None = None) -> RemoteFeatures:
@@ -182,12 +188,13 @@ class RemoteSynthesizer:
             if self._probe is None:
                 self._probe = self._service.exchange(self._deadline_s, most, body, self._stream)
             raise RemoteError(self._late)
+        exchange = self._service.exchange(self._deadline_s, most, body, self._stream)
         try:
-            reply = self._service.exchange(self._deadline_s, most, body, self._stream).result(options.cancel)
-            views = read_views(reply, header, trajectories, self.traits)
+            views = read_views(exchange.result(options.cancel), header, trajectories, self.traits)
         except (RemoteError, MessageError) as error:
-            self._late = str(error)
-            raise RemoteError(self._late) from error
+            is_quick = exchange.until_s - time.monotonic() > self._deadline_s / 2  # a refusal costs no wait: ask again
+            self._late = "" if is_quick else str(error)
+            raise RemoteError(str(error)) from error
         self._late = ""
         return views
 
@@ -197,7 +204,7 @@ class RemoteSynthesizer:
         return WindowHeader(
             stream=self._stream,
             window=self._windows,
-            weights=self.traits.sha256_12,
+            model=self._model,
             deadline_ms=round(1000 * self._deadline_s),
             shape=(features.frames, config.height, config.width),
             on_sphere=tuple(path.delta is not None for path in paths),
@@ -247,7 +254,8 @@ def open_remote(section: ModelSection) -> RemoteSynthesizer:
         or not all(map(str.isprintable, words))
     ):
         raise RemoteError(f"{service.address} has a model that is not for windows of video; see `gcd-node serve`")
-    return RemoteSynthesizer(service, traits, deadline_s=section.deadline_s, fallback=_fallback(section, traits))
+    fallback = _fallback(section, traits)
+    return RemoteSynthesizer(service, traits, reply.model, deadline_s=section.deadline_s, fallback=fallback)
 
 
 def _service(section: ModelSection) -> Service:
@@ -278,4 +286,6 @@ def _fallback(section: ModelSection, remote: Traits) -> ViewSynthesizer | None:
         raise ConfigError(f"[model] fallback: {error}") from error
     if not loaded.traits.live:
         raise ConfigError(f'[model] fallback is the live model or "drop", got {loaded.traits.name}')
+    if not remote.knows_camera:
+        raise ConfigError(f'[model] fallback: nobody knows where the view of {remote.name} stands; leave "drop"')
     return loaded

@@ -4,6 +4,7 @@ Each is one message of the wire protocol's envelope: prefix, JSON header, payloa
 the header, and are checked before anything is made of the bytes.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, TypeAlias, TypeVar
@@ -36,12 +37,14 @@ class RemoteFeatures(SourceFeatures):
 
 
 class ModelReply(msgspec.Struct, frozen=True, kw_only=True):
-    """What a service renders with. card: as our weight files state it."""
+    """What a service renders with. card: as our weight files state it. model: names all this but the device; windows
+    are sent for it."""
 
     card: dict[str, str]
     sha256_12: Digest
     precision: str
     device: str
+    model: Digest
 
 
 class Drawing(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,13 +64,14 @@ class WindowHeader(msgspec.Struct, frozen=True, kw_only=True):
     """Of a window. Payload: pictures u8 [T, H, W, 3] RGB, poses f64 [V, T, 4, 4], then of the views on a sphere angles
     and radius f64 [T, 3] each, see Trajectory.
 
-    stream, window: come back with the views. weights: what the views must be made with. deadline_ms: from arrival.
+    stream, window: come back with the views. model: what the views must be made with, see ModelReply. deadline_ms: from
+    arrival.
     shape: T, H, W. seeds: of the noise on each frame, of strength `augmentation`. lens: fx, fy, cx, cy in pixels.
     """
 
     stream: Stream
     window: Annotated[int, Meta(ge=0, lt=1 << 53)]
-    weights: Digest
+    model: Digest
     deadline_ms: Annotated[int, Meta(ge=1, le=30_000)]
     shape: tuple[_Size, _Size, _Size]
     on_sphere: Annotated[tuple[bool, ...], Meta(min_length=1, max_length=64)]
@@ -92,12 +96,18 @@ class WindowHeader(msgspec.Struct, frozen=True, kw_only=True):
 
 class ViewsHeader(msgspec.Struct, frozen=True, kw_only=True):
     """Of a window's views. Payload: u8 [V, S, T, 3, H, W], then class ids [V, S, T, H, W] of a model that has some.
-    stream, window, weights: the window's, and what the views were made with."""
+    stream, window, model: the window's, and what the views were made with."""
 
     stream: Stream
     window: int
-    weights: Digest
+    model: Digest
     proto: Literal["gcd-remote/1"] = "gcd-remote/1"
+
+
+def model_digest(traits: Traits) -> str:
+    """12 hex digits that name a model as it is served: its weights, what they are taken for, and their precision."""
+    told = traits.to_metadata(), traits.sha256_12, traits.precision
+    return hashlib.sha256(msgspec.json.encode(told, order="deterministic")).hexdigest()[:12]
 
 
 def window_message(header: WindowHeader, features: RemoteFeatures, paths: Sequence[Trajectory]) -> bytes:
@@ -117,8 +127,8 @@ def read_window(content: Part, traits: Traits) -> tuple[WindowHeader, NDArray[np
     """
     header, payload = _opened(content, _WINDOW, WindowHeader)
     config = traits.config
-    if header.weights != traits.sha256_12:
-        raise MessageError(f"the window is for weights {header.weights}, here are {traits.sha256_12}: configure anew")
+    if header.model != model_digest(traits):
+        raise MessageError(f"the window is for another model than {traits.name} as it is served now: configure anew")
     if header.shape != (config.frames, config.height, config.width) or len(header.seeds) != config.frames:
         raise MessageError(
             f"{traits.name} takes {config.frames} x {config.height} x {config.width}, got {header.shape}"
@@ -141,7 +151,7 @@ def read_window(content: Part, traits: Traits) -> tuple[WindowHeader, NDArray[np
 
 def views_message(header: WindowHeader, views: Sequence[View]) -> bytes:
     """The views of a window as they are sent back, in whole levels."""
-    found = ViewsHeader(stream=header.stream, window=header.window, weights=header.weights)
+    found = ViewsHeader(stream=header.stream, window=header.window, model=header.model)
     rows = [view.samples.numpy() for view in views] + [v.classes.numpy() for v in views if v.classes is not None]
     return pack(_VIEWS, 0, header.window, msgspec.json.encode(found), *map(payload_of, rows))
 
@@ -149,7 +159,7 @@ def views_message(header: WindowHeader, views: Sequence[View]) -> bytes:
 def read_views(content: Part, asked: WindowHeader, paths: Sequence[Trajectory], traits: Traits) -> list[View]:
     """Inverse of views_message(), on the node's side. Raises MessageError: damaged, or not what was asked for."""
     header, payload = _opened(content, _VIEWS, ViewsHeader)
-    if (header.stream, header.window, header.weights) != (asked.stream, asked.window, asked.weights):
+    if (header.stream, header.window, header.model) != (asked.stream, asked.window, asked.model):
         raise MessageError(f"views of window {asked.window} are due, got window {header.window} of {header.stream}")
     size = asked.views_size(classes=bool(traits.classes))
     if len(payload) != size:

@@ -40,12 +40,15 @@ class Announcer:
         self._logged_s: dict[str, float] = {}
         self._order = threading.Lock()
 
-    def event(self, code: str, level: Level, fields: Mapping[str, object] | None = None) -> None:
+    def event(
+        self, code: str, level: Level, fields: Mapping[str, object] | None = None, *, is_logged: bool = True
+    ) -> None:
         """Something has happened. code: stable, for programs; fields: plain JSON, a `message` for people. Warnings and
-        worse are logged too, each code at most once in ten seconds."""
+        worse are logged too, each code at most once in ten seconds. is_logged: False for what ends the process, which
+        says it itself."""
         event = {**(fields or {}), "code": code, "level": int(level)}
         self.sink.note("event", self._origin(), event)
-        if level >= Level.WARN and self._clock() >= self._logged_s.get(code, 0.0):
+        if is_logged and level >= Level.WARN and self._clock() >= self._logged_s.get(code, 0.0):
             self._logged_s[code] = self._clock() + _LOG_PERIOD_S
             rest = ", ".join(f"{name}: {value}" for name, value in (fields or {}).items() if name != "message")
             text = " ".join(part for part in (str(event.get("message", "")), f"({rest})" if rest else "") if part)

@@ -123,7 +123,7 @@ def serve(
     console.print(Text(f"deploying {settings.model.weights}"))
     with deployed(settings) as ends_with_us, contextlib.suppress(KeyboardInterrupt):
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        console.print(f"serving on {settings.serve.http}", soft_wrap=True)
+        console.print(f"serving on {settings.serve.url}", soft_wrap=True)
         if ends_with_us:
             signal.pause()
 

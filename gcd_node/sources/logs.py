@@ -141,10 +141,11 @@ class _Survey:
         except SourceError as limit:
             notes, self._reader.trouble = {}, str(limit)
         usable, missing, topics = self._usable(), companions - self._reader.topics.keys(), self._reader.topics | notes
-        if missing or len(usable) != 1:
-            lack = f"pictures on {_shown(usable)}: say which with topic in [source]" if usable else "no pictures"
+        if len(usable) > 1 and not missing:
+            raise SourceError(f"{path} has pictures on {_shown(usable)}: say which with topic in [source]")
+        if missing or not usable:
             raise SourceError(
-                f"{path} has {f'no topic {_shown(missing)}' if missing else lack}; wanted are pictures on "
+                f"{path} has no {f'topic {_shown(missing)}' if missing else 'pictures'}; wanted are pictures on "
                 f"{wanted or 'one topic'}, it has {_shown(map(' as '.join, topics.items()))}. {self._reader.trouble}"
             )
         (self.topic,) = usable

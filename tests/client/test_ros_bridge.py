@@ -8,6 +8,7 @@ import json
 import re
 import runpy
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -236,6 +237,21 @@ def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node
     assert [(each["id"], each["name"], tuple(each["colour"])) for each in json.loads(latched.data)] == [
         (each.id, each.name, each.colour) for each in CLASSES
     ]
+
+
+def test_what_the_camera_saw_is_read_while_somebody_looks_and_no_longer(bench: Bench) -> None:
+    topic = "~/src/image/compressed"
+    source = replace(jpeg_window(), topic="src/frm", header=replace(jpeg_window().header, view_id="src"))
+
+    def reads() -> bool:
+        return any(each.name == "src frm" for each in threading.enumerate())
+
+    bench.until(lambda: bench.out(topic), source)
+    bench.node.unread.add(topic)
+    bench.until(lambda: not reads(), source)
+    bench.node.unread.clear()
+    seen = len(bench.out(topic))
+    bench.until(lambda: len(bench.out(topic)) > seen, source)
 
 
 def test_a_grid_becomes_topics_of_its_own_in_the_frame_of_the_vehicle(bench: Bench) -> None:

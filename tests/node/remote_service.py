@@ -79,7 +79,8 @@ class ServiceStandIn:
         self._loop.call_soon_threadsafe(self._loop.stop)
 
     def _answer(self, request: BaseHTTPRequestHandler, body: bytes | None) -> bytes:
-        answer: Any = self.replica.answer(request.headers.get("authorization", ""), body)
+        self.replica.admit(request.headers.get("authorization", ""))
+        answer: Any = self.replica.answer(body)
         return asyncio.run_coroutine_threadsafe(answer, self._loop).result(10)
 
     def _reply(self, request: BaseHTTPRequestHandler, body: bytes | None) -> None:

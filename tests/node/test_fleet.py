@@ -32,7 +32,8 @@ from gcd_model.weights.card import FAMILIES
 from gcd_model.weights.load import save_weights
 from gcd_node.config import ModelSection
 from gcd_node.encoded_frames import frame_seed
-from gcd_node.fleet import deployed, service_config
+from gcd_node.errors import ConfigError
+from gcd_node.fleet import ServeSection, _require_endpoint, deployed, service_config
 from gcd_node.frame import Frame
 from gcd_node.lifecycle import Parts
 from gcd_node.node import Node
@@ -194,6 +195,9 @@ def test_no_stream_of_a_fleet_stops_or_gets_anothers_views_whatever_fails(
     streams = [Stream(number=number) for number in range(STREAMS)]
     short = Path("/tmp") / f"gcd-ray-{os.getpid()}"  # a socket's path has at most 107 characters
     with two_machines(short, monkeypatch) as cluster, deployed(service_config(service)):
+        _require_endpoint(service_config(service).serve)
+        with pytest.raises(ConfigError, match="already"):
+            _require_endpoint(ServeSection(http="127.0.0.1:1"))
         (worker,) = cluster.worker_nodes
         until(lambda: all(len(replicas(each)) == 1 for each in (cluster.head_node, worker)), 60)
         network = Network(port)

@@ -14,12 +14,14 @@ from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 from cameras import Bench, Camera, until
-from fakes import FakeSource, FakeSynthesizer, fake_config, live_traits, painting_traits, run, traits
+from fakes import TINY, FakeSource, FakeSynthesizer, fake_config, live_traits, painting_traits, run, traits
 from msgspec.structs import replace as struct_replace
 from mutations import BYTE_PIECES, TEXT_PIECES, Mutator
 from remote_service import Act, ServiceStandIn, WholeLevels, respond
@@ -36,16 +38,17 @@ from gcd_model import (
     Trajectory,
     View,
     ViewSynthesizer,
-    load_synthesizer,
 )
 from gcd_model.networks import random_networks
 from gcd_model.synthesizer import Synthesizer
 from gcd_model.weights.card import FAMILIES
+from gcd_node import fleet
 from gcd_node.config import ModelSection, parse_config
 from gcd_node.errors import ConfigError, RemoteError
-from gcd_node.fleet import RefusedError, Replica, load_service
+from gcd_node.fleet import RefusedError, Replica, ServiceConfig, load_service
 from gcd_node.model import ModelSlot
 from gcd_node.remote import RemoteSynthesizer, Service, open_remote
+from gcd_node.remote_messages import model_digest
 from gcd_node.session import load_model
 from gcd_node.stream_context import config_digest
 
@@ -105,7 +108,7 @@ def test_views_from_elsewhere_are_those_of_the_same_model_here(made: Traits) -> 
 
 
 def test_a_real_network_draws_the_same_noise_there() -> None:
-    made = traits("kubric90")
+    made = replace(traits("driving"), config=struct_replace(TINY, height=32, width=64))
     model = Synthesizer(random_networks(made.config, seed=0), made)
     options = RenderOptions(seed=7, steps=1, whole_levels=True)
     with ServiceStandIn(model) as service:
@@ -184,10 +187,17 @@ def test_views_of_another_stream_or_window_are_refused() -> None:
                 rendered(each)
 
 
-def test_a_service_that_serves_another_model_now_is_refused_until_the_node_is_configured_anew() -> None:
-    with ServiceStandIn(WholeLevels(traits())) as service:
+@pytest.mark.parametrize(
+    "change",
+    [{"sha256_12": "1" * 12}, {"precision": "bfloat16"}, {"family": FAMILIES["kubric180"]}],
+    ids=["weights", "precision", "family"],
+)
+def test_a_service_that_serves_another_model_now_is_refused_until_the_node_is_configured_anew(
+    change: dict[str, object],
+) -> None:
+    with ServiceStandIn(model := WholeLevels(traits("kubric90"))) as service:
         far = remote(service)
-        object.__setattr__(service.replica._synthesizer.traits, "sha256_12", "1" * 12)
+        model.traits = replace(model.traits, **change)
         with pytest.raises(RemoteError, match="configure anew"):
             rendered(far)
         assert rendered(remote(service))
@@ -197,7 +207,7 @@ def test_nobody_there_is_told_at_once_and_a_name_that_does_not_resolve_by_the_de
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     for address in (f"http://127.0.0.1:{port}", "http://gcd.invalid:8000"):
-        far = RemoteSynthesizer(Service(address=address), traits(), deadline_s=DEADLINE_S)
+        far = RemoteSynthesizer(Service(address=address), traits(), "0" * 12, deadline_s=DEADLINE_S)
         started_s = time.monotonic()
         with pytest.raises(RemoteError):
             rendered(far)
@@ -278,7 +288,7 @@ def filmed(folder: Path, load: Callable[[ModelSection], ViewSynthesizer], more: 
             filming.join()
 
 
-@pytest.mark.parametrize("falls_back", [False, True], ids=["drop", "live"])
+@pytest.mark.parametrize("falls_back", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["drop", "live"])
 def test_a_node_says_when_its_service_is_late_and_back_and_labels_who_drew(tmp_path: Path, falls_back: bool) -> None:
     fallback = FakeSynthesizer(replace(live_traits(), name="stand-in")) if falls_back else None
     with (
@@ -305,15 +315,24 @@ def test_a_node_says_when_its_service_is_late_and_back_and_labels_who_drew(tmp_p
     assert len(set(digests.values())) == len(digests)
 
 
-def test_the_live_model_draws_what_a_dead_service_does_not_with_its_own_maps_and_name() -> None:
+@pytest.mark.parametrize(
+    ("fallback", "name"),
+    [("random:live", "random-live"), pytest.param("package:live-small", "live-small", marks=pytest.mark.slow)],
+)
+def test_the_live_model_draws_what_a_dead_service_does_not_with_its_own_maps_and_name(fallback: str, name: str) -> None:
+    """The service dies after its first window; the model that the launch file names draws the second."""
     with ServiceStandIn(WholeLevels(traits())) as service:
-        far = remote(service, fallback=load_synthesizer("random:live", device="cpu", frames=14))
-    box = run(fake_config(), far, FakeSource(28))
-    assert Counter(message.topic for message in box.views) == Counter(
-        {f"view/main/{kind}": 2 for kind in ("win", "cls", "vis", "depth", "std")} | {"view/main/frm": 28}
-    )
-    names = {message.header.model.name for message in box.views}
-    assert names == {"random-live"}
+
+        def answer_once(request: BaseHTTPRequestHandler, reply: Callable[[], bytes]) -> None:
+            respond(request, reply())
+            service.act = FAULTS["hangs_up"]
+
+        service.act = answer_once
+        section = ModelSection(weights=service.address, engine="remote", fallback=fallback, device="cpu")
+        box = run(fake_config(), open_remote(section), FakeSource(28))
+    drawn = [(message.topic.rpartition("/")[2], message.header.model.name) for message in box.views]
+    by_live = {(kind, name): 1 for kind in ("win", "cls", "vis", "depth", "std")}
+    assert Counter(drawn) == by_live | {("win", "fake"): 1, ("frm", "fake"): 14, ("frm", name): 14}
     assert {each.topic for each in box.ends} == {message.topic for message in box.views}
 
 
@@ -337,7 +356,7 @@ def test_a_node_that_starts_before_its_service_waits_for_it(tmp_path: Path) -> N
 async def asked(replica: Replica, *bodies: bytes, pause_s: float = 0.0) -> list[bytes | BaseException]:
     tasks = []
     for body in bodies:
-        tasks.append(asyncio.create_task(replica.answer("", body)))
+        tasks.append(asyncio.create_task(replica.answer(body)))
         await asyncio.sleep(pause_s)
     return await asyncio.gather(*tasks, return_exceptions=True)
 
@@ -354,7 +373,7 @@ def windows(model: ViewSynthesizer, streams: int, each: int, deadline_s: float =
             raise RemoteError("kept")
 
     for _ in range(streams):
-        far = RemoteSynthesizer(Kept(), model.traits, deadline_s=deadline_s)
+        far = RemoteSynthesizer(Kept(), model.traits, model_digest(model.traits), deadline_s=deadline_s)
         for _ in range(each):
             with pytest.raises(RemoteError):
                 rendered(far)
@@ -373,6 +392,19 @@ def test_of_a_stream_the_newest_window_wins_and_streams_do_not_disturb_each_othe
     assert dropped.status == 409
     assert all(isinstance(each, bytes) for each in (first, second, third))
     assert replica._newest == {}
+
+
+def test_more_streams_than_a_replica_can_serve_do_not_keep_it_from_serving_any() -> None:
+    """Who comes first would be served first, and too late: every rendering would be begun and none finished in time."""
+    model = WholeLevels(traits())
+    replica = Replica({"model": {"weights": "fake"}}, lambda _: model)
+    bodies = [body for each in range(2) for body in windows(model, 16, 1, deadline_s=0.5)]
+    model._act = lambda _: time.sleep(0.2)
+    started_s = time.monotonic()
+    answers = asyncio.run(asked(replica, *bodies, pause_s=0.08))
+    could = (time.monotonic() - started_s) / 0.3  # not all of the time is the network's
+    assert sum(isinstance(each, bytes) for each in answers) > could / 2
+    assert {each.status for each in answers if isinstance(each, RefusedError)} <= {503, 504}
 
 
 def test_a_window_that_is_not_rendered_by_its_deadline_is_given_up_and_the_device_is_free_again() -> None:
@@ -425,6 +457,39 @@ def test_a_service_with_a_token_answers_those_who_know_it(tmp_path: Path) -> Non
             open_remote(section("missing"))
 
 
+def test_no_byte_of_a_body_is_read_for_a_stranger(tmp_path: Path) -> None:
+    """Who has no token may send slowly, or much."""
+    pytest.importorskip("starlette")
+    (tmp_path / "token").write_text("seven-of-nine")
+    config = {"model": {"weights": "fake"}, "serve": {"token": str(tmp_path / "token")}}
+    replica = Replica(config, lambda _: WholeLevels(traits()))
+    request = SimpleNamespace(
+        method="POST", headers={"authorization": "Bearer seven"}, stream=lambda: pytest.fail("read")
+    )
+    assert asyncio.run(replica(cast("Any", request))).status_code == 401
+
+
+def test_a_replica_whose_device_is_stuck_or_lost_is_not_healthy(monkeypatch: pytest.MonkeyPatch) -> None:
+    replica = Replica({"model": {"weights": "fake"}}, lambda _: WholeLevels(traits()))
+    replica.check_health()
+    (body,) = windows(model := replica._synthesizer, 1, 1)
+    stuck = threading.Event()
+    model._act = lambda _: stuck.wait(10) and None
+
+    async def look() -> None:
+        work = asyncio.create_task(replica.answer(body))
+        await asyncio.sleep(0.1)
+        replica.check_health()
+        monkeypatch.setattr(fleet, "_STUCK_S", 0.01)
+        with pytest.raises(RuntimeError, match="in work"):
+            replica.check_health()
+        stuck.set()
+        await work
+        replica.check_health()
+
+    asyncio.run(look())
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -441,6 +506,18 @@ def test_a_service_refuses_settings_it_cannot_have(tmp_path: Path, text: str) ->
     (tmp_path / "serve.toml").write_text(text)
     with pytest.raises(ConfigError):
         load_service(tmp_path / "serve.toml")
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://head", "head"])
+def test_a_cluster_that_is_named_and_not_there_is_refused_at_once(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with (
+        pytest.raises(ConfigError, match="RAY_ADDRESS"),
+        fleet.deployed(ServiceConfig(model=ModelSection(weights="x"))),
+    ):
+        pass
 
 
 def test_the_live_model_is_not_served() -> None:
@@ -484,6 +561,12 @@ def test_a_node_refuses_settings_that_its_service_cannot_have(keys: dict[str, st
         with pytest.raises(Exception, match=r"fallback|leave them out|password|ort|no-such-file") as caught:
             load_model(section)
     assert type(caught.value).__name__ in ("ConfigError", "CheckpointError")
+
+
+def test_nothing_takes_the_place_of_a_view_that_stands_nobody_knows_where() -> None:
+    made = replace(traits("driving"), family=None)
+    with ServiceStandIn(WholeLevels(made)) as service, pytest.raises(ConfigError, match="fallback"):
+        open_remote(ModelSection(weights=service.address, engine="remote", fallback="random:live", motion_bucket=127.0))
 
 
 def test_where_a_model_computes_and_what_stands_in_for_it_changes_no_digest() -> None:

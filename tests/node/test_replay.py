@@ -567,6 +567,23 @@ def test_a_bag_becomes_a_bag_of_its_views_that_fits_beside_it(tmp_path: Path) ->
     assert (transform.header.frame_id, transform.child_frame_id) == ("front_optical", "main_optical")
 
 
+def test_a_bag_with_two_cameras_asks_once_and_in_a_line_which(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As a bag is that was joined with the bag of its views."""
+    (shot,) = ramp(1, 192, 128)
+    topics = ("/front/image_raw/compressed", "/view/main/image/compressed")
+    said = [(topic, compressed(shot, i * 10**8)) for i in range(3) for topic in topics]
+    log = write_bag(tmp_path / "both", [*said, ("/front/camera_info", camera_info(192, 128, d=()))], StoragePlugin.MCAP)
+    launch = tmp_path / "launch.toml"
+    launch.write_text(f'[source]\nkind = "mcap"\npath = "{log}"\n[view.main]\n[model]\nweights = "random:kubric90"\n')
+    assert run_app(["replay", str(launch), "--bag", str(tmp_path / "views")]) == SourceError.exit_code
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "pictures on" in line]
+    assert all(topic in line for topic in topics)
+    assert "camera_info" not in line
+    assert not (tmp_path / "views").exists()
+
+
 def test_a_bag_is_whole_or_not_there_and_needs_a_free_place(tmp_path: Path) -> None:
     config = fake_config(source=SOURCE)
     with pytest.raises(ModelFailedError):

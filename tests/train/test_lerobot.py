@@ -447,8 +447,13 @@ def test_episodes_that_are_done_stay_and_the_set_appears_when_all_are(made: Path
     work = _augment(made, tmp_path / "out")
     work.claim()
     work(work.episodes[0])
-    with pytest.raises(RunError, match="other options"):
-        _augment(made, tmp_path / "out", source_radius=2.0).claim()
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps({"same": np.eye(4).tolist()}))
+    _augment(made, tmp_path / "out", view=None, poses=poses).claim()  # the same view by another option
+    poses.write_text(json.dumps({"same": _pose(0.1, 0.02).tolist()}))
+    for other in ({"view": None, "poses": poses}, {"view": ["same=1"]}, {"hfov_deg": 50.0}):
+        with pytest.raises(RunError, match="made otherwise"):
+            _augment(made, tmp_path / "out", **other).claim()
     assert not work.out.exists()
     assert [work(episode) for episode in work.episodes] == [0, ROWS, ROWS]
     work.finish()
@@ -477,6 +482,7 @@ def test_a_model_of_clips_views_every_frame_once(made: Path, tmp_path: Path, mon
         ({"view": []}, RecipeError),
         ({"view": ["same"]}, RecipeError),
         ({"view": ["../up=1"]}, RecipeError),
+        ({"view": ["up=0,1", "up=0,2"]}, RecipeError),
         ({"source_radius": None}, RecipeError),
         ({"poses": Path("missing.json")}, FileFault),
         ({"calibration": Path("missing.json")}, DataError),
@@ -499,8 +505,34 @@ def test_a_set_without_a_lens_asks_for_the_field_of_view_and_none_is_written_ove
     assert _augment(copied, tmp_path / "out", hfov_deg=60.0).cameras == {}
     with pytest.raises(RunError, match="is there already"):
         _augment(copied, copied, hfov_deg=60.0)
+    with pytest.raises(RunError, match="lies in"):  # a copy of itself has no end
+        _augment(copied, copied / "videos" / "out", hfov_deg=60.0)
     with pytest.raises(DataError, match="no LeRobot data set"):
         _augment(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.usefixtures("fake")
+def test_statistics_count_frames_and_weigh_as_those_of_lerobot(made: Path, tmp_path: Path) -> None:
+    """It joins sets by `count`; of pictures that is how many were looked at, not their pixels."""
+    out = _made_of(_augment(made, tmp_path / "out"))
+    stats = json.loads((out / "meta/stats.json").read_text())
+    assert stats["observation.state"]["count"] == [2 * ROWS]  # of the two episodes that were written with it
+    assert stats[LEFT]["count"] == [2 * -(-ROWS // 8)]
+    assert stats[f"{LEFT}_same"]["count"] == [3 * ROWS]
+    mean = _film(out, f"{LEFT}_same", 1).mean(axis=(0, 1, 2)) / 255
+    rows = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    if f"stats/{LEFT}_same/mean" in rows[1]:
+        np.testing.assert_allclose(np.ravel(rows[1][f"stats/{LEFT}_same/mean"]), mean, atol=0.02)
+
+
+@pytest.mark.usefixtures("fake")
+def test_a_view_goes_where_its_angles_say(made: Path, tmp_path: Path) -> None:
+    """Right, up and farther, as seen by the camera: x right, y down, z ahead."""
+    paths = _augment(made, tmp_path / "out", view=["right=10", "up=0,10", "back=0,0,0.5"]).paths
+    x, y, z = (paths[name].source_from_target[-1, :3, 3] for name in ("right", "up", "back"))
+    assert x[0] > 0.1
+    assert y[1] < -0.1
+    np.testing.assert_allclose(z, [0.0, 0.0, -0.5], atol=1e-9)
 
 
 @pytest.mark.slow

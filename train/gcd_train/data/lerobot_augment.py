@@ -17,7 +17,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,19 +68,13 @@ class AugmentOptions:
     camera: Annotated[str, Option(help="The camera, with or without observation.images.")]
     view: Annotated[
         list[str] | None,
-        Option(help="NAME=AZIMUTH,ELEVATION,RADIUS: degrees and metres away from the camera; may be repeated."),
+        Option(help="NAME=AZIMUTH,ELEVATION,RADIUS, degrees and metres to its right, up, away; may be repeated."),
     ] = None
-    poses: Annotated[
-        Path | None, Option(help="JSON {NAME: source_from_view}: 4 x 4, metres, x right, y down, z ahead.")
-    ] = None
-    source_radius: Annotated[
-        float | None, Option(min=0.01, help="How far what the camera looks at is: --view turns about that, metres.")
-    ] = None
+    poses: Annotated[Path | None, Option(help="JSON {NAME: source_from_view}: 4 x 4, x right, y down, metres.")] = None
+    source_radius: Annotated[float | None, Option(min=0.01, help="To what --view turns about, metres.")] = None
     source_elevation_deg: Annotated[float, Option(help="How steeply it looks down.")] = 30.0
-    hfov_deg: Annotated[
-        float | None, Option(min=1.0, max=179.0, help="Across the camera's pictures; else by meta/cameras.json.")
-    ] = None
-    calibration: Annotated[Path | None, Option(help="Cameras, if the set has no meta/cameras.json.")] = None
+    hfov_deg: Annotated[float | None, Option(min=1.0, max=179.0, help="Of its pictures; else as calibrated.")] = None
+    calibration: Annotated[Path | None, Option(help="Cameras, in place of the set's meta/cameras.json.")] = None
     weights: Annotated[str, Option(help="package:NAME, random:FAMILY or a path.")] = "package:live-small"
     device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
 
@@ -115,13 +109,15 @@ class Augmentation:
         """Look at the set, the camera and the views before anything is made.
 
         Raises: DataError, FileFault: no such set or camera, or nobody knows its lens. RecipeError: no view, or none
-        that can be. RunError: `out` is there. ModelError: the weights, or a view that they cannot give.
+        that can be. RunError: `out` is there, or in the set. ModelError: the weights, or a view that they cannot give.
         """
         for module in ("pyarrow.parquet", "av"):
             extra(module)
         if out.exists():
             raise RunError(f"{out} is there already; choose another folder, or remove it")
         info, episodes = read_set(source)
+        if out.resolve().is_relative_to(source.resolve()):
+            raise RunError(f"{out} lies in {source}, of which it is to be a copy; choose a folder beside it")
         camera = options.camera if options.camera in info.videos else _IMAGES + options.camera
         if camera not in info.videos:
             raise DataError(f"{source} has no video {options.camera}; it has {', '.join(info.videos) or 'none'}")
@@ -163,11 +159,13 @@ class Augmentation:
 
     def claim(self) -> None:
         """Say what the parts are made of. Raises RunError if those that are there are made of something else."""
-        told = {"set": str(self.source.resolve()), "model": self.model.traits.sha256_12}
-        told |= {name: str(value) for name, value in asdict(self.options).items() if name != "device"}
-        text, path = json.dumps(told, indent=1).encode(), self.parts / "made_from.json"
+        told = {"set": str(self.source.resolve()), "episodes": [each.length for each in self.episodes]}
+        told |= {"model": self.model.traits.sha256_12, "camera": self.camera, "lens": self.lens}
+        told |= {"calibration": self.cameras.get(self.camera)}
+        told |= {"views": {name: path.source_from_target[-1].tolist() for name, path in self.paths.items()}}
+        text, path = msgspec.json.encode(told), self.parts / "made_from.json"
         if path.exists() and path.read_bytes() != text:
-            raise RunError(f"{self.parts} holds episodes made with other options; remove it, or choose another --out")
+            raise RunError(f"{self.parts} holds episodes made otherwise; remove it, or choose another --out")
         write_whole(path, text)
 
     def __call__(self, episode: EpisodePlace) -> int:
@@ -190,7 +188,7 @@ class Augmentation:
                 for feature, picture in seen.items():
                     add_picture(*videos[feature], picture, number)
                     if number % sampled_every == 0:
-                        samples[feature].append(picture[::_SAMPLED, ::_SAMPLED].reshape(-1, 3))
+                        samples[feature].append(picture[::_SAMPLED, ::_SAMPLED].reshape(1, -1, 3))
             for container, stream in videos.values():
                 container.mux(stream.encode())
         with whole(done) as partial, partial.open("wb") as file:
@@ -358,16 +356,16 @@ def _like(known: Mapping[str, Any], statistics: Mapping[str, Mapping[str, Any]])
 
 def _paths(traits: Traits, options: AugmentOptions) -> dict[str, Trajectory]:
     """By the name of the view; at the goal in every frame. Raises RecipeError, FileFault; ModelError as `plan_view`."""
-    found: dict[str, Trajectory] = {}
-    if options.view and traits.live and options.source_radius is None:
-        raise RecipeError("--view turns about what the camera looks at: say how far that is with --source-radius")
+    found: list[tuple[str, Trajectory]] = []
     radius = options.source_radius
+    if options.view and traits.live and radius is None:
+        raise RecipeError("--view turns about what the camera looks at: say how far that is with --source-radius")
     stands = None
     if radius is not None:
         stands = Spherical(azimuth_deg=0.0, elevation_deg=options.source_elevation_deg, radius_m=radius)
     for text in options.view or ():
         name, _, numbers = text.partition("=")
-        found[name] = traits.plan_view(delta_of(numbers, "--view NAME="), source=stands, move_time=0)
+        found.append((name, traits.plan_view(delta_of(numbers, "--view NAME="), source=stands, move_time=0)))
     if options.poses is not None:
         try:
             poses = read_json(options.poses, dict[str, list[list[float]]], MOST_TEXT)
@@ -375,12 +373,14 @@ def _paths(traits: Traits, options: AugmentOptions) -> dict[str, Trajectory]:
         except (FileError, ValueError) as error:
             raise FileFault(options.poses, f"is no JSON of named 4 x 4 poses: {error}") from error
         for name, pose in matrices.items():
-            found[name] = traits.plan_poses(pose.expand(traits.config.frames, *pose.shape))
-    if not found or any(not _NAME.fullmatch(name) or name.endswith(_SEEN) for name in found):
+            found.append((name, traits.plan_poses(pose.expand(traits.config.frames, *pose.shape))))
+    names, paths = [name for name, _ in found], dict(found)
+    if len(paths) != len(names) or not names or any(not _NAME.fullmatch(x) or x.endswith(_SEEN) for x in names):
         raise RecipeError(
-            f"name one view or more with --view or --poses, in a-z, 0-9 and _, got {', '.join(found) or 'none'}"
+            "name one view or more with --view or --poses, each by another name in a-z, 0-9 and _, got "
+            f"{', '.join(names) or 'none'}"
         )
-    return found
+    return paths
 
 
 def _size_of(info: Info, camera: str) -> tuple[int, int]:

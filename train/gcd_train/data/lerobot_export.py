@@ -69,9 +69,11 @@ def video_feature(width: int, height: int, fps: float) -> dict[str, Any]:
 
 
 def statistics_of(rows: NDArray[Any], *, colours: bool) -> dict[str, list[Any]]:
-    """Of rows [N, C] as LeRobot writes it: C numbers each, or of colours, 0 to 255, [3, 1, 1] in [0, 1]."""
-    found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
-    found |= {f"q{percent:02d}": np.percentile(rows, percent, axis=0) for percent in _PERCENTS}
+    """Of rows [N, C] as LeRobot writes it, C numbers each; or of colours [frames, pixels, 3], 0 to 255, as [3, 1, 1] in
+    [0, 1]. It counts rows or frames: the weight that a set has when LeRobot joins several."""
+    axes = tuple(range(rows.ndim - 1))
+    found = {"min": rows.min(axes), "max": rows.max(axes), "mean": rows.mean(axes), "std": rows.std(axes)}
+    found |= {f"q{percent:02d}": np.percentile(rows, percent, axis=axes) for percent in _PERCENTS}
     unit, shape = (255, (3, 1, 1)) if colours else (1, (-1,))
     return {key: (row / unit).reshape(shape).tolist() for key, row in found.items()} | {"count": [len(rows)]}
 
@@ -96,9 +98,8 @@ class LeRobotWriter:
         self._folder, self._cameras, self._robot, self._fps, self._names = folder, cameras, robot, fps, names
         self._arrow, self._parquet, self._av = extra("pyarrow"), extra("pyarrow.parquet"), extra("av")
         self._frames, self._tasks = 0, dict[str, int]()
-        self._seen = dict[
-            str, list[NDArray[Any]]
-        ]()  # rows [N, C] of every feature, and of colours [N, 3] of some pictures
+        # Rows [N, C] of every feature, and colours [1, pixels, 3] of some pictures.
+        self._seen = dict[str, list[NDArray[Any]]]()
         self._tables, self._episodes = list[Any](), list[dict[str, Any]]()
         self._videos: dict[str, tuple[Any, Any]] = {}
         (folder / "meta").mkdir(parents=True, exist_ok=True)
@@ -178,7 +179,7 @@ class LeRobotWriter:
                     raise DataError(f"{name} must be {camera.width} x {camera.height}, got a picture {picture.shape}")
                 add_picture(*self._videos[name], picture, self._frames + frames - 1)
                 if frames % _SAMPLED == 1:
-                    self._seen.setdefault(name, []).append(picture[::4, ::4].reshape(-1, 3))
+                    self._seen.setdefault(name, []).append(picture[::4, ::4].reshape(1, -1, 3))
         return frames
 
     def _columns(

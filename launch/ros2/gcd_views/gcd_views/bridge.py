@@ -294,6 +294,7 @@ class GcdViews(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _STREAM)
         self._source = self.create_publisher(CompressedImage, f"~/{PREVIEW_ID}/image/compressed", _NEWEST)
         self._source_reader: ViewReader | None = None
+        self._source_stop = threading.Event()
         self._events = self.create_publisher(String, "~/events", _STREAM)
         self._status = StatusReader(self._settings, self._publish_event, self._stop_event)
         self._status.start()
@@ -310,9 +311,20 @@ class GcdViews(Node):
     def stop(self) -> None:
         """End all readers."""
         self._stop_event.set()
+        self._source_stop.set()
         readers = [self._status, *(reader for view in self._topics.values() for reader in view.readers)]
         for reader in readers if self._source_reader is None else [*readers, self._source_reader]:
             reader.join()
+
+    def _follow_source(self, *, is_watched: bool) -> None:
+        """The node codes what the camera saw for as long as somebody reads it."""
+        if is_watched and self._source_reader is None:
+            stop = self._source_stop = threading.Event()
+            self._source_reader = ViewReader(PREVIEW_ID, "frm", self._settings, self._publish_source, stop)
+            self._source_reader.start()
+        elif not is_watched and self._source_reader is not None:
+            self._source_stop.set()
+            self._source_reader = None
 
     def _publish_event(self, note: StatusMessage) -> None:
         self._events.publish(String(data=to_text(note.header, note.fields).decode()))
@@ -351,9 +363,7 @@ class GcdViews(Node):
         for view_id in self._status.views:
             if view_id not in self._topics:
                 self._topics[view_id] = ViewTopics(self, view_id, self._settings, self._stop_event)
-        if self._source_reader is None and self._source.get_subscription_count():  # the node codes it for somebody only
-            self._source_reader = ViewReader(PREVIEW_ID, "frm", self._settings, self._publish_source, self._stop_event)
-            self._source_reader.start()
+        self._follow_source(is_watched=self._source.get_subscription_count() > 0)
         for grid_id in self._status.grids:
             if f"grid {grid_id}" not in self._topics:
                 self._topics[f"grid {grid_id}"] = GridTopics(self, grid_id, self._settings, self._stop_event)
