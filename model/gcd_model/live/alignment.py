@@ -186,9 +186,9 @@ def align(known: Sequence[Landmarks], seen: Sequence[Features]) -> Alignment:
     Raises: AlignmentError: they show different scenes, or too little that both cameras see.
     """
     pairs = [_matched(each, other) for each in known for other in seen]
+    if (common := sum(map(len, pairs))) < _FEWEST:
+        raise AlignmentError(f"the pictures have {common} corners in common; {_FEWEST} are needed")
     tracks = Tracks(**{f.name: np.concatenate([getattr(each, f.name) for each in pairs]) for f in fields(Tracks)})
-    if len(tracks) < _FEWEST:
-        raise AlignmentError(f"the pictures have {len(tracks)} corners in common; {_FEWEST} are needed")
     # residuals count in the coarser picture's pixels: there corners are placed no better
     lens, finer = seen[0].lens, max(1.0, seen[0].lens.fx / known[0].lens.fx)
     coarse = lens.resized(max(1, round(lens.width / finer)), max(1, round(lens.height / finer)))
