@@ -50,8 +50,8 @@ def load_reference(view: ViewConfig) -> Reference:
     """Of one such view.
 
     Raises:
-        SourceError: a picture is missing or damaged. AlignmentError: one shows next to nothing. ConfigError: pictures of
-            several sizes; a calibration of another shape than theirs; too large a view.
+        SourceError: a picture is missing or damaged. AlignmentError: one shows next to nothing. ConfigError: pictures
+            of several sizes; a calibration of another shape than theirs; too large a view.
     """
     path = Path(view.reference or "").expanduser()
     paths = list_pictures(path) if path.is_dir() else [path]

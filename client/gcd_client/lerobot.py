@@ -35,8 +35,8 @@ _FIND_MS = 1500.0  # the node repeats what it is made of to whoever subscribes
 class GcdCameraConfig(CameraConfig):  # pyright: ignore[reportUntypedBaseClass]
     """view: the view's id. endpoint: of the node's views. timeout_ms: until the first view, and of each `read`.
 
-    width, height: left out, the view's; others are an error. fps: what the robot records at; nothing here. keys, node_key: folder of this client's key pair and file
-    of the node's public key, for a node that asks for them.
+    width, height: left out, the view's; others are an error. fps: for LeRobot alone. keys, node_key: folder of this
+    client's key pair and file of the node's public key, for a node that asks for them.
     """
 
     view: str
@@ -54,8 +54,8 @@ class GcdCameraConfig(CameraConfig):  # pyright: ignore[reportUntypedBaseClass]
 
 class GcdCamera(Camera):  # pyright: ignore[reportUntypedBaseClass]
     """Pictures u8 [H, W, 3]. A view that the node no longer vouches for (`valid_for_ms`) is never given: it is waited
-    for a newer one, until TimeoutError. Nor is one of another size: RuntimeError. A thread receives; `read` and its kind
-    may be called from any."""
+    for a newer one, until TimeoutError. Nor is one of another size: RuntimeError. A thread receives; `read` and its
+    kind may be called from any."""
 
     def __init__(self, config: GcdCameraConfig) -> None:
         super().__init__(config)
