@@ -1,12 +1,12 @@
-"""The camera that a canonical view stands in for: its pictures and its lens, as a launch file names them."""
+"""The camera that a canonical view stands in for: what its pictures show and its lens, as a launch file names them."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from gcd_model import Features, Intrinsics, features
+from gcd_model import AlignmentError, Features, Intrinsics, features
 from gcd_node.config import NodeConfig
 from gcd_node.errors import ConfigError, SourceError
-from gcd_node.frame import HALF_PIXEL, Image, load_lens
+from gcd_node.frame import HALF_PIXEL, load_lens
 from gcd_node.image_io import spread
 from gcd_node.preprocess import Rectifier
 from gcd_node.sources.files import list_pictures, read_picture
@@ -14,21 +14,20 @@ from gcd_node.view_config import ViewConfig
 
 _MOST_PICTURES = 8  # of a folder, spread over it
 _MOST_PIXELS = 640 * 480  # of a view
-_SHAPE_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Reference:
-    """pictures: u8 [H, W, 3] each, without distortion, of one camera that stood still. lens: of them. view: the lens
-    of the view, another size of the same."""
+    """features: of pictures without distortion, of one camera that stood still. view: the lens of the view, another
+    size of theirs."""
 
-    pictures: tuple[Image, ...]
-    lens: Intrinsics
+    features: tuple[Features, ...]
     view: Intrinsics
 
-    def features(self) -> list[Features]:
-        """Of every picture. Raises AlignmentError: one has next to none."""
-        return [features(picture, self.lens) for picture in self.pictures]
+    @property
+    def lens(self) -> Intrinsics:
+        """Of the pictures."""
+        return self.features[0].lens
 
 
 def load_references(config: NodeConfig) -> dict[str, Reference]:
@@ -42,7 +41,7 @@ def load_references(config: NodeConfig) -> dict[str, Reference]:
                 )
             try:
                 found[view_id] = load_reference(view)
-            except (ConfigError, SourceError) as error:
+            except (AlignmentError, ConfigError, SourceError) as error:
                 raise ConfigError(f"[view.{view_id}] {error}") from error
     return found
 
@@ -51,8 +50,8 @@ def load_reference(view: ViewConfig) -> Reference:
     """Of one such view.
 
     Raises:
-        SourceError: a picture is missing or damaged. ConfigError: pictures of several sizes; a calibration or a size of
-            another shape than theirs; too large a view.
+        SourceError: a picture is missing or damaged. AlignmentError: one shows next to nothing. ConfigError: pictures
+            of several sizes; a calibration of another shape than theirs; too large a view.
     """
     path = Path(view.reference or "").expanduser()
     paths = list_pictures(path) if path.is_dir() else [path]
@@ -70,13 +69,8 @@ def load_reference(view: ViewConfig) -> Reference:
         if model.distortion != "none":
             pictures = [Rectifier(model, lens).image(picture) for picture in pictures]
     across, along = view.size or (width, height)
-    if abs(across / width * height / along - 1) > _SHAPE_TOLERANCE:
-        raise ConfigError(
-            f"size: {across} x {along} is of another shape than the reference's {width} x {height}; give the picture "
-            "as the policy was given it, cut and resized"
-        )
     if across * along > _MOST_PIXELS:
         raise ConfigError(
             f"size: a view has at most {_MOST_PIXELS} pixels, got {across} x {along}; state a smaller one"
         )
-    return Reference(pictures=tuple(pictures), lens=lens, view=lens.resized(across, along))
+    return Reference(features=tuple(features(each, lens) for each in pictures), view=lens.resized(across, along))

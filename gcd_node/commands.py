@@ -147,8 +147,9 @@ class NodeCommands:
         if view is None or view.kind != "canonical":
             raise _unknown(args.view, tuple(k for k, v in self._live.config.view.items() if v.kind == "canonical"))
         self._require_revision(args.view, command.if_view_rev)
-        if stream is None or stream.drift is None:
-            raise RequestError("the camera is looked at while the node is active: activate first", Code.NOT_READY)
+        if stream is None or stream.drift is None or stream.drift.is_over:
+            message = "the camera is looked at while the node is active, in realtime: activate first"
+            raise RequestError(message, Code.NOT_READY)
         if not command.dry_run:
             stream.drift.request(args.view)
         return Outcome(code=Code.ACCEPTED, message="an event tells when it has")

@@ -5,7 +5,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 
 import numpy as np
@@ -25,6 +25,7 @@ _PERIOD_S = 0.4  # from one check to the next; each takes some 20 ms of a core
 _NICE = 10
 _IN_A_ROW = 3  # checks that agree: an arm before the lens is no camera that moved
 _UNSEEN_S, _HOLD_S = 5.0, 1.0
+_ANSWER_S = 5.0  # for a request; then it has failed
 _MOVED_CM, _MOVED_DEG = 0.5, 0.5  # a step, a turn; and a shift of the picture as by such a step to the side
 _PREFERRED = 0.7  # of the corners: things that the arm carries pull a pose, and the others do not follow
 _FROM_REFERENCE, _SIGMAS = 4.0, 3.0  # so many times that, and surer: other light, other things and a learned depth
@@ -44,18 +45,18 @@ class DriftDetector:
         references: Mapping[str, Reference],
         notice_change: Callable[[], None],
     ) -> None:
-        """notice_change: called once a view has another pose. Raises AlignmentError: a reference shows next to
-        nothing."""
+        """notice_change: called once a view has another pose."""
         self._live, self._announcer, self._notice_change = live, announcer, notice_change
-        self._references = {view_id: reference.features() for view_id, reference in references.items()}
+        self._references = {view_id: reference.features for view_id, reference in references.items()}
         self._newest: SeenFrame | None = None
-        self._asked: set[str] = set()
+        self._asked_s: dict[str, float] = {}  # when
         self._stopped = threading.Event()
         self._recent: deque[Landmarks] = deque(maxlen=_IN_A_ROW)
         self._anchor: Landmarks | None = None  # what the camera saw first
         self._expected: dict[str, Tensor] = {}  # anchor_from_source as the pose of each view takes it to be
         self._last: Tensor | None = None  # the same as it was found by the last check
-        self._in_a_row, self._seen_s, self._is_seen = 0, time.monotonic(), True
+        self._in_a_row, self._is_seen = 0, True
+        self._unseen_s: float | None = None  # since when the scene of the anchor is not seen
         self._moves = Condition("CAMERA_MOVED", announcer, hold_s=_HOLD_S)
         self._unaligned = Condition("UNALIGNED", announcer, hold_s=0.0)
         self.moved: frozenset[str] = frozenset()
@@ -65,8 +66,14 @@ class DriftDetector:
         self._newest = frame
 
     def request(self, view_id: str) -> None:
-        """Let the pose of a view follow the camera at the next check; an event tells how that went. From any thread."""
-        self._asked.add(view_id)
+        """Let the pose of a view follow the camera once it stands; an event tells how that went, within 5 s and a
+        check. From any thread, while not `is_over`."""
+        self._asked_s[view_id] = time.monotonic()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing is checked any more."""
+        return self._stopped.is_set()
 
     def stop(self) -> None:
         """End `run` soon."""
@@ -80,12 +87,17 @@ class DriftDetector:
                 frame, self._newest = self._newest, None
                 if frame is not None:
                     self.check(frame)
+                late_s = time.monotonic() - _ANSWER_S
+                late = [view_id for view_id, asked_s in self._asked_s.copy().items() if asked_s < late_s]
+                self._refuse("no frame shows where the camera stands, or it does not stand still", late)
         except Exception as error:  # the end of a thread: whoever asks for health gets it
             _LOG.exception("the drift detector broke")
             fields = {"thread": "drift", "message": f"{type(error).__name__}: {error}; activate the node anew"}
             self._announcer.event(THREAD_DIED, Level.ERROR, fields)
             self._announcer.health.raise_reason(THREAD_DIED, Level.ERROR)
         finally:
+            self._stopped.set()
+            self._refuse("nothing is looked at any more; activate the node", self._asked_s)
             self._announcer.health.camera = None
 
     def check(self, frame: SeenFrame) -> None:
@@ -101,7 +113,7 @@ class DriftDetector:
         self._keep(now, is_seen=True)
         if len(self._recent) < _IN_A_ROW:
             return
-        self._anchor, self._seen_s = self._anchor or now, time.monotonic()
+        self._anchor, self._unseen_s = self._anchor or now, None
         problem: Mapping[str, object] | None = None
         for view_id, view in self._views().items():
             if view_id not in self._expected:
@@ -125,7 +137,7 @@ class DriftDetector:
     def _begin(self, view_id: str, view: ViewConfig, anchor_from_now: Tensor) -> Mapping[str, object] | None:
         """Find the pose of a view, or see whether the stated one holds; what is wrong if there is none."""
         try:
-            found = align(list(self._recent), self._references[view_id])
+            found = align(self._recent, self._references[view_id])
         except AlignmentError as error:
             if view.pose is None:
                 return {"view": view_id, "message": f"the view is not drawn: {error}"}
@@ -143,13 +155,11 @@ class DriftDetector:
         """Tell whether the camera moved, and let views follow it once it stands."""
         views, last, self._last = self._views(), self._last, found.pose
         moves = {each: found.moved_from(pose) for each, pose in self._expected.items() if each in views}
-        if not moves:
-            return
         beyond = {view_id for view_id in moves if _is_beyond(found, self._expected[view_id])}
-        view_id, worst = max(moves.items(), key=lambda each: each[1].pixels)
-        self._announcer.health.camera = _rounded(worst)
+        view_id, worst = max(moves.items(), key=lambda each: each[1].pixels, default=("", None))
+        self._announcer.health.camera = None if worst is None else _rounded(worst)
         self._in_a_row = self._in_a_row + 1 if beyond else 0
-        if self._in_a_row >= _IN_A_ROW:
+        if worst is not None and self._in_a_row >= _IN_A_ROW:
             self.moved = frozenset(beyond)
             text = f"the source camera no longer stands where {view_id} takes it to stand"
             self._moves.update({"view": view_id, "message": text, **_rounded(worst)})
@@ -157,11 +167,9 @@ class DriftDetector:
             self.moved = frozenset()
             self._moves.update(None)
         if last is not None and not _is_beyond(found, last):  # it stands
-            for view_id in [each for each, view in views.items() if view.realign and each in self.moved]:
-                self._follow(view_id, views[view_id])
-            for view_id in [each for each in views if each in self._asked and each in self._expected]:
-                self._asked.discard(view_id)
-                self._follow(view_id, views[view_id])
+            for view_id in moves:
+                if view_id in self._asked_s or (views[view_id].realign and view_id in self.moved):
+                    self._follow(view_id, views[view_id])
 
     def _follow(self, view_id: str, view: ViewConfig) -> None:
         """Give a view the pose that follows from how the source camera moved."""
@@ -169,7 +177,7 @@ class DriftDetector:
         try:
             found = align([self._anchor], [each.features for each in self._recent])
         except AlignmentError as error:
-            self._announcer.event("ALIGN_FAILED", Level.WARN, {"view": view_id, "message": str(error)})
+            self._refuse(str(error), [view_id])
             return
         expected = self._expected[view_id]
         pose = invert_rigid(found.pose) @ expected @ _pose_of(view)
@@ -181,6 +189,7 @@ class DriftDetector:
         changed = replace(view, pose=tuple(pose.flatten().tolist()))
         revision = self._live.set_view(view_id, changed, instead_of=view)
         if revision is not None:
+            self._asked_s.pop(view_id, None)
             self._notice_change()
             fields = {"view": view_id, "view_rev": revision, "goal": changed.plain, **_rounded(move)}
             self._announcer.event("VIEW_ALIGNED", Level.OK, fields)
@@ -189,20 +198,26 @@ class DriftDetector:
     def _miss(self, reason: str) -> None:
         """The camera sees nothing of what it saw first: it was turned away, or something stands before it."""
         self._announcer.health.camera = None
-        while self._asked:
-            self._announcer.event("ALIGN_FAILED", Level.WARN, {"view": self._asked.pop(), "message": reason})
+        self._unseen_s = self._unseen_s or time.monotonic()
+        self._refuse(reason, self._asked_s)
         if self._anchor is None:  # nor was there anything
             waiting = [each for each, view in self._views().items() if view.pose is None]
             self._unaligned.update({"view": waiting[0], "message": reason} if waiting else None)
-        elif time.monotonic() - self._seen_s > _UNSEEN_S and not self._found_by_reference():
-            self.moved = frozenset(self._expected)
+        elif time.monotonic() - self._unseen_s > _UNSEEN_S and not self._found_by_reference():
+            self.moved = frozenset(self._expected.keys() & self._views().keys())
             self._moves.update({"message": f"the source camera no longer sees what it saw at the start: {reason}"})
+
+    def _refuse(self, reason: str, view_ids: Iterable[str]) -> None:
+        """Answer what was asked for these views."""
+        for view_id in list(view_ids):
+            if self._asked_s.pop(view_id, None) is not None:
+                self._announcer.event("ALIGN_FAILED", Level.WARN, {"view": view_id, "message": reason})
 
     def _found_by_reference(self) -> bool:
         """Whether a reference tells where the camera stands now; it is compared with what it sees now from here on."""
         for view_id, view in self._views().items():
             try:
-                found = align(list(self._recent), self._references[view_id])
+                found = align(self._recent, self._references[view_id])
             except AlignmentError:
                 continue
             if view_id in self._expected:

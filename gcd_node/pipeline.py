@@ -83,8 +83,7 @@ class Stream:
             first: window id and epoch to go on from: neither may come twice in one life of a node.
             recorder: is shown every frame.
         Raises:
-            ConfigError: see prepare_stream(). OptionError, PoseError: see VirtualView. AlignmentError: see
-                DriftDetector.
+            ConfigError: see prepare_stream(). OptionError, PoseError: see VirtualView.
         """
         self._live, self._health, self._announcer = live, announcer.health, announcer
         self._model, self._recorder = model, recorder

@@ -30,8 +30,8 @@ class ViewConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         that know them): x, y, z and a quaternion x, y, z, w, or the 16 numbers of a rigid 4x4 matrix row by row.
     canonical: what another camera, such as a policy's in training, saw from where it stood. reference: its picture, or
         a folder of them. hfov_deg or calibration: its lens, as of a source. size: width and height of the view; left
-        out, the reference's. pose: of that camera, as above; left out, the node finds it. realign: the pose follows a
-        source camera that was moved.
+        out, the reference's; of another shape: stretched, as a policy's resizing does. pose: of that camera, as above;
+        left out, the node finds it. realign: the pose follows a source camera that was moved.
     """
 
     kind: Literal["fixed", "orbit", "pose", "canonical"] = "fixed"

@@ -7,8 +7,9 @@
 
 Every scene leaves a file in OUT; what is there is not done again. The node's own code decides: `DriftDetector.check` on
 a frame every 0.42 s, `align` on five frames as `gcd-node calibrate-view` takes them. Exact depth, as a perfect camera
-would measure it, comes without the network's mask of what moves. Reference and live pictures differ in gamma, exposure
-and white balance, and have noise of two grey levels.
+would measure it, comes without the network's mask of what moves. All pictures have noise of two grey levels; that
+of `pose`'s reference camera is of another moment, gamma, exposure and white balance. `moves` and `alarms` compare with
+what the camera saw first: their reference is a clean picture from there, which the stated pose fits.
 """
 
 import argparse
@@ -175,7 +176,7 @@ class Watch:
 
     def __init__(self, picture: Array, lens: Intrinsics) -> None:
         announcer = Announcer("figures", "", SimpleNamespace(note=lambda *_: None), Health())  # type: ignore[arg-type]
-        reference = Reference(pictures=(picture,), lens=lens, view=lens)
+        reference = Reference(features=(features(picture, lens),), view=lens)
         self._detector = DriftDetector(
             LiveConfig(parse_config(LAUNCH, "figures")), announcer, {"v": reference}, lambda: None
         )

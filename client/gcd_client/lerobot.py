@@ -1,8 +1,9 @@
 """A LeRobot camera that shows a view of a node, such as the picture of the camera that a policy was trained with.
 
-    cameras = {"front": GcdCameraConfig(view="policy")}      # instead of OpenCVCameraConfig(...)
+    cameras = {"front": GcdCameraConfig(view="policy", width=224, height=224, fps=10)}   # not OpenCVCameraConfig(...)
 
-Importing this registers the camera as type "gcd". Needs the package lerobot (0.4.4 was tried).
+A robot of LeRobot needs all three. Importing this registers the camera as type "gcd": on LeRobot's command lines with
+--robot.discover_packages_path=gcd_client. Needs the package lerobot (0.4.4 was tried).
 """
 
 import logging
@@ -34,13 +35,13 @@ _FIND_MS = 1500.0  # the node repeats what it is made of to whoever subscribes
 class GcdCameraConfig(CameraConfig):  # pyright: ignore[reportUntypedBaseClass]
     """view: the view's id. endpoint: of the node's views. timeout_ms: until the first view, and of each `read`.
 
-    width, height: left out, the view's; others are an error. keys, node_key: folder of this client's key pair and file
-    of the node's public key, for a node that asks for them.
+    width, height: left out, the view's; others are an error. fps: for LeRobot alone. keys, node_key: folder of this
+    client's key pair and file of the node's public key, for a node that asks for them.
     """
 
     view: str
     endpoint: str = "ipc"
-    timeout_ms: float = 1000.0
+    timeout_ms: float = 5000.0
     color_mode: ColorMode = ColorMode.RGB
     keys: str | None = None
     node_key: str | None = None
@@ -53,7 +54,8 @@ class GcdCameraConfig(CameraConfig):  # pyright: ignore[reportUntypedBaseClass]
 
 class GcdCamera(Camera):  # pyright: ignore[reportUntypedBaseClass]
     """Pictures u8 [H, W, 3]. A view that the node no longer vouches for (`valid_for_ms`) is never given: it is waited
-    for a newer one, until TimeoutError. A thread receives; `read` and its kind may be called from any."""
+    for a newer one, until TimeoutError. Nor is one of another size: RuntimeError. A thread receives; `read` and its
+    kind may be called from any."""
 
     def __init__(self, config: GcdCameraConfig) -> None:
         super().__init__(config)
@@ -86,8 +88,8 @@ class GcdCamera(Camera):  # pyright: ignore[reportUntypedBaseClass]
     def connect(self, warmup: bool = True) -> None:
         """Subscribe. warmup: wait for the first view; without it `width` and `height` must be stated.
 
-        Raises: ConnectionError: there is no view, or the node does not let this client in; ValueError: the view has
-            another size than was stated.
+        Raises: ConnectionError: there is no view, or the node does not let this client in; RuntimeError: the view has
+            another size than was stated; ClientError: no such endpoint, view id or key.
         """
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
@@ -97,32 +99,30 @@ class GcdCamera(Camera):  # pyright: ignore[reportUntypedBaseClass]
             own, server = read_key_pair(Path(config.keys).expanduser()), read_public_key(config.node_key)
             keys = ClientKeys(own=own, server=server)
         views = ViewSubscriber(config.endpoint, config.view, "frm", keys=keys)
-        self._newest, self._error, self._is_new = None, None, False
+        self._newest, self._error, self._is_new, self._was_moved = None, None, False, False
+        self.width, self.height = config.width, config.height
         self._stop.clear()
         self._thread = threading.Thread(target=self._receive, args=(views,), name=str(self), daemon=True)
         self._thread.start()
         if not warmup and self.width is not None and self.height is not None:
             return
         try:
-            height, width = self.read().shape[:2]
-            if (self.width or width, self.height or height) != (width, height):
-                raise ValueError(f"{self} gives {width} x {height}, {self.width} x {self.height} was stated")
+            self.height, self.width = self.read().shape[:2]
         except TimeoutError as error:
             self.disconnect()
             raise ConnectionError(f"{error}; is the node active, and is there such a view? gcd-node status") from error
-        except (ConnectionError, ValueError):
+        except BaseException:
             self.disconnect()
             raise
-        self.width, self.height = width, height
 
     def read(self) -> NDArray[Any]:
-        """The next view that comes. Raises TimeoutError after `timeout_ms`, ConnectionError."""
+        """The next view that comes. Raises TimeoutError after `timeout_ms`, ConnectionError, RuntimeError."""
         with self._changed:
             self._is_new = False
         return self.async_read(self.config.timeout_ms)
 
     def async_read(self, timeout_ms: float = 200.0) -> NDArray[Any]:
-        """The newest view, unless it was given before: then the next. Raises TimeoutError, ConnectionError."""
+        """The newest view, unless it was given before: then the next. Raises as `read`."""
         with self._changed:
             fresh = lambda: self._error is not None or (self._is_new and self._is_valid())  # noqa: E731
             done = self.is_connected and self._changed.wait_for(fresh, timeout_ms / 1000)
@@ -134,7 +134,7 @@ class GcdCamera(Camera):  # pyright: ignore[reportUntypedBaseClass]
 
     def read_latest(self, max_age_ms: int = 500) -> NDArray[Any]:
         """The newest view, given before or not. Raises TimeoutError: its input is older, or it no longer holds;
-        RuntimeError: there was none yet; ConnectionError."""
+        RuntimeError: there was none yet, or it has another size; ConnectionError."""
         with self._changed:
             view = self._taken()
             if view is None:
@@ -185,6 +185,9 @@ class GcdCamera(Camera):  # pyright: ignore[reportUntypedBaseClass]
 
     def _picture(self, view: ReceivedView) -> NDArray[Any]:
         picture = view.images[0]
+        height, width = picture.shape[:2]
+        if (self.width or width, self.height or height) != (width, height):
+            raise RuntimeError(f"{self} gives {width} x {height}, not {self.width} x {self.height}: see [view.*] size")
         return np.array(picture if self.config.color_mode == ColorMode.RGB else picture[..., ::-1])
 
 

@@ -29,7 +29,7 @@ from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.view_config import CalibratedView
 from gcd_node.window import PartialWindow, PlacedFrame
 
-_VIEW = "reference"
+_VIEW, _NO_SIZE = "reference", (64, 64)  # which is not drawn
 _APART_NS = 200_000_000  # between two frames
 _PATIENCE_S = 60.0
 _FINEST, _FINER = 4, 2.0  # times the model's size, and times as fine as the reference
@@ -56,7 +56,7 @@ def calibrate_view(
     config = _config(source, reference, hfov_deg, calibration, changes or ())
     with Console(stderr=True, markup=False).status("looking"):
         known, camera = _landmarks(config, frames)
-        found = align(known, camera.features())
+        found = align(known, camera.features)
     move = found.moved_from(torch.eye(4, dtype=torch.float64))
     view = CalibratedView(
         pose=tuple(found.pose.flatten().tolist()), inliers=len(found.inliers), matches=found.matches, **asdict(move)
@@ -78,7 +78,7 @@ def _config(
     """Of a launch file, with the one canonical view that is looked for instead of its own."""
     if (hfov_deg is None) == (calibration is None):
         raise UsageError("state the lens of the reference: --hfov-deg or --calibration")
-    view: dict[str, object] = {"kind": "canonical", "reference": str(reference)}
+    view: dict[str, object] = {"kind": "canonical", "reference": str(reference), "size": _NO_SIZE}
     view |= {"hfov_deg": hfov_deg} if calibration is None else {"calibration": str(calibration)}
     try:
         content = decode_toml(read_small(path))

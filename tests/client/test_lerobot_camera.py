@@ -63,7 +63,7 @@ def camera(sender: Sender) -> Iterator[GcdCamera]:
 
 
 def test_a_policy_changes_one_line_of_its_config(sender: Sender) -> None:
-    config = GcdCameraConfig(view="top", endpoint=sender.endpoint)
+    config = GcdCameraConfig(view="top", endpoint=sender.endpoint, width=8, height=6, fps=10)  # as robots demand
     assert isinstance(config, CameraConfig)
     assert config.type == "gcd"
     if importlib.util.find_spec("draccus") is not None:  # the real one
@@ -107,12 +107,17 @@ def test_it_connects_once_within_its_time_and_only_to_a_view_of_the_stated_size(
             use()
     camera = GcdCamera(dataclass_replace(silent, width=9, height=6, timeout_ms=5000))
     threading.Timer(0.3, sender.numbered, (0, frame(1))).start()
-    with pytest.raises(ValueError, match="8 x 6"):
+    with pytest.raises(RuntimeError, match="8 x 6"):
         camera.connect()
     assert not camera.is_connected
     camera.connect(warmup=False)
     with pytest.raises(ConnectionError):
         camera.connect()
+    sender.wait()
+    sender.numbered(1, frame(2))  # in mid-stream a node may be started with another size, or a view set elsewhere
+    for read in (camera.async_read, camera.read_latest):
+        with pytest.raises(RuntimeError, match="8 x 6"):
+            read(5000)
     camera.disconnect()
 
 

@@ -53,6 +53,18 @@ def test_the_pose_is_found_to_its_doubt_whatever_an_arm_does(
     assert move.centimetres == pytest.approx(100 * step, abs=5.0)
 
 
+@pytest.mark.parametrize("wrong", [(0.04, 0, 0), (0, 0.04, 0), (0, 0, 0.04)])
+def test_the_doubt_covers_depths_that_are_wrong_together(wrong: tuple[float, float, float]) -> None:
+    here, there = pose(), pose(0.5, 0.3, 3.0)
+    rgb, metres = shown(here)
+    across, along = np.meshgrid(np.linspace(-1, 1, LENS.width), np.linspace(-1, 1, LENS.height))
+    metres *= 1 + wrong[0] + wrong[1] * across + wrong[2] * along
+    found = align([landmarks(rgb, LENS, metres, np.full(metres.shape, 0.02))], [features(shown(there)[0], LENS)])
+    off = found.moved_from(invert_rigid(here) @ there)
+    assert off.centimetres < off.doubt_centimetres
+    assert off.degrees < off.doubt_degrees
+
+
 def test_pictures_of_another_size_and_lens_are_aligned_too() -> None:
     import cv2
 

@@ -1,11 +1,16 @@
 """Canonical views: their camera, how their pose is found, and how a source camera that was moved is noticed."""
 
+import os
 import threading
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import torch
 from fakes import Box, FakeSource, run, traits
 from numpy.typing import NDArray
 from textured_room import HERE, LENS, moved, seen, shot
@@ -78,12 +83,14 @@ def test_the_pose_comes_from_the_file_that_calibrate_view_wrote(folder: Path) ->
     assert config(folder, f'pose = "{folder}/p.toml"').view["policy"].pose == numbers
 
 
-@pytest.mark.parametrize("change", ["size = [224, 224]", "size = [1920, 1280]", 'calibration = "no.yaml"', "reference"])
+@pytest.mark.parametrize("change", ["size = [1920, 1280]", 'calibration = "no.yaml"', "folder", "dark"])
 def test_a_reference_that_says_something_else_is_refused_in_a_line(folder: Path, change: str) -> None:
     text = LAUNCH.format(folder=folder) + STANDS
-    if change == "reference":  # a folder of pictures of two sizes
+    if change == "folder":  # of pictures of two sizes
         write_png(folder / "small.png", np.zeros((64, 96, 3), np.uint8))
         text = text.replace("/reference.png", "")
+    elif change == "dark":
+        write_png(folder / "reference.png", np.zeros((64, 96, 3), np.uint8))
     elif change.startswith("calibration"):
         text = text.replace("hfov_deg = 60.0\npose", f"{change}\npose")
     else:
@@ -91,6 +98,12 @@ def test_a_reference_that_says_something_else_is_refused_in_a_line(folder: Path,
     with pytest.raises(ConfigError) as error:
         load_references(parse_config(text, "test"))
     assert "\n" not in str(error.value)
+
+
+def test_a_size_of_another_shape_stretches_the_view_as_a_policy_resizes_its_picture(folder: Path) -> None:
+    square = load_reference(config(folder, STANDS + "size = [96, 96]").view["policy"])
+    assert square.features[0].lens == LENS
+    assert (square.view.fx, square.view.fy) == pytest.approx((LENS.fx / 2, LENS.fy * 0.75))
 
 
 def test_a_view_in_lockstep_has_the_camera_of_its_reference_and_needs_its_pose(folder: Path) -> None:
@@ -132,6 +145,10 @@ class Watched:
         announcer = Announcer("gcd", "boot", self.box, self.health)
         references = {"policy": load_reference(self.live.config.view["policy"])}
         self.detector = DriftDetector(self.live, announcer, references, lambda: None)
+
+    def cover(self) -> None:
+        frame = seen(HERE)
+        self.detector.check(replace(frame, picture=torch.full_like(frame.picture, -1.0)))
 
     def show(self, pose: NDArray[np.float64], times: int = 3, seed: int = 0) -> "Watched":
         for number in range(times):
@@ -209,11 +226,54 @@ def test_a_camera_that_was_turned_away_is_told_of_and_found_by_its_reference(
     watched = Watched(folder, stated(THERE)).show(HERE).show(HERE, 2, seed=5)
     assert watched.detector.moved == {"policy"}
     assert watched.codes() == ["CAMERA_MOVED"]
+    watched = Watched(folder, stated(THERE)).show(HERE)
+    watched.cover()
+    assert watched.codes() == ["CAMERA_MOVED"]
     watched = Watched(folder, stated(moved(0.0, 0.0, 10.0) @ THERE) + "realign = true\n")
     watched.show(moved(0.0, 0.0, 10.0), seed=7)  # what it saw at the start, and never again
     watched.show(HERE, 9)
     assert watched.codes()[-1] == "VIEW_ALIGNED"
     assert_near(watched.pose, THERE)
+
+
+def test_a_dark_frame_after_a_break_is_no_move(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    watched, clock = Watched(folder, stated(THERE)).show(HERE), time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: clock() + 60.0)  # a camera that was plugged in again
+    watched.cover()
+    assert watched.show(HERE).codes() == []
+
+
+def test_a_view_that_a_command_made_another_has_not_moved(folder: Path) -> None:
+    watched = Watched(folder, stated(THERE) + "[view.other]\n").show(HERE).show(moved(0.03), 4)
+    watched.live.set_view("policy", watched.live.config.view["other"])
+    watched.show(moved(0.03), 2)
+    time.sleep(gcd_node.drift._HOLD_S)  # pyright: ignore[reportPrivateUsage]
+    watched.show(moved(0.03), 1)
+    assert watched.detector.moved == frozenset()
+    assert watched.health.status()["reasons"] == []
+    assert "camera" not in watched.health.status()
+
+
+@pytest.mark.parametrize("frames", [True, False])
+def test_a_request_is_answered_once_in_time_whatever_the_camera_does(
+    folder: Path, frames: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gcd_node.drift, "_PERIOD_S", 0.01)
+    monkeypatch.setattr(gcd_node.drift, "_ANSWER_S", 0.05)
+    monkeypatch.setattr(os, "nice", lambda _: 0)
+    watched = Watched(folder, "").show(HERE, seed=3)  # where no reference tells the pose
+    thread = threading.Thread(target=watched.detector.run)
+    watched.detector.request("policy")
+    thread.start()
+    while "ALIGN_FAILED" not in watched.codes():
+        if frames:
+            watched.detector.offer(seen(HERE, seed=3))
+        time.sleep(0.01)
+    watched.detector.request("policy")
+    watched.detector.stop()
+    thread.join(5)
+    assert watched.detector.is_over
+    assert watched.codes() == ["UNALIGNED", "ALIGN_FAILED", "ALIGN_FAILED"]
 
 
 def test_a_command_that_came_first_is_not_overwritten(folder: Path) -> None:
@@ -231,6 +291,8 @@ def test_calibrate_view_writes_a_pose_or_says_in_its_exit_code_why_not(
         write_png(folder / "source" / f"{number}.png", shot(HERE)[0])
     write_png(folder / "same.png", shot(HERE)[0])
     write_png(folder / "other.png", shot(HERE, seed=3)[0])
+    write_png(folder / "large.png", np.asarray(cv2.resize(shot(HERE)[0], (1280, 853)), np.uint8))
+    write_png(folder / "dark.png", np.zeros((128, 192, 3), np.uint8))
     launch = folder / "launch.toml"
     source = f'[source]\nkind = "folder"\npace = "lockstep"\npath = "{folder}/source"\nfps = 5.0\nhfov_deg = 60.0\n'
     (folder / "no_lens.toml").write_text(source.replace("hfov_deg = 60.0\n", "") + '[model]\nweights = "random:live"\n')
@@ -244,11 +306,13 @@ def test_calibrate_view_writes_a_pose_or_says_in_its_exit_code_why_not(
     assert code("same.png", *lens) == 0
     pose = np.array(config(folder, f'pose = "{folder}/found.toml"').view["policy"].pose).reshape(4, 4)
     assert np.abs(pose - np.eye(4)).max() < 1e-3  # whatever depth random weights see
+    assert code("large.png", *lens) == 0  # more pixels than a view may have
     (folder / "found.toml").unlink()
     capsys.readouterr()
     for reference, options, wanted in (
         ("other.png", lens, 65),
         ("missing.png", lens, 78),
+        ("dark.png", lens, 78),
         ("same.png", (), 64),
         ("same.png", (*lens, "--source", str(folder / "no_lens.toml")), 78),
         ("same.png", (*lens, "--set", "source.path=/missing"), 66),

@@ -32,7 +32,7 @@ const link = new Link({
   meta: (told) => { noticeBoot(told.boot_id); offerViews(told.fields.views ?? []); },
   event: (told) => {
     health.event(told);
-    if (["VIEW_SET", "VIEW_REMOVED", "PARAM_SET"].includes(told.fields.code)) controls.refresh(controls.commands);
+    if (["VIEW_SET", "VIEW_ALIGNED", "VIEW_REMOVED", "PARAM_SET"].includes(told.fields.code)) controls.refresh(controls.commands);
   },
   picture: (head, bytes, at) => {
     taking = taking.then(() => take(head, bytes, at)).catch((error) => console.warn("a picture could not be shown", error))

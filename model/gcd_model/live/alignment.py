@@ -38,6 +38,8 @@ _EDGE = 1.1
 """Depths around a landmark differ by less than this factor: at an edge nobody knows on which side it lies."""
 _FEWEST, _LEAST_SHARE = 12, 0.25
 """Of the matches, that agree with a pose: fewer are a coincidence."""
+_TOGETHER = 2.0
+"""Of the standard error of depths: by how much they may be wrong together."""
 _MOST_DEG, _MOST_SHARE = 1.5, 0.02
 """Doubt about an angle, and about a place in parts of the distance to the landmarks, beyond which a pose is none."""
 
@@ -186,9 +188,9 @@ def align(known: Sequence[Landmarks], seen: Sequence[Features]) -> Alignment:
     Raises: AlignmentError: they show different scenes, or too little that both cameras see.
     """
     pairs = [_matched(each, other) for each in known for other in seen]
+    if (common := sum(map(len, pairs))) < _FEWEST:
+        raise AlignmentError(f"the pictures have {common} corners in common; {_FEWEST} are needed")
     tracks = Tracks(**{f.name: np.concatenate([getattr(each, f.name) for each in pairs]) for f in fields(Tracks)})
-    if len(tracks) < _FEWEST:
-        raise AlignmentError(f"the pictures have {len(tracks)} corners in common; {_FEWEST} are needed")
     # residuals count in the coarser picture's pixels: there corners are placed no better
     lens, finer = seen[0].lens, max(1.0, seen[0].lens.fx / known[0].lens.fx)
     coarse = lens.resized(max(1, round(lens.width / finer)), max(1, round(lens.height / finer)))
@@ -237,14 +239,21 @@ def _matched(known: Landmarks, seen: Features) -> Tracks:
 
 
 def _covariance(inliers: Tracks, lens: Intrinsics, pose: Array, pairs: int) -> Array:
-    """Of a step and a turn. pairs: of pictures, which show the same corners and so err alike; and all depths may be
-    wrong by the same share, which moves the camera along its way."""
+    """Of a step and a turn. pairs: of pictures, which show the same corners and so err alike.
+
+    All depths may also be wrong together: by the same share, or by one that grows across the picture or down it.
+    """
     residual, slope = reprojection(inliers, lens, pose)
     flat = slope.reshape(-1, 6)
     spread = max(1.0, (residual**2).sum() / (residual.size - 6))
-    covariance = np.linalg.inv(flat.T @ flat / pairs + 1e-6 * np.eye(6)) * spread
-    way = pose[:3, :3].T @ pose[:3, 3] * inliers.share.mean()
-    covariance[:3, :3] += np.outer(way, way)
+    inverse_normal = np.linalg.inv(flat.T @ flat + 1e-6 * np.eye(6))
+    covariance = pairs * spread * inverse_normal
+    ray = (inliers.point - inliers.eye) @ pose[:3, :3] * inliers.share[:, None]
+    shift = np.einsum("nij,nj->ni", slope[:, :, :3], ray)  # of the picture, where a depth is wrong by its share
+    across, along = 2 * ((inliers.place + 0.5) / (lens.width, lens.height) - 0.5).T
+    for mode in (np.ones(len(inliers)), across, along):
+        moved = _TOGETHER * inverse_normal @ np.einsum("nij,ni,n->j", slope, shift, mode)
+        covariance += np.outer(moved, moved)
     return covariance
 
 
