@@ -122,6 +122,9 @@ class NodeCommands:
         if args.view not in live.known_views:
             raise _unknown(args.view, live.known_views)
         self._require_revision(args.view, command.if_view_rev)
+        if (now := live.config.view.get(args.view)) is not None and now.kind == "canonical":
+            message = f"{args.view} is canonical: align_view lets it follow its camera; another pose is the launch file's"
+            raise RequestError(message, Code.BAD_ARG)
         view = args.to_config()
         result: dict[str, object] = {"view": args.view}
         if view.pose is not None:
@@ -150,8 +153,9 @@ class NodeCommands:
         if stream is None or stream.drift is None or stream.drift.is_over:
             message = "the camera is looked at while the node is active, in realtime: activate first"
             raise RequestError(message, Code.NOT_READY)
-        if not command.dry_run:
-            stream.drift.request(args.view)
+        if command.dry_run:
+            return Outcome(message="it would be asked for")
+        stream.drift.request(args.view)
         return Outcome(code=Code.ACCEPTED, message="an event tells when it has")
 
     def _remove_view(self, args: RemoveView, command: Command) -> Outcome:

@@ -35,7 +35,7 @@ class DriftDetector:
     """Compares what the source camera sees with what it saw when this began, a few times a second, in a thread of its
     own: of the frames that were looked at for views, while these are drawn.
 
-    moved: views whose pose no longer holds.
+    moved: views whose pose no longer holds now.
     """
 
     def __init__(
@@ -60,6 +60,11 @@ class DriftDetector:
         self._moves = Condition("CAMERA_MOVED", announcer, hold_s=_HOLD_S)
         self._unaligned = Condition("UNALIGNED", announcer, hold_s=0.0)
         self.moved: frozenset[str] = frozenset()
+        self._held_from: dict[str, int] = {}  # the revision with which a moved view was aligned again
+
+    def was_wrong(self, view_id: str, revision: int) -> bool:
+        """Whether what is drawn with this revision of a view shows a pose that no longer holds. From any thread."""
+        return view_id in self.moved or revision < self._held_from.get(view_id, 0)
 
     def offer(self, frame: SeenFrame) -> None:
         """A frame that the model has looked at; the newest is checked. From any thread; never waits."""
@@ -181,11 +186,13 @@ class DriftDetector:
             return
         expected = self._expected[view_id]
         pose = invert_rigid(found.pose) @ expected @ _pose_of(view)
-        if self._set_pose(view_id, view, pose, found.moved_from(expected)):
+        if revision := self._set_pose(view_id, view, pose, found.moved_from(expected)):
+            if view_id in self.moved:
+                self._held_from[view_id] = revision
             self._expected[view_id], self.moved, self._in_a_row = found.pose, self.moved - {view_id}, 0
 
-    def _set_pose(self, view_id: str, view: ViewConfig, pose: Tensor, move: CameraMove) -> bool:
-        """Unless a command has changed the view meanwhile. move: what the event tells."""
+    def _set_pose(self, view_id: str, view: ViewConfig, pose: Tensor, move: CameraMove) -> int | None:
+        """The view's new revision, unless a command has changed it meanwhile. move: what the event tells."""
         changed = replace(view, pose=tuple(pose.flatten().tolist()))
         revision = self._live.set_view(view_id, changed, instead_of=view)
         if revision is not None:
@@ -193,7 +200,7 @@ class DriftDetector:
             self._notice_change()
             fields = {"view": view_id, "view_rev": revision, "goal": changed.plain, **_rounded(move)}
             self._announcer.event("VIEW_ALIGNED", Level.OK, fields)
-        return revision is not None
+        return revision
 
     def _miss(self, reason: str) -> None:
         """The camera sees nothing of what it saw first: it was turned away, or something stands before it."""

@@ -263,6 +263,7 @@ class Renderer:
             raise Cancelled("the node is stopping")
         ended_ns, offset_ns = time.monotonic_ns(), utc_offset_ns()
         self._shown.source(context, views[0])
+        drift = self._drift
         for virtual, view in zip(job.views, views, strict=True):
             rendered = Rendered(
                 window=job.window,
@@ -274,7 +275,7 @@ class Renderer:
                 steps=steps,
                 seed=seed,
                 utc_offset_ns=offset_ns,
-                flags=("moved",) if self._drift is not None and virtual.view_id in self._drift.moved else (),
+                flags=("moved",) if drift is not None and drift.was_wrong(virtual.view_id, virtual.rev) else (),
             )
             self._out.send(messages(context, rendered))
             age_s = (time.monotonic_ns() - newest_ns(context, job.window)) / 1e9

@@ -104,7 +104,8 @@ class Exchange(threading.Thread):
             else:
                 self._reply = content
         except (OSError, http.client.HTTPException, ValueError) as error:
-            self._problem = f"{type(error).__name__}: {str(error)[:_LONGEST_WORD]}"
+            word = f"{type(error).__name__}: {str(error)[:_LONGEST_WORD]}"
+            self._problem = f"{word}; does `gcd-node serve` run there, and is [model] weights its address?"
         finally:
             link.close()
             self._ended_s = time.monotonic()
@@ -266,11 +267,14 @@ def _service(section: ModelSection) -> Service:
         url = urlsplit(section.weights)
         if not url.hostname or url.username is not None or url.port == 0:
             raise ValueError("a host and no password is due")
+    except ValueError as error:
+        raise ConfigError(f"[model] weights: no address of a service: {error}") from error
+    try:
         token = "" if section.token is None else read_small(Path(section.token).expanduser()).strip()
         if not token.isascii() or not token.isprintable():
-            raise ValueError("a token is printable ASCII")
+            raise ValueError("is not printable ASCII")
     except (ValueError, FileError) as error:
-        raise ConfigError(f"[model] weights or token of the service: {error}") from error
+        raise ConfigError(f"[model] token: {section.token} {error}; a file that holds the token alone") from error
     return Service(address=section.weights, token=token)
 
 

@@ -1,7 +1,10 @@
 """`gcd-node calibrate-view`: where the camera of a reference picture stood, in the axes of the camera there is now."""
 
+import logging
+import math
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
@@ -13,7 +16,18 @@ import torch
 from rich.console import Console
 from typer import Argument, Option
 
-from gcd_model import FileError, FrameSynthesizer, Intrinsics, Landmarks, align, decode_toml, landmarks_of, read_small
+from gcd_model import (
+    Alignment,
+    AlignmentError,
+    FileError,
+    FrameSynthesizer,
+    Intrinsics,
+    Landmarks,
+    align,
+    decode_toml,
+    landmarks_of,
+    read_small,
+)
 from gcd_node.canonical import Reference
 from gcd_node.cli.main import table
 from gcd_node.cli.run import Changes
@@ -29,9 +43,11 @@ from gcd_node.stream_context import StreamContext, prepare_stream
 from gcd_node.view_config import CalibratedView
 from gcd_node.window import PartialWindow, PlacedFrame
 
+_LOG = logging.getLogger(__name__)
 _VIEW, _NO_SIZE = "reference", (64, 64)  # which is not drawn
 _APART_NS = 200_000_000  # between two frames
 _PATIENCE_S = 60.0
+_LENSES, _CLEARLY = (0.8, 0.87, 0.93, 1.07, 1.15, 1.25), 1.06  # focal lengths tried instead; times as many corners
 _FINEST, _FINER = 4, 2.0  # times the model's size, and times as fine as the reference
 
 
@@ -70,6 +86,25 @@ def calibrate_view(
     console = Console(markup=False)
     console.print(table(shown, ("the reference's camera", ">pixels", ">degrees", ">cm")))
     console.print(f"{view.inliers} of {view.matches} common corners agree; wrote {out}", soft_wrap=True)
+    _doubt_lens(known, camera, found)
+
+
+def _doubt_lens(known: list[Landmarks], camera: Reference, found: Alignment) -> None:
+    """Warn where clearly more corners agree with a pose if the reference's lens were another: a wrong one of either
+    camera makes a wrong pose, whose standard error does not tell."""
+    agree = {1.0: len(found.inliers) / found.matches}
+    for factor in _LENSES:
+        lens = replace(camera.lens, fx=factor * camera.lens.fx, fy=factor * camera.lens.fy)
+        with suppress(AlignmentError):
+            other = align(known, [replace(each, lens=lens) for each in camera.features])
+            agree[factor] = len(other.inliers) / other.matches
+    best = max(agree, key=lambda factor: agree[factor])
+    if agree[best] > _CLEARLY * agree[1.0]:
+        wide, wider = (math.degrees(2 * math.atan(camera.lens.width / 2 / f / camera.lens.fx)) for f in (1.0, best))
+        _LOG.warning(
+            f"a reference of about {wider:.0f} degrees instead of {wide:.0f} would agree with {agree[best]:.0%} of the "
+            f"corners instead of {agree[1.0]:.0%}: are both lenses stated right? A wrong lens is a wrong pose"
+        )
 
 
 def _config(

@@ -274,8 +274,10 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 def _read(path: Path, flags: int) -> NDArray[Any]:
     """A picture as OpenCV decodes it."""
     try:
-        if not path.is_file() or path.stat().st_size > _MAX_BYTES:
-            raise SourceError(f"is missing, no regular file, or has more than {_MAX_BYTES} bytes")
+        if not path.is_file():
+            raise SourceError("is missing, or no regular file")
+        if path.stat().st_size > _MAX_BYTES:
+            raise SourceError(f"has more than {_MAX_BYTES} bytes")
         return decode_picture(path.read_bytes(), flags)
     except (OSError, SourceError) as error:
         raise SourceError(f"{path} {error}; remove or replace it") from error

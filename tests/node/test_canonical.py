@@ -197,6 +197,7 @@ def test_a_view_follows_a_camera_that_was_moved(folder: Path, asked: bool) -> No
     assert watched.codes() == ["CAMERA_MOVED", "VIEW_ALIGNED"]
     assert watched.detector.moved == frozenset()
     assert watched.live.revision("policy") == 2
+    assert [watched.detector.was_wrong("policy", rev) for rev in (1, 2)] == [True, False]  # 1 is still in work
     assert_near(watched.pose, np.linalg.inv(now) @ THERE)
 
 
@@ -307,8 +308,10 @@ def test_calibrate_view_writes_a_pose_or_says_in_its_exit_code_why_not(
     pose = np.array(config(folder, f'pose = "{folder}/found.toml"').view["policy"].pose).reshape(4, 4)
     assert np.abs(pose - np.eye(4)).max() < 1e-3  # whatever depth random weights see
     assert code("large.png", *lens) == 0  # more pixels than a view may have
+    assert capsys.readouterr().err == ""
+    assert code("same.png", "--hfov-deg", "50") == 0
+    assert "instead of 50" in capsys.readouterr().err  # no standard error tells that a lens is wrong
     (folder / "found.toml").unlink()
-    capsys.readouterr()
     for reference, options, wanted in (
         ("other.png", lens, 65),
         ("missing.png", lens, 78),

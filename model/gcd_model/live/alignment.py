@@ -200,7 +200,10 @@ def align(known: Sequence[Landmarks], seen: Sequence[Features]) -> Alignment:
     agree = errors < OUTLIER
     needed = max(_FEWEST, math.ceil(_LEAST_SHARE * len(tracks)))
     if agree.sum() < needed:
-        raise AlignmentError(f"only {agree.sum()} of {len(tracks)} common corners agree on a pose; {needed} are needed")
+        raise AlignmentError(
+            f"only {agree.sum()} of {len(tracks)} common corners agree on a pose; {needed} are needed: do both show one "
+            "scene, and are both lenses stated right?"
+        )
     inliers = tracks.rows(agree)
     covariance = _covariance(inliers, coarse, pose, len(pairs))
     _require_sure(inliers, pose, covariance)
@@ -262,5 +265,6 @@ def _require_sure(inliers: Tracks, pose: Array, covariance: Array) -> None:
     doubt_deg, doubt_m = math.degrees(math.sqrt(variance[3:].sum())), math.sqrt(variance[:3].sum())
     if doubt_deg > _MOST_DEG or doubt_m > _MOST_SHARE * far_m:
         raise AlignmentError(
-            f"the pictures leave a doubt of {doubt_deg:.1f} degrees and {100 * doubt_m:.0f} cm: they share too little"
+            f"the pictures leave a doubt of {doubt_deg:.1f} degrees and {100 * doubt_m:.0f} cm: they share too little, "
+            "or a lens is stated wrong"
         )
