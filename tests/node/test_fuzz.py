@@ -15,7 +15,19 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from mutations import BYTE_PIECES, ROUNDS, TEXT_PIECES, Mutator, outcomes
-from wire_messages import BOOT, class_map, depth, end, grid, jpeg_window, origin, pixels, view_header, visibility, window
+from wire_messages import (
+    BOOT,
+    class_map,
+    depth,
+    end,
+    grid,
+    jpeg_window,
+    origin,
+    pixels,
+    view_header,
+    visibility,
+    window,
+)
 
 from gcd_client.control import Code, Reply, Request, encode_request
 from gcd_client.frames import decode_frame, encode_frame
@@ -214,7 +226,7 @@ def test_what_was_tampered_with_ends_as_what_it_is_or_a_documented_error(
     assert ended.total() - ended["refused"] >= least_accepted * ROUNDS
 
 
-# Every kind of message, byte for byte as it has been since 1.0 (1.1 for maps, 1.3 for grids): SHA-256 of recorded bytes.
+# Every kind of message, byte for byte as since 1.0 (1.1 for maps, 1.3 for grids): SHA-256 of recorded bytes.
 
 
 STAMP_NS = 1_700_000_002_123_456_789
