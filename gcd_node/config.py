@@ -109,8 +109,9 @@ class GridConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         sides = [(high - low) / self.cell_m for low, high in (self.extent_m[:2], self.extent_m[2:])]
         if not all(1 <= side <= _MOST_CELLS and abs(side - round(side)) < 1e-6 for side in sides):
             raise ValueError(f"extent_m is x from, x to, y from, y to, 1 to {_MOST_CELLS} whole cells of cell_m each")
-        if max(map(abs, self.extent_m)) > _FARTHEST_CELL_M:
-            raise ValueError(f"a grid reaches at most {_FARTHEST_CELL_M:g} m from the vehicle, got {self.extent_m}")
+        farthest_m = min(_FARTHEST_CELL_M, _MOST_CELLS * self.cell_m)  # the memory lies all about the vehicle
+        if max(map(abs, self.extent_m)) > farthest_m:
+            raise ValueError(f"such a grid reaches at most {farthest_m:g} m from the vehicle, got {self.extent_m}")
 
 
 class PublishConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

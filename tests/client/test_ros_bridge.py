@@ -47,6 +47,8 @@ from gcd_node.lifecycle import PATHS, State
 from gcd_node.sources.logs import pose_of
 
 PACKAGE = Path(__file__).parents[2] / "launch" / "ros2" / "gcd_views"
+LAYOUT = (PACKAGE.parents[1] / "foxglove-live.json").read_text().replace("topdown", "top")
+SHOWN = {re.sub("^/gcd/", "~/", name) for name in re.findall(r'"(/\w[\w/]+)', LAYOUT)}
 
 with pytest.MonkeyPatch.context() as patch:
     for each, module in ROS.items():
@@ -155,6 +157,7 @@ class Bench:
     node: Any
     folder: Path
     sequence: int = 0
+    views: tuple[str, ...] = ("top",)
     grids: tuple[str, ...] = ()
 
     def start(self) -> None:
@@ -173,7 +176,7 @@ class Bench:
         while not holds():
             assert time.monotonic() < deadline_s, "it did not come about"
             self.sequence += 1
-            for message in (status(), meta("top", grids=self.grids), *sent):
+            for message in (status(), meta(*self.views, grids=self.grids), *sent):
                 socket = self.sockets["status" if isinstance(message, StatusMessage) else "data"]
                 socket.send(encode(replace(message, sequence=self.sequence)))
             self.node.tick()
@@ -215,11 +218,9 @@ def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node
     assert bench.node.topics == topics
     assert bench.out("~/src/image/compressed")[0].header.frame_id == "robot/gcd/source_optical"
     assert json.loads(bench.out("~/events")[0].data)["code"] == "STATE"
-    layout = (PACKAGE.parents[1] / "foxglove-live.json").read_text().replace("/topdown/", "/top/")
-    shown = set(re.findall(r'"(/\w[\w/]+)', layout))
-    assert len(shown) >= 8
-    assert {re.sub("^/gcd/", "~/", name) for name in shown} <= topics
-    parts = set(re.findall(r'name==\\"([^\\]+)', layout.replace("topdown", "top")))
+    assert len(SHOWN) >= 8
+    assert topics >= SHOWN - {"~/grid_around/occupancy"}
+    parts = set(re.findall(r'name==\\"([^\\]+)', LAYOUT))
     assert {f"robot/{name}" for name in parts} <= {each.name for each in bench.out("/diagnostics")[-1].status}
     headers = [bench.out(f"~/top/{name}")[0].header for name in names if name != "class_names"]
     newest_at_goal = divmod(window().header.t_capture_ns[1], 10**9)
@@ -231,8 +232,6 @@ def test_a_view_becomes_topics_of_one_stamp_and_frame_under_the_name_of_the_node
     frames = (transform.header.frame_id, transform.child_frame_id)
     assert frames == ("robot/gcd/source_optical", "robot/gcd/top_optical")
     bench.until(lambda: len(bench.out("~/top/classes")) > 1, class_map())
-    bench.until(lambda: "~/top/image" in bench.node.topics, meta("~/../x"))  # no view id, and never a topic
-    assert {topic.split("/")[1] for topic in bench.node.topics if topic[0] == "~"} == {"top", "src", "events"}
     (latched,) = bench.out("~/top/class_names")
     assert [(each["id"], each["name"], tuple(each["colour"])) for each in json.loads(latched.data)] == [
         (each.id, each.name, each.colour) for each in CLASSES
@@ -254,10 +253,21 @@ def test_what_the_camera_saw_is_read_while_somebody_looks_and_no_longer(bench: B
     bench.until(lambda: len(bench.out(topic)) > seen, source)
 
 
+@pytest.mark.parametrize(("views", "grids"), [(("top", "~/../x"), ()), (("top",), ("~/../x",))])
+def test_what_is_no_id_is_said_and_never_becomes_a_topic(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, views: tuple[str, ...], grids: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(bridge, "SILENT_AFTER_S", 0.0)  # says what is wrong instead of what the node says
+    bench.views, bench.grids = views, grids
+    bench.until(lambda: "~/../x" in bench.diagnostic(0).message)
+    assert not any("x" in topic.split("/") for topic in bench.node.topics)
+
+
 def test_a_grid_becomes_topics_of_its_own_in_the_frame_of_the_vehicle(bench: Bench) -> None:
     topics = {f"~/grid_around/{name}" for name in ("occupancy", "grid_map", "class_names")}
     bench.grids = ("around",)
     bench.until(lambda: topics <= set(bench.node.published), grid())
+    assert topics & SHOWN
     headers = [bench.out(f"~/grid_around/{name}")[0].header for name in ("occupancy", "grid_map")]
     assert {each.frame_id for each in headers} == {"base_link"}
     stale = grid(t_publish_ns=time.time_ns() - 10**10, valid_for_ms=500)

@@ -89,6 +89,14 @@ def test_a_kerb_is_ground_and_ground_under_something_is_not_free() -> None:
     assert at(hanging, 10.25, 6.25)[0] == FREE
 
 
+def test_ground_close_in_front_of_something_is_free_only_by_measured_depth() -> None:
+    hanging = street((15.0, -6.0, 6.0, 0.6, 3.0))
+    learned = replace(hanging, geometry=replace(hanging.geometry, spread=torch.zeros(64, 96)))
+    measured, estimated = (mapper().update(each, 0.0) for each in (hanging, learned))
+    assert (at(measured, 14.25, 0.25)[0], at(estimated, 14.25, 0.25)[:2]) == (FREE, (UNKNOWN, NEVER_SEEN))
+    assert at(measured, 12.25, 0.25)[0] == at(estimated, 12.25, 0.25)[0] == FREE
+
+
 def test_what_stands_is_remembered_where_it_is_while_the_vehicle_moves_and_turns() -> None:
     made = mapper()
     made.update(street(WALL), 0.0)

@@ -23,6 +23,7 @@ GRID = "[grid.around]\nextent_m = [-2.0, 6.0, -3.0, 3.0]\n"
     [
         *(f"extent_m = {extent}" for extent in ("[0.0, 10.0, 0.0]", "[5.0, 0.0, 0.0, 5.0]", "[0.0, 0.6, 0.0, 5.0]")),
         *(f"extent_m = [0.0, {far}, 0.0, 1.0]" for far in ("300.0", "1e300", "nan", "inf")),
+        "extent_m = [180.0, 200.0, -5.0, 5.0]\ncell_m = 0.05",
         *("extent_m = [-100.0, 100.0, -5.0, 5.0]\ncell_m = 0.1", "cell_m = 0.01", "seconds = -1", "size = 3"),
     ],
 )

@@ -41,6 +41,8 @@ _ACROSS = (-1 / 3, 0.0, 1 / 3)
 """Places across a pixel at which what is in the way is looked up: a wall seen sideways has no gaps."""
 _DENSE = 0.8
 """Ground is looked up at places so far apart, in cells of the memory."""
+_IN_FRONT = 0.06
+"""Ground so little nearer, as a share of its distance, than what a network's depth has above it, may lie under that."""
 _NEVER = math.inf
 _CELL = np.dtype([("stamp", "f8"), ("votes", "f4"), ("height", "f4"), ("label", "u1"), ("moves", "?")], align=True)
 _NOTHING = np.array((-_NEVER, 0, 0, 0, False), _CELL)
@@ -196,7 +198,7 @@ class _Picture:
     """A frame's pixels, row by row in one axis, [N].
 
     rays: [2, N], see `Intrinsics.rays`. slopes: [2, N], see `relative_slopes`. height: over the ground, NaN where
-    nothing is known surely. way_m: [H, W], depth of what is in the way, elsewhere infinite.
+    nothing is known surely. way_m: [H, W], depth of what is in the way, elsewhere infinite. in_front: see _IN_FRONT.
     """
 
     lens: Intrinsics
@@ -208,6 +210,7 @@ class _Picture:
     way_m: Array
     labels: Array
     moves: Array
+    in_front: float
 
     @staticmethod
     def of(frame: SeenFrame, vehicle_from_camera: Array) -> "_Picture":
@@ -232,6 +235,7 @@ class _Picture:
             way_m=np.where(height > _WAY_M[0], metres, np.inf).reshape(lens.height, lens.width),
             labels=labels,
             moves=_TRAFFIC[labels] & ~seen.static.cpu().numpy().ravel(),
+            in_front=0 if seen.spread is None else _IN_FRONT,  # measured depth is taken as it is
         )
 
     @property
@@ -259,7 +263,7 @@ class _Picture:
     def ground(self, reach_m: float, step_m: float) -> tuple[Array, Array, Array]:
         """Places on ground that is seen under nothing, so far away and about so far apart; see `points`."""
         lens, above_m = self.lens, np.minimum.accumulate(self.way_m).ravel()
-        ground = (self.height <= _WAY_M[0]) & (self.metres < above_m)
+        ground = (self.height <= _WAY_M[0]) & (self.metres < above_m * (1 - self.in_front))
         far = np.arange(step_m, reach_m, step_m)  # along the vehicle's axis, where the ground should be
         _, y, z = self.on_camera(np.stack([far, 0 * far, 0 * far]))
         v = lens.fy * y[z > 0] / z[z > 0] + lens.cy
