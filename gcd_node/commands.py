@@ -123,7 +123,9 @@ class NodeCommands:
             raise _unknown(args.view, live.known_views)
         self._require_revision(args.view, command.if_view_rev)
         if (now := live.config.view.get(args.view)) is not None and now.kind == "canonical":
-            message = f"{args.view} is canonical: align_view lets it follow its camera; another pose is the launch file's"
+            message = (
+                f"{args.view} is canonical: align_view lets it follow its camera; another pose is the launch file's"
+            )
             raise RequestError(message, Code.BAD_ARG)
         view = args.to_config()
         result: dict[str, object] = {"view": args.view}

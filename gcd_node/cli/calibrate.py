@@ -47,7 +47,7 @@ _LOG = logging.getLogger(__name__)
 _VIEW, _NO_SIZE = "reference", (64, 64)  # which is not drawn
 _APART_NS = 200_000_000  # between two frames
 _PATIENCE_S = 60.0
-_LENSES, _CLEARLY = (0.8, 0.87, 0.93, 1.07, 1.15, 1.25), 1.06  # focal lengths tried instead; times as many corners
+_LENSES, _CLEARLY = (0.8, 0.87, 0.93, 1.07, 1.15, 1.25), 1.03  # focal lengths tried instead; times as many corners
 _FINEST, _FINER = 4, 2.0  # times the model's size, and times as fine as the reference
 
 
@@ -86,10 +86,10 @@ def calibrate_view(
     console = Console(markup=False)
     console.print(table(shown, ("the reference's camera", ">pixels", ">degrees", ">cm")))
     console.print(f"{view.inliers} of {view.matches} common corners agree; wrote {out}", soft_wrap=True)
-    _doubt_lens(known, camera, found)
+    doubt_lens(known, camera, found)
 
 
-def _doubt_lens(known: list[Landmarks], camera: Reference, found: Alignment) -> None:
+def doubt_lens(known: list[Landmarks], camera: Reference, found: Alignment) -> None:
     """Warn where clearly more corners agree with a pose if the reference's lens were another: a wrong one of either
     camera makes a wrong pose, whose standard error does not tell."""
     agree = {1.0: len(found.inliers) / found.matches}
