@@ -366,9 +366,11 @@ def _http_options(section: ServeSection) -> "HTTPOptions":
 
 def _require_endpoint(section: ServeSection) -> None:
     """Serve has one endpoint a cluster, and keeps the one it has. Raises ConfigError: that is another."""
-    from ray.serve.context import _get_global_client  # the only place that tells
+    from ray.serve.context import _get_global_client as client  # pyright: ignore[reportPrivateUsage]  # alone tells
 
-    now, due = _get_global_client().http_config, _http_options(section)
+    serve = client()
+    assert serve is not None, "it was started"
+    now, due = serve.http_config, _http_options(section)
     names = ("host", "port", "ssl_certfile", "ssl_keyfile")
     if other := [f"{name} {getattr(now, name)}" for name in names if getattr(now, name) != getattr(due, name)]:
         raise ConfigError(

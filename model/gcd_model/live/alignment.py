@@ -201,8 +201,8 @@ def align(known: Sequence[Landmarks], seen: Sequence[Features]) -> Alignment:
     needed = max(_FEWEST, math.ceil(_LEAST_SHARE * len(tracks)))
     if agree.sum() < needed:
         raise AlignmentError(
-            f"only {agree.sum()} of {len(tracks)} common corners agree on a pose; {needed} are needed: do both show one "
-            "scene, and are both lenses stated right?"
+            f"only {agree.sum()} of {len(tracks)} common corners agree on a pose; {needed} are needed: do both show "
+            "one scene, and are both lenses stated right?"
         )
     inliers = tracks.rows(agree)
     covariance = _covariance(inliers, coarse, pose, len(pairs))
