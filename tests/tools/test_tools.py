@@ -56,10 +56,10 @@ def test_a_policy_learns_and_is_tried_with_its_camera_moved(tmp_path: Path) -> N
     out = ["--out", str(tmp_path)]
     ran("policy_study.py", "demonstrations", *out, "--count", "4")
     ran("policy_study.py", "train", *out, "--cpu-minutes", "0.05")
-    ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--groups", "1")
+    ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--moves", "1")
     rows = (tmp_path / "episodes.jsonl").read_text()
     assert {json.loads(row)["view"] for row in rows.splitlines()} > {"none", "homography", "canonical-learned"}
-    ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--groups", "1")
+    ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--moves", "1")
     assert (tmp_path / "episodes.jsonl").read_text() == rows
     ran("policy_study.py", "report", *out)
     assert (tmp_path / "report.png").exists()
