@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 import torch
 from policy_views import VIEWS, Correction, to_network
-from policy_world import CAMERA, COLOURS, DECISIONS, HEIGHT, LENS, WIDTH, Action, Bench, Move
+from policy_world import BLOCK_CORNERS, CAMERA, COLOURS, DECISIONS, HEIGHT, LENS, WIDTH, Action, Bench, Move
 from scipy.stats import binomtest
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -94,7 +94,7 @@ class Policy(nn.Module):
     """Picture, own state and a colour in; where the tool shall go, how far to open, whether to grip out.
 
     Convolutions, then by the colour expected places of 24 keypoints (spatial softmax, Levine et al. 2016), and three
-    linear layers. The first keypoint learns where the thing is, too.
+    linear layers. The first keypoint learns where the thing is, too, and two more where the block's front corners are.
     """
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class Policy(nn.Module):
             pictures: [B, 3, H, W] in [-1, 1]. states: [B, 5]. colours: int64 [B, N].
         Returns:
             [B, N, 5]: place about the middle of the table in decimetres, opening in decimetres, logit of gripping.
-            [B, N, H / 4, W / 4]: log shares of the first keypoint.
+            [B, N, 3, H / 4, W / 4]: log shares of the first keypoints.
         """
         names = self.name(colours)
         scale, shift = self.modulation(names)[..., None, None].chunk(2, dim=2)
@@ -128,7 +128,7 @@ class Policy(nn.Module):
         places = (shares.exp() @ grid.flatten(0, 1)).view(*colours.shape, -1)
         own = torch.cat([(states[:, :3] - _MIDDLE) / _SPREAD, states[:, 3:4] / _SPREAD, states[:, 4:]], dim=1)
         out = self.hand(torch.cat([places, own[:, None].expand(-1, colours.shape[1], -1), names], dim=2))
-        return out, shares[:, 0].view(*colours.shape, *maps.shape[2:])
+        return out, shares[:, :3].view(*colours.shape, 3, *maps.shape[2:])
 
     @torch.inference_mode()
     def act(self, picture: Tensor, state: np.ndarray, colour: int) -> Action:
@@ -143,7 +143,8 @@ def _cells(width: int, height: int) -> Tensor:
 
 
 def losses(told: tuple[Tensor, Tensor], actions: Tensor, raised_m: Tensor) -> Tensor:
-    """Mean errors [4]: of place and opening, decimetres; of the grip; of where things that stand are seen, both nats.
+    """Mean errors [4]: of place and opening, decimetres; of the grip; of where things that stand, and the front corners
+    of the block if there is one, are seen, both nats.
 
     An opening counts where nothing is gripped. actions: [B, N, 5], NaN where unknown. raised_m: [B].
     """
@@ -152,13 +153,17 @@ def losses(told: tuple[Tensor, Tensor], actions: Tensor, raised_m: Tensor) -> Te
     place = (out[:, :3] - (actions[:, :3] - _MIDDLE) / _SPREAD).abs().mean()
     free = actions[:, 4] == 0
     opening = (out[free, 3] - actions[free, 3] / _SPREAD).abs().mean()
-    middle = (_MIDDLE_M + raised_m)[:, None].expand(known.shape)[known][free, None]
-    points = torch.cat([actions[free, :2], middle, torch.ones_like(middle)], dim=1)
-    x, y, z = torch.from_numpy(np.linalg.inv(CAMERA)[:3]).float() @ points.T
-    pixels = torch.stack([LENS.fx * x / z + LENS.cx, LENS.fy * y / z + LENS.cy], dim=1)
-    cells = _cells(shares.shape[2], shares.shape[1])
-    away = (cells - pixels[:, None, None] * cells.shape[0] / HEIGHT).square().sum(-1)  # [K, h, w]
-    seen = -((-away).flatten(1).softmax(1) * shares[free].flatten(1)).sum(1).mean()
+    raised_m = raised_m[:, None].expand(known.shape)[known][free]
+    points = torch.cat([torch.zeros(len(raised_m), 3, 2), raised_m[:, None, None].expand(-1, 3, 1)], dim=2)
+    points[:, 0, :2], points[:, 1:, :2] = actions[free, :2], torch.tensor(BLOCK_CORNERS)
+    points[:, 0, 2] += _MIDDLE_M
+    x, y, z = (F.pad(points, (0, 1), value=1.0) @ torch.from_numpy(np.linalg.inv(CAMERA)[:3]).float().T).unbind(2)
+    pixels = torch.stack([LENS.fx * x / z + LENS.cx, LENS.fy * y / z + LENS.cy], dim=2)
+    cells = _cells(shares.shape[3], shares.shape[2])
+    away = (cells - pixels[:, :, None, None] * cells.shape[0] / HEIGHT).square().sum(-1)  # [K, 3, h, w]
+    nats = -((-away).flatten(2).softmax(2) * shares[free].flatten(2)).sum(2)
+    nats[:, 1:] *= (raised_m > 0)[:, None]
+    seen = nats.sum(1).mean()
     grip = F.binary_cross_entropy_with_logits(out[:, 4], actions[:, 4], pos_weight=torch.tensor(_GRIPS))
     return torch.stack([place, opening, grip, seen])
 

@@ -64,6 +64,8 @@ _SPAN_M, _AZIMUTH = (0.30, 0.50), 0.5
 """Where things stand about the robot's base: distance, and the largest angle to either side, radians."""
 _BLOCK_AT, _BLOCK_M = (0.02, 0.0), (0.36, 0.60)
 """Middle and sides of the block on which all things stand if they are raised."""
+BLOCK_CORNERS = [(_BLOCK_AT[0] + _BLOCK_M[0] / 2, side * _BLOCK_M[1] / 2) for side in (-1, 1)]
+"""The two that the camera sees in front, x and y in metres."""
 _ARM_SEED, _TICK = 0, 4
 _TRAVEL_M, _NEAR_M, _AT_M, _LIFT_M = 0.20, 0.06, 0.012, 0.13
 _NOTHING_M = 0.01
