@@ -1,6 +1,7 @@
 """What a policy is shown of a moved camera: its picture as it is, or turned back to where the policy learned.
 
-All know how the camera was moved. The homography knows the table's plane as well; two views are given exact depth.
+All know how the camera was moved. The homography knows the table's plane as well, homography-height also how high
+over it the things stand; two views are given exact depth.
 """
 
 import cv2
@@ -15,7 +16,7 @@ from gcd_model.live.splat import splat, unproject
 from gcd_model.live.synthesizer import Painter
 from gcd_model.networks import LiveNetworks
 
-VIEWS = ("none", "homography", "splat-exact", "canonical-learned", "canonical-exact")
+VIEWS = ("none", "homography", "homography-height", "splat-exact", "canonical-learned", "canonical-exact")
 _BENCH_M = 1.6
 """Nearer than this are table, arm and things."""
 
@@ -28,12 +29,13 @@ def to_network(pictures: Tensor) -> Tensor:
 class Correction:
     """One view of one moved camera, picture by picture.
 
-    view: of VIEWS. camera: table_from_camera [4, 4] of the moved one. networks: of the live model. depth_errors: median
-    relative error of learned depth nearer than 1.6 m, a number a picture.
+    view: of VIEWS. camera: table_from_camera [4, 4] of the moved one. networks: of the live model. raised_m: how high
+    the things stand. depth_errors: median relative error of learned depth nearer than 1.6 m, a number a picture.
     """
 
-    def __init__(self, view: str, camera: np.ndarray, networks: LiveNetworks) -> None:
+    def __init__(self, view: str, camera: np.ndarray, networks: LiveNetworks, raised_m: float) -> None:
         self._view, self._camera = view, camera
+        self._plane_m = raised_m if view == "homography-height" else 0.0
         self._moved_from_learned = torch.from_numpy(np.linalg.inv(camera) @ CAMERA)
         self._eyes, self._world = Eyes(networks), SeenWorld(networks.config)
         self._painter = Painter(networks, steps=networks.config.steps)
@@ -41,7 +43,7 @@ class Correction:
 
     def __call__(self, picture: np.ndarray, metres: np.ndarray) -> Tensor:
         """picture: uint8 [H, W, 3]; metres: exact depth [H, W] → [3, H, W] in [-1, 1]."""
-        if self._view == "homography":
+        if self._view.startswith("homography"):
             picture = self._by_plane(picture)
         shown, depth = to_network(torch.from_numpy(picture)), torch.from_numpy(metres).float()
         if self._view == "splat-exact":
@@ -51,10 +53,9 @@ class Correction:
         return shown
 
     def _by_plane(self, picture: np.ndarray) -> np.ndarray:
-        """Exact for what lies on the table; its border goes on outwards."""
-        moved, learned = (
-            LENS.matrix.numpy() @ np.linalg.inv(pose)[:3][:, [0, 1, 3]] for pose in (self._camera, CAMERA)
-        )
+        """Exact for what lies on the plane; its border goes on outwards."""
+        plane = np.array([[1, 0, 0], [0, 1, 0], [0, 0, self._plane_m], [0, 0, 1]])
+        moved, learned = (LENS.matrix.numpy() @ np.linalg.inv(pose)[:3] @ plane for pose in (self._camera, CAMERA))
         to_centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
         move = to_centres @ moved @ np.linalg.inv(learned) @ np.linalg.inv(to_centres)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

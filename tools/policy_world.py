@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from gcd_model.geometry import Intrinsics, look_at
 from gcd_train.live.filming import FLOOR_Z_M, METRES_A_UNIT
-from gcd_train.scenes.description import Colour, Doubles, Point, Scene, rotations, shaded, with_world
+from gcd_train.scenes.description import Colour, Doubles, Part, Point, Scene, pick, rotations, shaded, with_world
 from gcd_train.scenes.drop.world import HFOV_DEG
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.tabletop.arm import (
@@ -30,7 +30,16 @@ from gcd_train.scenes.tabletop.arm import (
 )
 from gcd_train.scenes.tabletop.scene import TABLE_EXTENT, drawn, random_light, room
 from gcd_train.scenes.tabletop.simulation import Simulation
-from gcd_train.scenes.tabletop.things import Placed, Setting, TableThing, plain, random_table, random_thing
+from gcd_train.scenes.tabletop.things import (
+    FLATS,
+    Placed,
+    Setting,
+    TableThing,
+    TabletopClass,
+    plain,
+    random_table,
+    random_thing,
+)
 from gcd_train.scenes.triangles import freeze
 
 Random = np.random.Generator
@@ -53,6 +62,10 @@ LIFTED_M = 0.05
 _THINGS, _TRIES = 3, 1000
 _SPAN_M, _AZIMUTH = (0.30, 0.50), 0.5
 """Where things stand about the robot's base: distance, and the largest angle to either side, radians."""
+_BLOCK_AT, _BLOCK_M = (0.02, 0.0), (0.36, 0.60)
+"""Middle and sides of the block on which all things stand if they are raised."""
+BLOCK_CORNERS = [(_BLOCK_AT[0] + _BLOCK_M[0] / 2, side * _BLOCK_M[1] / 2) for side in (-1, 1)]
+"""The two that the camera sees in front, x and y in metres."""
 _ARM_SEED, _TICK = 0, 4
 _TRAVEL_M, _NEAR_M, _AT_M, _LIFT_M = 0.20, 0.06, 0.012, 0.13
 _NOTHING_M = 0.01
@@ -92,8 +105,8 @@ class Action:
 class Robot(Simulation):
     """The tabletop world's arm and its controller, told where to bring its tool."""
 
-    def __init__(self, setting: Setting, start: Point) -> None:
-        self.model = build_model(setting)
+    def __init__(self, setting: Setting, start: Point, raised_m: float) -> None:
+        self.model, self._travel_m = build_model(setting), raised_m + _TRAVEL_M
         super().__init__(self.model, setting.things, np.random.default_rng(0), SPEED_M_S)
         self._place, self._closed = np.asarray(start), False
         for _ in range(30):
@@ -143,7 +156,7 @@ class Robot(Simulation):
         away = math.hypot(tool[0] - x, tool[1] - y)
         if away < _AT_M and abs(tool[2] - level) < 1.5 * _AT_M:
             return Action(np.array([x, y, level]), opening, True)
-        above = max(level + 0.1, _TRAVEL_M) - level
+        above = max(level + 0.1, self._travel_m) - level
         return Action(np.array([x, y, level + above * min(max((away - 0.01) / _NEAR_M, 0.0), 1.0)]), opening, False)
 
     def poses(self) -> np.ndarray:
@@ -153,14 +166,20 @@ class Robot(Simulation):
 
 
 class Bench:
-    """One episode's table: things, robot, and pictures of one camera. Close it."""
+    """One episode's table: things, robot, and pictures of one camera. Close it.
 
-    def __init__(self, seed: int, renderer: Renderer, camera: Doubles = CAMERA) -> None:
+    highest_m: the things stand on a block, whose height is drawn up to this; 0: they stand on the table.
+    """
+
+    def __init__(self, seed: int, renderer: Renderer, camera: Doubles = CAMERA, highest_m: float = 0.0) -> None:
         random = np.random.default_rng([seed, 0xB0])
         setting, self.colours = _setting(random)
         self.target = int(random.integers(len(setting.things)))
-        start = *_spot(random), random.uniform(0.2, 0.32)
-        self.robot = Robot(setting, start)
+        self.raised_m = 0.0
+        if highest_m:
+            setting, self.raised_m = _raised(setting, np.random.default_rng([seed, 0xB1]), highest_m)
+        start = *_spot(random), self.raised_m + random.uniform(0.2, 0.32)
+        self.robot = Robot(setting, start, self.raised_m)
         scene = _scene(setting, self.robot.model, random)
         self._poses, self._next = scene.poses, 0
         world_from_camera = camera.copy()
@@ -205,6 +224,16 @@ def _setting(random: Random) -> tuple[Setting, list[int]]:
             placed.append(Placed(thing=painted, place=(x, y, thing.size[2] / 2 + 0.002), yaw=0.0))
     arm = random_arm(np.random.default_rng(_ARM_SEED))
     return Setting(arm=arm, table=random_table(random), clutter=(), things=tuple(placed)), numbers
+
+
+def _raised(setting: Setting, random: Random, highest_m: float) -> tuple[Setting, float]:
+    """The same things on a block of a random height, and that height."""
+    high = random.uniform(0.0, highest_m)
+    block = Part(
+        *("box", (*_BLOCK_AT, high / 2), (*_BLOCK_M, high), plain(pick(random, FLATS), 0.2), TabletopClass.TABLE)
+    )
+    things = (replace(each, place=(*each.place[:2], each.place[2] + high)) for each in setting.things)
+    return replace(setting, table=(*setting.table, block), things=tuple(things)), high
 
 
 def _painted(thing: TableThing, colour: Colour) -> TableThing:
