@@ -148,7 +148,7 @@ class _Look:
             raise _DoubtfulError("not looked at: that takes the source and the weights")
         context = prepare_stream(config, traits, info)
         VirtualViews(traits).sync(LiveConfig(config).settings(), context.mount, context.references)
-        frames, names = traits.config.frames, ", ".join(config.view)
+        frames, names = traits.config.frames, ", ".join([*config.view, *(f"grid {name}" for name in config.grid)])
         line = f"{names}: {f'windows of {frames} frames' if frames > 1 else 'every frame'} at {context.fps:g} FPS"
         line = "; ".join(filter(None, (line, in_words(context.mount, config.source.pose, traits))))
         if traits.live and context.lens is None and info.hfov_in_use(config.source.hfov_deg) is None:

@@ -108,7 +108,8 @@ class GridConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     def __post_init__(self) -> None:
         sides = [(high - low) / self.cell_m for low, high in (self.extent_m[:2], self.extent_m[2:])]
         if not all(1 <= side <= _MOST_CELLS and abs(side - round(side)) < 1e-6 for side in sides):
-            raise ValueError(f"extent_m is x from, x to, y from, y to, 1 to {_MOST_CELLS} whole cells of cell_m each")
+            wanted = f"x from, x to, y from, y to, 1 to {_MOST_CELLS} whole cells of cell_m each"
+            raise ValueError(f"extent_m is {wanted}, got {self.extent_m} and {self.cell_m:g}")
         farthest_m = min(_FARTHEST_CELL_M, _MOST_CELLS * self.cell_m)  # the memory lies all about the vehicle
         if max(map(abs, self.extent_m)) > farthest_m:
             raise ValueError(f"such a grid reaches at most {farthest_m:g} m from the vehicle, got {self.extent_m}")
@@ -267,7 +268,7 @@ def parse_config(text: str | bytes, name: str, changes: Sequence[str] = ()) -> N
     except msgspec.ValidationError as error:
         words = re.sub(
             r"^Expected `str` matching regex .* - at ",
-            "a name is of a-z, 0-9 and _ (of node_id also A-Z and -), got another at ",
+            "a name is of a-z, 0-9 and _ (of node_id also A-Z and -), and src is the input's; got another at ",
             str(error),
         )
         raise ConfigError(f"{name}: {explain_settings_error(words, NodeConfig)}") from error

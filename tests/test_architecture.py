@@ -21,12 +21,12 @@ OPENING_CALLS = {"open", "safe_open", "save_file", "read_text", "read_bytes", "w
 OPENING_LIBRARIES = {"torch", "np", "numpy", "json", "pickle", "safetensors"}  # their load and save open files
 MAY_OPEN_FILES = {"small_files.py", "read.py", "load.py", "save.py", "onnx_export.py"}
 MOST = [
-    ("client/gcd_client", 9, 1_816),
-    ("model/gcd_model", 44, 10_108),
-    ("tests/model", 29, 6_416),
-    ("gcd_node", 68, 15_271),
-    ("tests/node", 43, 12_074),
-    ("train/gcd_train", 116, 27_362),
+    ("client/gcd_client", 9, 1_819),
+    ("model/gcd_model", 44, 10_125),
+    ("tests/model", 29, 6_436),
+    ("gcd_node", 68, 15_446),
+    ("tests/node", 43, 12_281),
+    ("train/gcd_train", 116, 27_359),
     ("tests/train", 72, 14_994),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is

@@ -45,7 +45,7 @@ def rehearsed(config: NodeConfig, folder: Path) -> NodeConfig:
     here = {name: f"ipc://{folder}/{name}" for name in ("data", "status", "control")}
     random = f"random:{config.model.family or 'live'}"
     reference = folder / "training.png"
-    cv2.imwrite(str(reference), np.zeros((224, 224, 3), np.uint8))
+    cv2.imwrite(str(reference), np.random.default_rng(0).integers(0, 256, (224, 224, 3), np.uint8))
     views = {name: replace(each, reference=each.reference and str(reference)) for name, each in config.view.items()}
     return replace(
         config,
