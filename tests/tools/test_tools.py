@@ -52,18 +52,16 @@ def test_a_short_soak_ends_with_nothing_left_behind(tmp_path: Path) -> None:
     assert report["memory_mb"]["last"] - report["memory_mb"]["first"] < 100
 
 
-@pytest.mark.parametrize("highest", [0.0, 0.25])
-def test_a_policy_learns_and_is_tried_with_its_camera_moved(tmp_path: Path, highest: float) -> None:
-    out = ["--out", str(tmp_path), "--highest", str(highest)]
+def test_a_policy_learns_and_is_tried_with_its_camera_moved(tmp_path: Path) -> None:
+    out = ["--out", str(tmp_path), "--highest", "0.25"]
     ran("policy_study.py", "demonstrations", *out, "--count", "4")
     ran("policy_study.py", "train", *out, "--cpu-minutes", "0.05")
     ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--moves", "1")
     text = (tmp_path / "episodes.jsonl").read_text()
     rows = [json.loads(row) for row in text.splitlines()]
-    assert {row["view"] for row in rows} > {"none", "homography", "canonical-learned"}
-    assert ("homography-height" in {row["view"] for row in rows}) == (highest > 0)
+    assert {row["view"] for row in rows} > {"none", "homography", "homography-height", "canonical-learned"}
     (raised_m,) = {row["raised_m"] for row in rows}
-    assert (raised_m > 0, raised_m <= highest) == (highest > 0, True)
+    assert 0 < raised_m <= 0.25
     ran("policy_study.py", "evaluate", *out, "--episodes", "1", "--moves", "1")
     assert (tmp_path / "episodes.jsonl").read_text() == text
     ran("policy_study.py", "report", *out)
