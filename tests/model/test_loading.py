@@ -130,6 +130,7 @@ def test_a_view_is_finite_trained_and_the_same_twice() -> None:
     assert torch.equal(first.video, second.video)
 
 
+@pytest.mark.slow
 def test_the_first_view_does_without_a_compiler() -> None:
     """torch's compiler takes two seconds to import, and comes in by functions of tensors on the device "meta"."""
     code = """

@@ -197,6 +197,7 @@ class Tape:
         until(lambda: len(self.of(topic)) >= wanted)
 
 
+@pytest.mark.slow
 def test_a_topic_that_a_command_opens_and_closes_and_a_removed_view_begin_and_end_with_it(tmp_path: Path) -> None:
     model, views = FakeSynthesizer(painting_traits()), "[view.top]\n[view.second]"
     with Tape(tmp_path) as tape, Rig(tmp_path, lambda _: Steady(), model, config=LOCKSTEP, views=views) as rig:

@@ -347,6 +347,7 @@ def test_what_a_view_does_not_hold_is_neither_published_nor_ended_and_what_it_he
     assert ends == [("depth", 1), ("frm", 2), ("vis", 2), ("win", 2)]
 
 
+@pytest.mark.slow
 def test_maps_are_never_made_lossy_and_one_sample_of_a_model_that_states_its_spread_has_a_deviation() -> None:
     raw, packed = (published(*HELD, "log_variance", frames=14, encoding=encoding) for encoding in ("rgb8", "jpeg"))
     assert packed.of("win")[0].header.encoding == "jpeg"

@@ -246,7 +246,9 @@ def undisturbed(stride: int) -> dict[int, bytes]:
     return pixels(run(config(stride), Encoder(), FakeSource(40)))
 
 
-@pytest.mark.parametrize(("stride", "pace"), [(5, "lockstep"), (T, "realtime"), (17, "lockstep")])
+@pytest.mark.parametrize(
+    ("stride", "pace"), [(5, "lockstep"), (T, "realtime"), pytest.param(17, "lockstep", marks=pytest.mark.slow)]
+)
 def test_views_are_the_same_to_the_last_bit_whatever_the_timing(stride: int, pace: str) -> None:
     wanted = undisturbed(stride)
     assert len(set(wanted.values())) == len(wanted) >= 2

@@ -394,6 +394,7 @@ def test_of_a_stream_the_newest_window_wins_and_streams_do_not_disturb_each_othe
     assert replica._newest == {}
 
 
+@pytest.mark.slow
 def test_more_streams_than_a_replica_can_serve_do_not_keep_it_from_serving_any() -> None:
     """Who comes first would be served first, and too late: every rendering would be begun and none finished in time."""
     model = WholeLevels(traits())

@@ -232,6 +232,7 @@ def test_a_page_that_takes_seconds_for_a_message_may_say_as_much_as_any_other() 
     assert slow.code is None
 
 
+@pytest.mark.slow
 def test_the_end_waits_for_nobody(tmp_path: Path) -> None:
     with viewer_of(tmp_path, control=False) as viewer, open_feed(viewer.url) as feed:  # a node without a control socket
         assert hear(feed, "welcome")["commands"] is False

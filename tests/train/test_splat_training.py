@@ -37,7 +37,9 @@ from gcd_train.training.trainable import adapter_of, let_train
 STEM = "unet.stem.weight"
 
 
-@pytest.mark.parametrize(("name", "camera"), [("gcd.ckpt", "spherical"), ("svd.safetensors", "none")])
+@pytest.mark.parametrize(
+    ("name", "camera"), [("gcd.ckpt", "spherical"), pytest.param("svd.safetensors", "none", marks=pytest.mark.slow)]
+)
 def test_the_first_update_computes_what_the_published_weights_compute(tmp_path: Path, name: str, camera: str) -> None:
     """Loss and gradient, from GCD's weights and from SVD's; what is new is zero, and has a gradient of its own."""
     path = write(tmp_path / name, given(camera))

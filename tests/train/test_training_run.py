@@ -92,7 +92,7 @@ def folder_with(run: Path, path: Path, *parts: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("stage", "at"), [("vae", 2), ("unet", 5)])
+@pytest.mark.parametrize(("stage", "at"), [("vae", 2), pytest.param("unet", 5, marks=pytest.mark.slow)])
 def test_a_resumed_stage_equals_an_uninterrupted_one_bit_for_bit(
     run: Path, tmp_path: Path, stage: StageName, at: int
 ) -> None:
