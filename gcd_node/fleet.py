@@ -311,7 +311,7 @@ def deployed(config: ServiceConfig) -> Generator[bool]:
     runs there with another endpoint.
     """
     read_token(config.serve)
-    _require_cluster(os.environ.get("RAY_ADDRESS", "auto"))
+    _require_cluster(os.environ.get("RAY_ADDRESS") or "auto")
     try:
         import ray
         from ray import serve
