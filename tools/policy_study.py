@@ -326,7 +326,8 @@ def report(out: Path, films: Sequence[int], highest_m: float) -> None:
     views = [view for view in VIEWS if any(cell[1] == view for cell in cells)]
     rows = [[view, *(_success(cells.get((move, view), {})) for move in moves)] for view in views]
     lines = markdown_rows(["success, % [95 %], of episodes", *(_COLUMNS[move] for move in moves)], rows)
-    header = ["recovered of what was lost, % [95 %]", "seeds", *views[1:], "canonical-learned over homography, points"]
+    over = (f"{view} over homography, points" for view in ("learned", "exact"))
+    header = ["recovered of what was lost, % [95 %]", "seeds", *views[1:], *over]
     lines += ["", *markdown_rows(header, _recoveries(cells, moves, views)), ""]
     if errors:
         low, middle, high = np.quantile(errors, [0.05, 0.5, 0.95])
@@ -366,9 +367,8 @@ def _recoveries(
         trained = weights @ np.array([cells[TRAINED, "none"][seed] for seed in seeds])
         lost = np.maximum(trained - share["none"], 1e-9)
         recovered = [_drawn((share[view] - share["none"]) / lost) if view in share else "-" for view in views[1:]]
-        rows.append(
-            [_COLUMNS[move], str(len(seeds)), *recovered, _drawn(share["canonical-learned"] - share["homography"])]
-        )
+        over = [_drawn(share[f"canonical-{depth}"] - share["homography"]) for depth in ("learned", "exact")]
+        rows.append([_COLUMNS[move], str(len(seeds)), *recovered, *over])
     return rows
 
 
