@@ -242,11 +242,10 @@ MOVES = (TOGETHER, *(Move(shift_m, 0) for shift_m in (0.03, 0.05, 0.1)), *(Move(
 
 
 def _cells_of(move: Move, highest_m: float) -> list[tuple[Move, str]]:
-    """The moved camera's views; some are tried with the first move alone, and one only where things are raised."""
-    if move is not TOGETHER:
-        return [(move, view) for view in VIEWS if view not in ("homography-height", "splat-exact")]
-    views = [view for view in VIEWS if highest_m or view != "homography-height"]
-    return [(TRAINED, "none"), *((move, view) for view in views)]
+    """The moved camera's views; one of them only with the first move, and where things are raised."""
+    is_first = move is TOGETHER
+    views = [view for view in VIEWS if (highest_m and is_first) or view != "homography-height"]
+    return [(TRAINED, "none")] * is_first + [(move, view) for view in views]
 
 
 @torch.inference_mode()
