@@ -4,6 +4,7 @@ import importlib.util
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace as dataclass_replace
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,24 @@ def test_a_view_that_no_longer_holds_is_never_given(sender: Sender, camera: GcdC
         camera.read_latest(max_age_ms=10_000)
 
 
+@contextmanager
+def said_again(sender: Sender) -> Iterator[None]:
+    """One picture after the other, as nobody knows when a reader is there."""
+    done = threading.Event()
+
+    def say() -> None:
+        number = 0
+        while not done.wait(0.05):
+            sender.numbered(number, frame(number + 1))
+            number += 1
+
+    thread = threading.Thread(target=say)
+    thread.start()
+    yield
+    done.set()
+    thread.join()
+
+
 def test_it_connects_once_within_its_time_and_only_to_a_view_of_the_stated_size(sender: Sender) -> None:
     silent = GcdCameraConfig(view="top", endpoint=sender.endpoint, timeout_ms=100)
     camera = GcdCamera(silent)
@@ -106,18 +125,16 @@ def test_it_connects_once_within_its_time_and_only_to_a_view_of_the_stated_size(
         with pytest.raises(ConnectionError):
             use()
     camera = GcdCamera(dataclass_replace(silent, width=9, height=6, timeout_ms=5000))
-    threading.Timer(0.3, sender.numbered, (0, frame(1))).start()
-    with pytest.raises(RuntimeError, match="8 x 6"):
+    with said_again(sender), pytest.raises(RuntimeError, match="8 x 6"):
         camera.connect()
     assert not camera.is_connected
     camera.connect(warmup=False)
     with pytest.raises(ConnectionError):
         camera.connect()
-    sender.wait()
-    sender.numbered(1, frame(2))  # in mid-stream a node may be started with another size, or a view set elsewhere
-    for read in (camera.async_read, camera.read_latest):
-        with pytest.raises(RuntimeError, match="8 x 6"):
-            read(5000)
+    with said_again(sender):  # in mid-stream a node may be started with another size, or a view set elsewhere
+        for read in (camera.async_read, camera.read_latest):
+            with pytest.raises(RuntimeError, match="8 x 6"):
+                read(5000)
     camera.disconnect()
 
 

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
 from itertools import count
@@ -167,7 +167,12 @@ def test_a_reply_that_is_late_or_wrong_gives_no_view_and_the_next_window_is_rend
             rendered(far)
         assert time.monotonic() - started_s < DEADLINE_S + SLACK_S
         service.act = None
-        assert len(rendered(far)) == 2
+        until_s = time.monotonic() + 10 * SLACK_S
+        while True:  # at once, on a machine at rest
+            with suppress(RemoteError):
+                assert len(rendered(far)) == 2
+                break
+            assert time.monotonic() < until_s
 
 
 def test_views_of_another_stream_or_window_are_refused() -> None:
