@@ -5,27 +5,31 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from fakes import Box, FakeSource, run, traits
+from fakes import Box, FakeSource, live_traits, run, traits
 from numpy.typing import NDArray
 from textured_room import HERE, LENS, moved, seen, shot
 
 import gcd_node.drift
+from gcd_client.control import Code
 from gcd_model import Intrinsics, OptionError, align, features, landmarks_of, load_synthesizer
 from gcd_node.canonical import Reference, load_reference, load_references
 from gcd_node.cli.calibrate import doubt_lens
 from gcd_node.cli.main import run_app
+from gcd_node.commands import NodeCommands
 from gcd_node.config import NodeConfig, parse_config
 from gcd_node.drift import DriftDetector
 from gcd_node.errors import ConfigError
 from gcd_node.health import Health
 from gcd_node.image_io import write_png
 from gcd_node.status import Announcer
+from gcd_node.verbs import AlignView, Command, RequestError, SetPose, SetView
 from gcd_node.view_config import CalibratedView, pose_matrix
 from gcd_node.views import LiveConfig, VirtualView
 
@@ -143,9 +147,9 @@ class Watched:
     def __init__(self, folder: Path, more: str = STANDS) -> None:
         self.live, self.box, self.changes = LiveConfig(config(folder, more)), Box(), 0
         self.health = Health()
-        announcer = Announcer("gcd", "boot", self.box, self.health)
+        self.announcer = Announcer("gcd", "boot", self.box, self.health)
         references = {"policy": load_reference(self.live.config.view["policy"])}
-        self.detector = DriftDetector(self.live, announcer, references, lambda: None)
+        self.detector = DriftDetector(self.live, self.announcer, references, lambda: None)
 
     def cover(self) -> None:
         frame = seen(HERE)
@@ -276,6 +280,22 @@ def test_a_request_is_answered_once_in_time_whatever_the_camera_does(
     thread.join(5)
     assert watched.detector.is_over
     assert watched.codes() == ["UNALIGNED", "ALIGN_FAILED", "ALIGN_FAILED"]
+
+
+def test_a_canonical_view_is_aligned_and_never_set(folder: Path) -> None:
+    watched = Watched(folder, stated(THERE))
+    parts: Any = SimpleNamespace(traits=live_traits(), stream=SimpleNamespace(drift=watched.detector))
+    unused: Any = None
+    commands = NodeCommands(watched.live, watched.announcer, parts, unused, unused)
+    for args in (SetView(view="policy"), SetPose(view="policy", pose=(0, 0, 0, 0, 0, 0, 1))):
+        with pytest.raises(RequestError, match="align_view"):
+            commands.handle(Command(verb="set_view", args=args), "operator")
+    align_it = Command(verb="align_view", args=AlignView(view="policy"))
+    assert commands.handle(replace(align_it, dry_run=True), "operator").code is Code.OK
+    assert watched.detector._asked_s == {}
+    assert commands.handle(align_it, "operator").code is Code.ACCEPTED
+    assert list(watched.detector._asked_s) == ["policy"]
+    assert watched.live.revision("policy") == 1
 
 
 def test_a_command_that_came_first_is_not_overwritten(folder: Path) -> None:

@@ -179,7 +179,7 @@ def picture(suffix: str, width: int = 24, height: int = 16, *options: int) -> by
 
 JPEGS = [picture(".jpg"), picture(".jpg", 40, 8), picture(".jpg", 24, 16, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)]
 PICTURES = [*JPEGS, *map(picture, (".png", ".bmp", ".webp", ".tiff"))]
-MESSAGES = [encode(each) for each in (window(), jpeg_window(), class_map(), grid(), end(), status())]
+MESSAGES = [encode(each) for each in (window(), jpeg_window(), class_map(), end(), status(), grid())]
 FRAMES = [
     encode_frame(BOOT, 0, pixels(5, frames=1)[0], 5, np.ones((4, 6), np.float32), np.eye(4), checksum=False),
     encode_frame(BOOT, 0, JPEGS[0], 5),
@@ -197,7 +197,7 @@ READ = ["message", "unchecked", "frame", "page", "request", "launch", "changes",
     ("read", "examples", "pieces", "error", "least_refused", "least_accepted"),
     [
         (read_message, MESSAGES, ANY, MessageError, 0.25, 0),
-        (read_message_without_checksum, MESSAGES, ANY, MessageError, 0.25, 0.03),
+        (read_message_without_checksum, MESSAGES, ANY, MessageError, 0.25, 0.05),
         (read_frame, FRAMES, ANY, MessageError, 0.25, 0.05),
         (read_page, PAGE, TEXT_PIECES, MessageError, 0.25, 0.05),
         (lambda part, _: parse_command(part).verb, REQUESTS, TEXT_PIECES, RequestError, 0.25, 0.05),
@@ -226,7 +226,7 @@ def test_what_was_tampered_with_ends_as_what_it_is_or_a_documented_error(
     assert ended.total() - ended["refused"] >= least_accepted * ROUNDS
 
 
-# Every kind of message, byte for byte as since 1.0 (1.1 for maps, 1.3 for grids): SHA-256 of recorded bytes.
+# Every kind of message, byte for byte as since 1.0 (headers of views since 1.3): SHA-256 of recorded bytes.
 
 
 STAMP_NS = 1_700_000_002_123_456_789

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
 from itertools import count
@@ -56,8 +56,10 @@ DEADLINE_S = 0.4
 SLACK_S = 1.0  # what a machine that does other things may add
 
 
-def remote(service: ServiceStandIn, *, fallback: ViewSynthesizer | None = None) -> RemoteSynthesizer:
-    section = ModelSection(weights=service.address, engine="remote", deadline_s=DEADLINE_S)
+def remote(
+    service: ServiceStandIn, *, fallback: ViewSynthesizer | None = None, deadline_s: float = DEADLINE_S
+) -> RemoteSynthesizer:
+    section = ModelSection(weights=service.address, engine="remote", deadline_s=deadline_s)
     made = open_remote(section)
     made.fallback = fallback
     return made
@@ -160,19 +162,14 @@ FAULTS: dict[str, Act] = {
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
 def test_a_reply_that_is_late_or_wrong_gives_no_view_and_the_next_window_is_rendered(fault: Act) -> None:
     with ServiceStandIn(WholeLevels(traits())) as service:
-        far = remote(service)
+        far = remote(service, deadline_s=SLACK_S)
         service.act = fault
         started_s = time.monotonic()
         with pytest.raises(RemoteError):
             rendered(far)
-        assert time.monotonic() - started_s < DEADLINE_S + SLACK_S
+        assert time.monotonic() - started_s < 2 * SLACK_S
         service.act = None
-        until_s = time.monotonic() + 10 * SLACK_S
-        while True:  # at once, on a machine at rest
-            with suppress(RemoteError):
-                assert len(rendered(far)) == 2
-                break
-            assert time.monotonic() < until_s
+        assert len(rendered(far)) == 2
 
 
 def test_views_of_another_stream_or_window_are_refused() -> None:
@@ -465,7 +462,7 @@ def test_a_service_with_a_token_answers_those_who_know_it(tmp_path: Path) -> Non
 
 def test_no_byte_of_a_body_is_read_for_a_stranger(tmp_path: Path) -> None:
     """Who has no token may send slowly, or much."""
-    pytest.importorskip("starlette")
+    pytest.importorskip("starlette", reason="needs the extra cluster")
     (tmp_path / "token").write_text("seven-of-nine")
     config = {"model": {"weights": "fake"}, "serve": {"token": str(tmp_path / "token")}}
     replica = Replica(config, lambda _: WholeLevels(traits()))
