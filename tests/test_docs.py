@@ -217,14 +217,15 @@ def test_a_python_block_is_python_and_runs_if_it_is_so_marked(
 @pytest.mark.timeout(900)
 @marked("sh", "run")
 def test_a_shell_block_marked_run_runs(block: Block, tmp_path: Path) -> None:
-    """With `gcd-node` and `gcd-train` of this checkout."""
+    """With `gcd-node` and `gcd-train` of this checkout, and with the programs that were installed beside Python."""
     (tmp_path / "bin").mkdir()
     for name in ("gcd-node", "gcd-train"):
         program = tmp_path / "bin" / name
         program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m {name.replace("-", "_")} "$@"\n')
         program.chmod(0o755)
     roots = [tmp_path / "bin", *(ROOT / each for each in ("model", "client", "train")), ROOT]
-    paths = {"PATH": f"{roots[0]}:{os.environ['PATH']}", "PYTHONPATH": os.pathsep.join(map(str, roots))}
+    programs = [roots[0], Path(sys.executable).parent, os.environ["PATH"]]
+    paths = {"PATH": os.pathsep.join(map(str, programs)), "PYTHONPATH": os.pathsep.join(map(str, roots))}
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     for name in ("drive.mp4", "my.mp4"):
         shutil.copy(ROOT / "gcd_node" / "assets" / "drive.mp4", tmp_path / name)
