@@ -122,7 +122,7 @@ class NodeCommands:
         if args.view not in live.known_views:
             raise _unknown(args.view, live.known_views)
         self._require_revision(args.view, command.if_view_rev)
-        if (now := live.config.view.get(args.view)) is not None and now.kind == "canonical":
+        if args.view in live.canonical:
             message = (
                 f"{args.view} is canonical: align_view lets it follow its camera; another pose is the launch file's"
             )

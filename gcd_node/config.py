@@ -239,6 +239,11 @@ class NodeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     node_id: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$(?!\n)")] = "gcd"
     strict: bool = False
 
+    def __post_init__(self) -> None:
+        if self.model.engine == "remote" and self.model.deadline_s >= self.life.hang_s:
+            wait, hang = f"[model] deadline_s {self.model.deadline_s:g}", f"[life] hang_s {self.life.hang_s:g}"
+            raise ValueError(f"{wait} has to be less than {hang}, or a node that waits for its service counts as hung")
+
 
 def load_config(path: Path, changes: Sequence[str] = ()) -> NodeConfig:
     """Read a launch file. changes: such as `model.steps=4`, made before anything is checked.

@@ -42,6 +42,7 @@ class LiveConfig:
     def __init__(self, config: NodeConfig) -> None:
         self._lock = threading.Lock()
         self._revisions = dict.fromkeys(config.view, 1)  # of removed views too
+        self.canonical = frozenset(name for name, view in config.view.items() if view.kind == "canonical")  # and these
         self._settings = Settings(config=config, revisions=dict(self._revisions))
 
     @property

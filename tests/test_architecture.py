@@ -24,10 +24,10 @@ MOST = [
     ("client/gcd_client", 9, 1_819),
     ("model/gcd_model", 44, 10_125),
     ("tests/model", 29, 6_437),
-    ("gcd_node", 68, 15_446),
-    ("tests/node", 43, 12_309),
+    ("gcd_node", 68, 15_444),
+    ("tests/node", 43, 12_350),
     ("train/gcd_train", 116, 27_359),
-    ("tests/train", 72, 14_996),
+    ("tests/train", 72, 14_998),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is
 new alone: lately canonical views, grids, a fleet behind Ray Serve, and novel views in LeRobot sets and ROS 2 bags."""

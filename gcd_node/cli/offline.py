@@ -126,18 +126,10 @@ def synthesize(**options: Any) -> None:
     drawing = RenderOptions(**_of(chosen, RenderOptions))
     if not chosen.input_path.exists():
         raise SourceError(f"{chosen.input_path} does not exist; give a video, a folder of pictures or a still")
+    names = ("adapter", "family", "device", "dtype", "engine", "head_width", "image_heads")
+    loading = {name: getattr(chosen, name) for name in names}
     with Console(stderr=True, markup=False).status("loading the weights"):
-        model = load_synthesizer(
-            chosen.weights,
-            adapter=chosen.adapter,
-            family=chosen.family,
-            device=chosen.device,
-            dtype=chosen.dtype,
-            engine=chosen.engine,
-            head_width=chosen.head_width,
-            image_heads=chosen.image_heads,
-            providers=chosen.provider or (),
-        )
+        model = load_synthesizer(chosen.weights, providers=chosen.provider or (), **loading)
     traits = model.traits
     clip = read_clip(chosen.input_path, request, traits)
     trajectory = plan(

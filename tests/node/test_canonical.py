@@ -287,7 +287,8 @@ def test_a_canonical_view_is_aligned_and_never_set(folder: Path) -> None:
     parts: Any = SimpleNamespace(traits=live_traits(), stream=SimpleNamespace(drift=watched.detector))
     unused: Any = None
     commands = NodeCommands(watched.live, watched.announcer, parts, unused, unused)
-    for args in (SetView(view="policy"), SetPose(view="policy", pose=(0, 0, 0, 0, 0, 0, 1))):
+    setting = (SetView(view="policy"), SetPose(view="policy", pose=(0, 0, 0, 0, 0, 0, 1)))
+    for args in setting:
         with pytest.raises(RequestError, match="align_view"):
             commands.handle(Command(verb="set_view", args=args), "operator")
     align_it = Command(verb="align_view", args=AlignView(view="policy"))
@@ -296,6 +297,10 @@ def test_a_canonical_view_is_aligned_and_never_set(folder: Path) -> None:
     assert commands.handle(align_it, "operator").code is Code.ACCEPTED
     assert list(watched.detector._asked_s) == ["policy"]
     assert watched.live.revision("policy") == 1
+    watched.live.remove_view("policy")
+    for args in setting:  # what a policy looks at does not come back as another view of that name
+        with pytest.raises(RequestError, match="align_view"):
+            commands.handle(Command(verb="set_view", args=args), "operator")
 
 
 def test_a_command_that_came_first_is_not_overwritten(folder: Path) -> None:

@@ -194,7 +194,15 @@ def test_no_stream_of_a_fleet_stops_or_gets_anothers_views_whatever_fails(
     }
     streams = [Stream(number=number) for number in range(STREAMS)]
     short = Path("/tmp") / f"gcd-ray-{os.getpid()}"  # a socket's path has at most 107 characters
-    with two_machines(short, monkeypatch) as cluster, deployed(service_config(service)):
+    with ExitStack() as stack:
+        cluster = stack.enter_context(two_machines(short, monkeypatch))
+        lost = {"model": {**service["model"], "weights": str(tmp_path / "lost.safetensors")}, "serve": service["serve"]}
+        with (
+            pytest.raises(ConfigError, match=r"cannot be deployed: .*lost\.safetensors"),
+            deployed(service_config(lost)),
+        ):
+            pass
+        stack.enter_context(deployed(service_config(service)))
         _require_endpoint(service_config(service).serve)
         with pytest.raises(ConfigError, match="already"):
             _require_endpoint(ServeSection(http="127.0.0.1:1"))

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler
 from itertools import count
@@ -229,7 +229,20 @@ def test_over_https_a_service_must_be_who_it_says(tmp_path: Path, monkeypatch: p
         with pytest.raises(RemoteError, match="CERTIFICATE"):
             remote(service)
         monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
-        assert rendered(remote(service))
+        far = remote(service)
+        assert rendered(far)
+        ended = threading.Event()
+
+        def wait_for_the_end(request: BaseHTTPRequestHandler, _: object) -> None:
+            with suppress(OSError):
+                assert request.connection.recv(1) == b""
+            ended.set()
+
+        service.act = wait_for_the_end
+        with pytest.raises(RemoteError, match="did not answer"):
+            rendered(far)
+        assert ended.wait(5)  # given up: the service knows, and nobody reads on
+        until(lambda: not any(each.name == "exchange" for each in threading.enumerate()))
 
 
 def test_a_cancelled_window_is_not_waited_for() -> None:
@@ -492,6 +505,14 @@ def test_a_replica_whose_device_is_stuck_or_lost_is_not_healthy(monkeypatch: pyt
 
     asyncio.run(look())
 
+    def query() -> None:
+        raise RuntimeError("CUDA error: unspecified launch failure")
+
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(query=query))
+    model.traits = replace(model.traits, device="cuda:0")
+    with pytest.raises(RuntimeError, match="launch failure"):
+        replica.check_health()
+
 
 @pytest.mark.parametrize(
     "text",
@@ -579,6 +600,13 @@ def test_where_a_model_computes_and_what_stands_in_for_it_changes_no_digest() ->
     )
     one, other = (config_digest(parse_config(LAUNCH + text, "test"), traits()) for text in texts)
     assert one == other
+
+
+def test_a_node_that_waits_for_its_service_never_counts_as_hung() -> None:
+    text = LAUNCH + 'weights = "http://a:1"\nengine = "remote"\ndeadline_s = 5.0\n[life]\nhang_s = '
+    with pytest.raises(ConfigError, match=r"deadline_s 5 has to be less than .* hang_s 5"):
+        parse_config(text + "5.0", "test")
+    assert parse_config(text + "5.1", "test").model.deadline_s == 5.0
 
 
 def test_a_fallback_is_warmed_up_and_the_service_is_not() -> None:

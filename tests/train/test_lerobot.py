@@ -436,6 +436,8 @@ def test_a_set_gets_a_view_of_every_frame_and_everything_else_stays(
     assert {name for name, each in features.items() if each.get("info", {}).get("synthetic")} == {
         f"{LEFT}_{name}{kind}" for name in ("same", "moved") for kind in ("", "_visibility")
     }
+    with pytest.raises(DataError, match="was made by a model"):
+        _augment(out, tmp_path / "again", camera=f"{LEFT}_moved", view=None, poses=pose)
     assert f"`{LEFT}_moved`" in (out / "README.md").read_text()
     assert set(_only(out, LEFT, RIGHT).cameras) == set(LeRobotPairs(out).cameras) - {HAND}  # none by itself
     sample = _only(out, LEFT, f"{LEFT}_moved").sample(0)

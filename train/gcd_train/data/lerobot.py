@@ -109,6 +109,7 @@ class Feature(msgspec.Struct, frozen=True, kw_only=True):
 
     dtype: str
     shape: tuple[int, ...] = ()
+    info: dict[str, Any] | None = None
 
 
 class Info(msgspec.Struct, frozen=True, kw_only=True):

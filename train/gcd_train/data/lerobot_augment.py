@@ -121,6 +121,8 @@ class Augmentation:
         camera = options.camera if options.camera in info.videos else _IMAGES + options.camera
         if camera not in info.videos:
             raise DataError(f"{source} has no video {options.camera}; it has {', '.join(info.videos) or 'none'}")
+        if (info.features[camera].info or {}).get("synthetic"):
+            raise DataError(f"{camera} of {source} was made by a model; take the camera it was made of")
         width, height = _size_of(info, camera)
         if width % 2 or height % 2:
             raise DataError(f"H.264 wants an even width and height, {camera} is {width} x {height}")
@@ -173,8 +175,7 @@ class Augmentation:
 
         Raises: DataError: its rows or pictures are damaged. ModelError.
         """
-        done = self.parts / f"{episode.name}.npz"
-        if done.exists():
+        if (done := self.parts / f"{episode.name}.npz").exists():
             return 0
         samples, sampled_every = defaultdict[str, list[Bytes]](list), max(1, episode.length // _MOST_SAMPLES)
         with ExitStack() as stack:
@@ -328,8 +329,7 @@ class Augmentation:
             for each in (feature, feature + _SEEN):
                 told = video_feature(*_size_of(self.info, self.camera), self.info.fps)
                 info["features"][each] = told | {"info": told["info"] | made}
-            source = self.cameras.get(self.camera)
-            if source is not None and source.pose is not None:
+            if (source := self.cameras.get(self.camera)) is not None and source.pose is not None:
                 rows = tuple(map(tuple, (source.pose @ pose).tolist()))
                 cameras[feature] = msgspec.structs.replace(source, base_from_camera=rows, synthetic=True)
             card.append(f"- `{feature}`; `{feature}{_SEEN}`: 255 seen now, 128 seen before, 0 painted")

@@ -172,8 +172,7 @@ def row_label(method: str, details: Mapping[str, str], table: PaperTable) -> str
     """
     if "splat" in details:
         return None
-    known = _baseline(method)
-    if known is not None:
+    if (known := _baseline(method)) is not None:
         return known
     told = f"{method} {details.get('family', '')}".lower()
     if not is_model(method, details) and not re.search(r"gcd|gradual|direct", method.lower()):
