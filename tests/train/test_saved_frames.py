@@ -54,13 +54,15 @@ def test_pictures_in_the_clips_folder_are_its_only_draw(tmp_path: Path, first: i
 
 
 def test_each_samples_folder_is_a_draw_in_the_order_of_its_number(tmp_path: Path) -> None:
-    for number in (10, 2, 0):
+    for number in range(11):
         save(tmp_path / KEY / f"sample_{number}", CLIP.target // (number + 1))
     save(tmp_path / KEY / "target")
     save(tmp_path / KEY / "source", CLIP.source)
     draws = predicted(tmp_path)
-    assert_target(draws[:1])
-    assert [torch.equal(d, to_pictures(CLIP.target // n)) for d, n in zip(draws, (1, 3, 11), strict=True)] == [True] * 3
+    assert [torch.equal(d, to_pictures(CLIP.target // n)) for n, d in enumerate(draws, 1)] == [True] * 11
+    (tmp_path / KEY / "sample_4").rename(tmp_path / KEY / "sample_14")
+    with pytest.raises(DataError, match="one is missing"):
+        predicted(tmp_path)
 
 
 @pytest.mark.parametrize("place", [f"{KEY}.mp4", f"{KEY}/sample_0.mp4", "extra/t_000_n0_c02_scn02900_fs0_pred_s0.mp4"])

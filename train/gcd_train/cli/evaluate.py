@@ -66,8 +66,9 @@ def evaluate_command(
             account = _measured(work, workers, ray, asked.device)
         for line in account.lines():
             say(line)
-        typer.echo(make_report([out], out, drawn=False).read_text())
-        say(f"wrote {out}/run.json, records, report.md, tables" + " and gallery" * (views != "none"))
+        if any(out.glob("records/*/*.json")):
+            typer.echo(make_report([out], out, drawn=False).read_text())
+            say(f"wrote {out}/run.json, records, report.md, tables" + " and gallery" * (views != "none"))
     if account.failures:
         raise typer.Exit(TrainError.exit_code)
 

@@ -9,8 +9,8 @@
 In the benchmark cam1 is the input, cam0 the target; both may move. Kubric-5D has cam00 to cam15. Extrinsics are world
 from camera, intrinsics a pinhole in pixels of the stored pictures. Source: README and PROTOCOL page of
 TRI-ML/AnyView-DVS (Van Hoorick et al. 2026). They do not say, and this is assumed: camera axes are x right, y down, z
-ahead; pixels count from the picture's corner; all cameras of an episode have its resolution; an episode lies somewhere
-below a folder that is called as its split, the last of such; a folder without splits.json is one split.
+ahead; pixels count from the picture's corner; all cameras of an episode have its resolution; `groups` lists the splits
+of each; an episode lies below a folder called as its split, the last of such; without splits.json there is one split.
 """
 
 import io
@@ -87,8 +87,8 @@ def read_groups(root: Path) -> dict[str, tuple[str, ...]]:
 def find_episodes(root: Path, splits: Sequence[str]) -> dict[str, dict[str, Path]]:
     """Folders of the episodes by split and name, in order, linked ones, too; of a split that is not there none.
 
-    Raises: DataError: the folder cannot be read, an episode lies in a folder of no split or has another's name, or
-        folders lie too deep to look for one.
+    Raises: DataError: the folder cannot be read, an episode has no metadata, lies in a folder of no split or has
+        another's name, or folders lie too deep to look for one.
     """
     found: dict[str, dict[str, Path]] = {split: {} for split in splits}
 
@@ -98,6 +98,8 @@ def find_episodes(root: Path, splits: Sequence[str]) -> dict[str, dict[str, Path
     for place, folders, files in os.walk(root, onerror=passed_on, followlinks=True):
         parts = (root.name, *Path(place).relative_to(root).parts)
         if METADATA not in (*folders, *files):
+            if {"rgb", "lowdim"} & set(folders):
+                raise DataError(f"{place} is an episode without {METADATA}; download it again, or take it out")
             folders[:] = sorted(name for name in folders if not name.startswith("."))
             if folders and len(parts) > _MOST_DEPTH + 1:
                 raise DataError(f"{place} has folders deeper than an episode lies ({_MOST_DEPTH}); take them out")
@@ -336,14 +338,14 @@ class EpisodeExport:
         return True
 
     def finish(self) -> tuple[str, ...]:
-        """Write or complete splits.json; gives the splits. Raises DataError: one that is there is none of these."""
+        """Name the splits that have episodes in splits.json; gives all. Raises DataError for another file there."""
         begun = (self.out / SPLITS).exists()
         groups = {name: list(splits) for name, splits in read_groups(self.out).items()} if begun else {}
-        for group, split, _ in (item.split("/") for item in self.items):
-            known = groups.setdefault(group, [])
-            known += [] if split in known else [split]
-        text = msgspec.json.encode({"groups": groups})
-        write_whole(self.out / SPLITS, msgspec.json.format(text, indent=1))
+        for group, split, name in (item.split("/") for item in self.items):
+            if (self.out / split / name).is_dir() and split not in (known := groups.setdefault(group, [])):
+                known.append(split)
+        if groups:
+            write_whole(self.out / SPLITS, msgspec.json.format(msgspec.json.encode({"groups": groups}), indent=1))
         return tuple(split for splits in groups.values() for split in splits)
 
 

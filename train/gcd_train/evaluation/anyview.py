@@ -192,8 +192,9 @@ def benchmark_table(of: EvaluatedSet) -> Table:
         places += [(group, {group: splits}), *((f"{group}: {s}", {group: {s: keys}}) for s, keys in splits.items())]
     rows = [_row(method, label, part) for label, part in places for method in of.methods]
     out = [split for splits in of.note.groups.values() for split, keys in splits.items() if not keys]
+    lengths = ", ".join(map(str, sorted({record.frames for each in of.methods for record in each.records})))
     means = f"Unweighted means over frames, episodes, splits, {len(groups)} groups"
-    notes = [f"{means}: of all, or not known; black targets do not count."]
+    notes = [f"{means}: of all, or not known; black targets do not count. Clips of {lengths} frames."]
     parts = [each.name for each in of.methods if any(record.crop is not None for record in each.records)]
     notes += [f"†, a part of each frame alone, which is not the protocol's: {', '.join(parts)}."] if parts else []
     notes += [f"Left out, without pixels or not there: {', '.join(out)}."] if out else []

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -233,13 +233,13 @@ def find_draws(folder: Path, key: str) -> list[Path]:
     where PREFIX names the scene and, from the second on, the trajectory: `..._c02_scn02900_fs...` is that of the key
     `scn02900.sample_02`. Where pictures and a video are of one name, the pictures count.
 
-    Raises: DataError naming the clip if there is nothing, or the draws of several runs.
+    Raises: DataError naming the clip if there is nothing, a draw is missing, or there are the draws of several runs.
     """
     if not key or Path(key).name != key:
         raise DataError(f"saved frames are found by the clip's name, which must be a file name, got {key!r}")
     samples = {int(named[1]): path for path, named in _draws_in(folder / key, _SAMPLE)}
     alone = [path for path in (folder / key, folder / key / "frames", folder / (key + _VIDEO)) if _is_draw(path)]
-    found = [samples[number] for number in sorted(samples)] or alone[:1]
+    found = _numbered(samples, folder / key) or alone[:1]
     found = found or _released(folder / "extra", key) or _released(folder, key)
     if not found:
         raise DataError(
@@ -260,7 +260,15 @@ def _released(folder: Path, key: str) -> list[Path]:
             by_prefix.setdefault(named[1], {})[int(named[2])] = path
     if len(by_prefix) > 1:
         raise DataError(f"{folder} holds clip {key} several times: {', '.join(sorted(by_prefix))}; keep one")
-    return [draws[number] for draws in by_prefix.values() for number in sorted(draws)]
+    return [draw for draws in by_prefix.values() for draw in _numbered(draws, folder)]
+
+
+def _numbered(draws: Mapping[int, Path], place: Path) -> list[Path]:
+    """In order. Raises DataError unless all are there."""
+    numbers = sorted(draws)
+    if numbers and (numbers[0] > 1 or numbers[-1] - numbers[0] >= len(numbers)):
+        raise DataError(f"{place} holds draws {numbers}, one is missing; number them from 0")
+    return [draws[number] for number in numbers]
 
 
 def _draws_in(folder: Path, names: re.Pattern[str]) -> Iterator[tuple[Path, re.Match[str]]]:
