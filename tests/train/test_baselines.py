@@ -263,3 +263,6 @@ def test_by_its_name_it_is_built_from_the_options_and_described_by_its_weights(w
         named("vanilla_svd")
     with pytest.raises(CheckpointError):
         named("vanilla_svd", svd="nowhere.safetensors")
+    for name, camera in (("mine.ckpt", "none"), ("mine.safetensors", "spherical")):  # GCD's, by another name
+        with pytest.raises(RecipeError, match="GCD"):
+            named("vanilla_svd", svd=str(write(weights.with_name(name), given(camera))))

@@ -277,35 +277,28 @@ def _gaussians(clips: EvaluationSet, options: EvaluateOptions, views: int) -> Ga
 
 def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> VanillaSVD:
     """With weights that are opened where they are used: the published file `svd.safetensors`, its diffusers folder, or
-    our own of the same task. A published file is taken to be SVD, whatever it is called."""
+    our own of the same task. A published file but GCD's is taken to be SVD, whatever it is called."""
     if options.svd is None:
         raise RecipeError(f"{VANILLA_SVD} wants its weights: give the path of svd.safetensors")
     kind, _, name = options.svd.partition(":")
     if kind == "random":
         family, weights_digest = name, options.svd
     else:
-        inspected = inspect_weights(weights_path(options.svd))
-        family, weights_digest = inspected.family and inspected.family.name, inspected.digest[:12]
+        found = inspect_weights(weights_path(options.svd))
+        steered = found.layout == "gcd-ckpt" or getattr(found.config, "camera", "none") != "none"
+        family = found.family.name if found.family else "GCD" if steered else None
+        weights_digest = found.digest[:12]
     if family not in ("svd", None):
         raise RecipeError(
             f"{VANILLA_SVD} wants weights that make a video out of a picture, {options.svd} is of the family "
             f"{family}; give svd.safetensors"
         )
     samples, seed = options.samples or 1, options.seed
-    details = {
-        "baseline": VANILLA_SVD,
-        "crop": "centre",
-        "samples": str(samples),
-        "seed": str(seed),
-        "weights": weights_digest,
-    }
+    details = {"baseline": VANILLA_SVD, "crop": "centre", "samples": str(samples), "seed": str(seed)}
+    details["weights"] = weights_digest
     weights = partial(open_weights, _resolved(options.svd), options.device, options.dtype, None if family else "svd")
-    return VanillaSVD(weights=weights, samples=samples, seed=seed, shared_noise=_one_noise(clips), details=details)
-
-
-def _one_noise(clips: EvaluationSet) -> bool:
-    """Whether all clips are to be made from the same noise: AnyViewBench's protocol."""
-    return isinstance(clips, EpisodeSet)
+    one = isinstance(clips, EpisodeSet)  # AnyViewBench makes all clips from the same noise
+    return VanillaSVD(weights=weights, samples=samples, seed=seed, shared_noise=one, details=details)
 
 
 def _zeronvs(clips: EvaluationSet, options: EvaluateOptions, views: int) -> ZeroNVS:
@@ -315,31 +308,24 @@ def _zeronvs(clips: EvaluationSet, options: EvaluateOptions, views: int) -> Zero
             f"{ZERONVS} wants its weights, --zeronvs zeronvs.ckpt, and --zeronvs-scale: metres that count as one, or a "
             "run on validation clips in which several were measured"
         )
+    networks = partial(open_zeronvs, _resolved(options.zeronvs), options.device, options.dtype)
+    networks()
+    samples, weights_digest = options.samples or 1, digest((Path(options.zeronvs),))[:12]
     try:
         scale, chosen = float(options.zeronvs_scale), "as given"
     except ValueError:
-        scale, chosen = best_scale(Path(options.zeronvs_scale), clips, digest((Path(options.zeronvs),))[:12])
+        scale, chosen = best_scale(Path(options.zeronvs_scale), clips, weights_digest)
     if not (math.isfinite(scale) and scale > 0):
         raise RecipeError(f"--zeronvs-scale must be metres above 0, got {options.zeronvs_scale}")
-    networks = partial(open_zeronvs, _resolved(options.zeronvs), options.device, options.dtype)
-    networks()
-    details = {
-        "baseline": ZERONVS,
-        "scale": f"{scale:g}",
-        "scale chosen": chosen,
-        "steps": str(STEPS),
-        "guidance": f"{GUIDANCE:g}",
-        "eta": f"{ETA:g}",
-        "samples": str(options.samples or 1),
-        "seed": str(options.seed),
-        "weights": digest((Path(options.zeronvs),))[:12],
-    }
+    details = {"baseline": ZERONVS, "scale": f"{scale:g}", "scale chosen": chosen, "weights": weights_digest}
+    details |= {"steps": str(STEPS), "guidance": f"{GUIDANCE:g}", "eta": f"{ETA:g}"}
+    details |= {"samples": str(samples), "seed": str(options.seed)}
     return ZeroNVS(
         networks=networks,
         scale=scale,
-        samples=options.samples or 1,
+        samples=samples,
         seed=options.seed,
-        shared_noise=_one_noise(clips),
+        shared_noise=isinstance(clips, EpisodeSet),
         details=details,
     )
 
