@@ -7,9 +7,9 @@ on image-to-video helps, training on goals up to 90 degrees is better there than
 is compared with; and ours, that it helps to be shown the source's points. A training is there once for each seed:
 NAME-s1, NAME-s2 and so on. The figure is the mean paired difference over scenes and seeds; its 95 % interval draws both
 anew, scenes and seeds (bootstrap, 10 000 draws), and what seeds differ by is widened by sqrt(S / (S - 1)), as S of them
-drawn from S differ by less. A claim holds where the interval lies on the better side of zero and so does every seed's
-own difference, which stands beside. Clips are paired by name where both show the same in the frames that count: models
-of two paths share the last frame alone. Writes findings.md and findings.csv.
+drawn from S differ by less. A claim holds where the interval lies on the better side of zero and so does the difference
+of each of two seeds or more, which stands beside. Clips are paired by name where both show the same in the frames that
+count: models of two paths share the last frame alone. Writes findings.md and findings.csv.
 """
 
 import argparse
@@ -145,7 +145,8 @@ def figures(each, seeds):
     form = f"+.{each.column.digits}f"
     numbers = (format(number, form) for number in (each.apart.value, each.apart.low, each.apart.high))
     apart = ", ".join(format(number, form) for number in seeds)
-    verdict = each.verdict if len({number > 0 for number in seeds}) == 1 and each.clips >= FEW_SCENES else "open"
+    agree = len(seeds) > 1 and len({number > 0 for number in seeds}) == 1
+    verdict = each.verdict if agree and each.clips >= FEW_SCENES else "open"
     return [each.column.heading, "{} [{}, {}]".format(*numbers), apart, str(each.clips), VERDICTS[verdict]]
 
 
