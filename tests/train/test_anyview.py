@@ -27,7 +27,7 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.errors import DataError, RecipeError, TrainError
 from gcd_train.evaluation.anyview import benchmark_table, grid_size, published_table
 from gcd_train.evaluation.hexplane import HexPlane
-from gcd_train.evaluation.methods import EvaluateOptions, run_note
+from gcd_train.evaluation.methods import EvaluateOptions, baselines, run_note
 from gcd_train.evaluation.metrics import Lpips
 from gcd_train.evaluation.opening import ClipOptions, open_clips
 from gcd_train.evaluation.per_scene import Shown
@@ -219,8 +219,7 @@ def test_means_go_by_episode_split_and_group_without_black_targets(root: Path, t
     report = (tmp_path / "out" / "report.md").read_text()
     assert ("Published, not measured here" in report, "11.57" in report) == (True, True)
     assert "11.57" not in (tmp_path / "out" / "tables" / "anyviewbench.csv").read_text()
-    code, said = run(*line, "--methods", "copy_source")  # goes on where it stopped
-    assert "0 measured, 4 there already" in said
+    assert "0 measured, 4 there already" in run(*line, "--methods", "copy_source")[1]  # goes on where it stopped
     code, said = run(*line, "--methods", "copy_source", "--frames", "5")
     assert (code, "data_identity" in said) == (73, True)
 
@@ -270,8 +269,7 @@ def test_both_cameras_may_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(("fx", "zooms"), [(60.0, True), (50.0 + 1e-5, False)])
 def test_a_lens_that_zooms_is_refused_by_what_takes_one(tmp_path: Path, fx: float, zooms: bool) -> None:
     still = filmed(azimuth_deg=90.0)
-    longer = replace(still.lenses[0], fx=fx)
-    target = replace(still, lenses=[*still.lenses[:-1], longer])
+    target = replace(still, lenses=[*still.lenses[:-1], replace(still.lenses[0], fx=fx)])
     episode(benchmark(tmp_path, {"g": ["s"]}) / "s" / "e", target)
     clips, _ = open_clips(ClipOptions(data=[tmp_path], protocol="anyviewbench", frames=FRAMES))
     clip = clips.clip("s.e")
@@ -344,8 +342,7 @@ def test_a_live_model_is_told_lens_and_motion_at_its_own_size_and_drawn_at_the_g
     assert (clips.keys, clips.frames) == (("far_a.e0",), 4)
     clip = clips.clip("far_a.e0")
     made = SynthesizedViews.of(lambda: model, clips).predict(clip.seen)
-    assert made.video is not None
-    assert made.video.shape == (4, 3, *GRID)
+    assert made.video.shape == (4, 3, *GRID)  # pyright: ignore
     (given,) = model.clips
     assert given.video.shape == (4, 3, 64, 96)
     assert given.lens == clip.seen.cameras.source.resized(96, 64)
@@ -375,11 +372,13 @@ def test_what_does_not_fit_the_benchmark_is_one_line(
     assert (got, said in " ".join(output.split())) == (code, True), output
 
 
-def test_its_lpips_is_that_of_vgg(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_lpips_is_that_of_vgg_and_its_noise_one(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Lpips, "open", lambda folder: SimpleNamespace(network="alex", identity="alex-0"))
-    options = EvaluateOptions(data=[root], protocol="anyviewbench", lpips=root)
+    options = EvaluateOptions(data=[root], protocol="anyviewbench", lpips=root, svd="random:svd")
+    clips, _ = open_clips(options)
     with pytest.raises(DataError, match="VGG16"):
-        run_note(open_clips(options)[0], (), options, "")
+        run_note(clips, (), options, "")
+    assert [method.shared_noise for method in baselines(["vanilla_svd"], clips, options)] == [True]  # pyright: ignore
 
 
 def test_a_model_without_free_poses_or_of_another_length_is_refused(root: Path) -> None:
