@@ -237,6 +237,12 @@ def named(*names: str, of: PairedSet | None = None, **options: object) -> tuple[
     return baselines(names or None, clips, EvaluateOptions(data=(), device="cpu", **options))
 
 
+def test_options_of_learned_baselines_arrive_and_are_told() -> None:
+    told = {"gaussian_updates": 7, "gaussians": 900, "hexplane_updates": 8, "hexplane_rays": 9}
+    gaussians, planes = (each.details for each in named("4dgs_1", "hexplane_1", **told))
+    assert (gaussians["updates"], gaussians["most"], planes["updates"], planes["rays"]) == ("7", "900", "8", "9")
+
+
 def test_the_usual_baselines_are_those_that_the_clips_have_enough_for() -> None:
     clips = PairedSet.of(PlaneClips.make(1), "plane")
     plain, painted = replace(clips, classes=()), replace(clips, painted=True)

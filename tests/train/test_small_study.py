@@ -115,7 +115,7 @@ def test_the_whole_study_runs_in_its_tiny_form(tmp_path: Path) -> None:
     subprocess.run(call, env=told, check=True)
     rows = [line.split(" | ") for line in (tmp_path / "findings" / "findings.md").read_text().splitlines()[2:]]
     not_run = [row[2] for row in rows if "not run" in row]
-    assert len({tuple(row[:3]) for row in rows if len(row) > 3}) == len(study_findings.CLAIMS)
+    assert len({tuple(row[:4]) for row in rows if len(row) > 3}) == len(study_findings.CLAIMS)
     assert set(not_run) == {"hexplane_1"}
     assert (tmp_path / "report" / "report.md").stat().st_size > 1000
     kept = [

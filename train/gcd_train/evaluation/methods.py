@@ -79,6 +79,7 @@ class EvaluateOptions(ClipOptions):
     hexplane_updates: Annotated[int, Option(min=1, help="hexplane_K: steps of learning a clip.")] = 1000
     hexplane_rays: Annotated[int, Option(min=1, help="hexplane_K: rays in each of these steps.")] = 1024
     gaussian_updates: Annotated[int, Option(min=1, help="4dgs_K: steps of learning a clip, a picture each.")] = 1500
+    gaussians: Annotated[int, Option(min=500, help="4dgs_K: to how many they grow.")] = 500
     lpips: Annotated[Path | None, Option(help="Folder with LPIPS weights; without, no such figure.")] = None
     device: Annotated[str, Option(help="auto, cpu, cuda or cuda:N.")] = "auto"
     dtype: Annotated[str | None, Option(help="float32, bfloat16 or float16; by default as stored.")] = None
@@ -272,7 +273,8 @@ def _hexplane(clips: EvaluationSet, options: EvaluateOptions, views: int) -> Hex
 
 
 def _gaussians(clips: EvaluationSet, options: EvaluateOptions, views: int) -> GaussianSplatting:
-    return GaussianSplatting(views=views, seed=options.seed, device=options.device, updates=options.gaussian_updates)
+    told = {"updates": options.gaussian_updates, "most": options.gaussians}
+    return GaussianSplatting(views=views, seed=options.seed, device=options.device, **told)
 
 
 def _vanilla_svd(clips: EvaluationSet, options: EvaluateOptions, views: int) -> VanillaSVD:
