@@ -36,13 +36,13 @@ class LiveConfig:
     """Holds the configuration between the control thread that changes it and the model thread that follows it.
 
     Nothing is checked here. A view that was removed may come back, and its revision goes on from where it was:
-    receivers drop older ones.
+    receivers drop older ones. canonical: names of such views, removed or not; they are no other view's.
     """
 
     def __init__(self, config: NodeConfig) -> None:
         self._lock = threading.Lock()
         self._revisions = dict.fromkeys(config.view, 1)  # of removed views too
-        self.canonical = frozenset(name for name, view in config.view.items() if view.kind == "canonical")  # and these
+        self.canonical = frozenset(name for name, view in config.view.items() if view.kind == "canonical")
         self._settings = Settings(config=config, revisions=dict(self._revisions))
 
     @property

@@ -21,7 +21,7 @@ import numpy as np
 from gcd_train.evaluation.paper import PICTURE_COLUMNS
 from gcd_train.evaluation.runs import Run, gather, targets_apart
 from gcd_train.evaluation.statistics import COVERAGE, DRAWS, FEW_SCENES, SEED, Interval, scene_weights
-from gcd_train.evaluation.tables import Difference, differences_csv, markdown_rows
+from gcd_train.evaluation.tables import Difference, csv_text, markdown_rows
 
 GRADUAL, DROP = "study-gradual-pretrained", "study-drop-gradual-90-pretrained"
 CLAIMS = [
@@ -57,7 +57,7 @@ def main():
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     methods = by_name(gather([Run.read(run) for run in options.runs]))
-    rows, notes, found = [], [], []
+    rows, notes = [], []
     seeds = sorted({seed for name in methods for seed in re.findall(r"-(s\d+)$", name)})
     for text, first, other, frames in CLAIMS:
         head, pairs = [text, first, other, frames], seeds_of(methods, first, other)
@@ -79,11 +79,10 @@ def main():
             notes.append(f"{first} and {other}: without {', '.join(lacking)}, which is not there on both sides.")
         apart = [of for column in PICTURE_COLUMNS if (of := difference(pairs, column, frames, keys))] if keys else []
         rows += [[*head, *figures(*each)] for each in apart] or [[*head, "-", "no clips in common", "-", "-", "-"]]
-        found += [each for each, _ in apart]
     table = "\n".join([*markdown_rows(HEADS, rows), *(f"\n{note}" for note in dict.fromkeys(notes))]) + "\n"
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "findings.md").write_text(table)
-    (options.out / "findings.csv").write_text(differences_csv(found))
+    (options.out / "findings.csv").write_text(csv_text(HEADS, rows))
     print(table)
 
 

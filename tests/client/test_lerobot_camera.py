@@ -110,9 +110,11 @@ def said_again(sender: Sender) -> Iterator[None]:
 
     thread = threading.Thread(target=say)
     thread.start()
-    yield
-    done.set()
-    thread.join()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 def test_it_connects_once_within_its_time_and_only_to_a_view_of_the_stated_size(sender: Sender) -> None:

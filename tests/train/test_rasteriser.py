@@ -87,6 +87,21 @@ def test_needles_are_drawn_in_single_precision_as_in_double(seed: int) -> None:
     assert_close(drawn.passed.double(), exact.passed, rtol=0, atol=5e-3)
 
 
+def test_a_ball_ahead_is_a_bump_of_its_size() -> None:
+    camera = replace(CAMERA, world_from_camera=torch.eye(4, dtype=torch.float64))
+    ball = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 5.0]]),
+        quaternions=torch.tensor([[0.3, -2.0, 0.4, 1.0]]),
+        scales=torch.full((1, 3), 0.5),
+        opacities=torch.tensor([0.8]),
+        colours=torch.tensor([[1.0, 0.5, 0.0]]),
+    )
+    x, y = torch.arange(LENS.width) + 0.5 - LENS.cx, torch.arange(LENS.height)[:, None] + 0.5 - LENS.cy
+    wide, high = ((focal * 0.5 / 5.0) ** 2 + LOW_PASS for focal in (LENS.fx, LENS.fy))
+    alpha = 0.8 * torch.exp(-(x**2 / wide + y**2 / high) / 2)
+    assert_close(rasterised(ball, camera).passed, 1.0 - torch.where(alpha < FAINTEST, 0.0, alpha))
+
+
 def test_a_quaternion_is_w_x_y_z_and_turns_to_the_world() -> None:
     """Against the exponential of its axis and angle."""
     x, y, z = axis = torch.nn.functional.normalize(torch.tensor([0.3, -2.0, 0.4]), dim=0)
