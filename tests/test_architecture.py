@@ -26,7 +26,7 @@ MOST = [
     ("tests/model", 29, 6_437),
     ("gcd_node", 68, 15_444),
     ("tests/node", 43, 12_350),
-    ("train/gcd_train", 116, 27_359),
+    ("train/gcd_train", 116, 27_353),
     ("tests/train", 72, 15_019),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is

@@ -21,7 +21,7 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.data.paths import DRIVING, MAX90
 from gcd_train.data.pictures import ViewPairs
-from gcd_train.data.visibility import published_picture
+from gcd_train.data.visibility import published_tensor
 from gcd_train.parallel import one_thread_each
 from gcd_train.scenes.scene_writer import write_scene
 from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
@@ -75,8 +75,8 @@ def measure(place, name, edition, options):
     if edition == "compact":
         draw = sampling.draw(np.random.default_rng(0), world.frames, world.fps)
         lens, poses = data.lens(scene), draw.world_from_target[:: CLIP_FRAMES // TARGETS]
-        published_picture(views, poses[0], lens, (384, 256))
-        drawn = [cpu_s(published_picture, views, pose, lens, (384, 256)) for pose in poses]
+        published_tensor(views, poses[0], lens, (384, 256))
+        drawn = [cpu_s(published_tensor, views, pose, lens, (384, 256)) for pose in poses]
         show(f"{name}: drawing a 384x256 target from {len(views)} views", "CPU s", drawn)
     if form.frames == world.frames:
         pairs, read = ViewPairs(data, sampling), []

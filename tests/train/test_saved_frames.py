@@ -19,21 +19,19 @@ CLIP = PLANE[0]
 SEEN = seen_of(CLIP, key=KEY)
 
 
-def save(folder: Path, video: np.ndarray = CLIP.target, *, first: int = 0, suffix: str = ".png") -> Path:
+def save(folder: Path, video: np.ndarray = CLIP.target, *, first: int = 0, suffix: str = ".png") -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for number, frame in enumerate(video, start=first):
         assert cv2.imwrite(str(folder / f"{number:04d}{suffix}"), np.ascontiguousarray(frame[..., ::-1]))
-    return folder
 
 
-def save_video(path: Path, video: np.ndarray = CLIP.target) -> Path:
+def save_video(path: Path, video: np.ndarray = CLIP.target) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     size = (video.shape[2], video.shape[1])
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, size)
     for frame in video:
         writer.write(np.ascontiguousarray(frame[..., ::-1]))
     writer.release()
-    return path
 
 
 def predicted(folder: Path) -> list[torch.Tensor]:
@@ -88,6 +86,14 @@ def test_a_clip_that_is_not_there_is_named_with_what_was_looked_for(tmp_path: Pa
     save(tmp_path / "another")
     (tmp_path / KEY).mkdir()
     with pytest.raises(DataError, match=f"holds no frames for clip {KEY}: wanted {KEY}/0000.png"):
+        predicted(tmp_path)
+
+
+@pytest.mark.parametrize("second", ["sample_0", "frames"])
+def test_a_clip_that_lies_there_twice_is_refused(tmp_path: Path, second: str) -> None:
+    save(tmp_path / KEY)
+    save(tmp_path / KEY / second, CLIP.target // 2)
+    with pytest.raises(DataError, match=f"holds clip {KEY} several times: .*; keep one"):
         predicted(tmp_path)
 
 

@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
 from gcd_train.data.splat import Doubles, Splatted, ray_lengths, splat
-from gcd_train.data.visibility import (
-    depth_visibility,
-    fill_holes,
-    published_picture,
-    published_tensor,
-    render_lens,
-    visibility,
-)
+from gcd_train.data.visibility import depth_visibility, fill_holes, in_memory, published_tensor, render_lens, visibility
 
 SOURCE = Intrinsics.from_hfov(53.13, 72, 48)
 TARGET = Intrinsics.from_hfov(53.13, 52, 35)
@@ -303,7 +296,7 @@ def test_the_published_picture_is_within_50_db_of_plain_float64(room: list[Scene
     wanted = torch.nn.functional.interpolate(wanted, size=(40, 60), mode="bilinear")[0].permute(1, 2, 0)
     made = published_tensor(room, pose, SOURCE, (60, 40))
     assert -10 * np.log10(((made - wanted) ** 2).mean().item()) >= 50.0
-    assert np.abs(published_picture(room, pose, SOURCE, (60, 40)) / 255 - made.numpy()).max() < 0.5 / 255 + 1e-6
+    assert np.abs(in_memory(made) / 255 - made.numpy()).max() < 0.5 / 255 + 1e-6
 
 
 @pytest.mark.parametrize(("width", "height", "crop"), [(90, 60, (0, 24, 640, 427)), (60, 60, (80, 0, 480, 480))])
@@ -321,7 +314,8 @@ def test_black_is_a_hole_in_published_pictures_only(grey: int, published: bool) 
     rgb = np.full((48, 72, 3), 200, np.uint8)
     rgb[18:28, 30:42] = grey
     view = SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=np.eye(4), lens=SOURCE)
-    middle = published_picture([view], np.eye(4), SOURCE, (66, 44), published=published)[19:24, 31:36]
+    made = published_tensor([view], np.eye(4), SOURCE, (66, 44), published=published)
+    middle = in_memory(made, published=published)[19:24, 31:36]
     if grey == 0 and published:
         assert middle.min() > 165  # filled from what is around it; its edges are nearly black
     else:
@@ -361,6 +355,6 @@ def test_digits_are_cut_off_in_published_pictures_only() -> None:
     depth = np.full((48, 72), 5.0, np.float32)
     view = SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=np.eye(4), lens=SOURCE)
     for published in (False, True):
-        exact = published_tensor([view], np.eye(4), SOURCE, (64, 43), published=published).numpy() * 255
-        made = published_picture([view], np.eye(4), SOURCE, (64, 43), published=published)
-        np.testing.assert_array_equal(made, np.floor(exact + (0.0 if published else 0.5)).astype(np.uint8))
+        made = published_tensor([view], np.eye(4), SOURCE, (64, 43), published=published)
+        exact = np.floor(made.numpy() * 255 + (0.0 if published else 0.5)).astype(np.uint8)
+        np.testing.assert_array_equal(in_memory(made, published=published), exact)

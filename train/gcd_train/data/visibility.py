@@ -74,18 +74,8 @@ def published_tensor(
     return smaller[0].permute(1, 2, 0)
 
 
-def published_picture(
-    views: Sequence[SceneView],
-    world_from_camera: Doubles,
-    lens: Intrinsics,
-    size: tuple[int, int],
-    *,
-    values: Sequence[Bytes] | None = None,
-    published: bool = False,
-    device: str | None = None,
-) -> Bytes:
-    """published_tensor() as u8 [height, width, C] in memory: digits are cut off with `published`, else rounded."""
-    picture = published_tensor(views, world_from_camera, lens, size, values=values, published=published, device=device)
+def in_memory(picture: Tensor, *, published: bool = False) -> Bytes:
+    """A picture of published_tensor() as u8: digits are cut off with `published`, else rounded."""
     return (picture * 255 + (0.0 if published else 0.5)).clamp(0, 255).to(torch.uint8).cpu().numpy()
 
 

@@ -233,13 +233,17 @@ def find_draws(folder: Path, key: str) -> list[Path]:
     where PREFIX names the scene and, from the second on, the trajectory: `..._c02_scn02900_fs...` is that of the key
     `scn02900.sample_02`. Where pictures and a video are of one name, the pictures count.
 
-    Raises: DataError naming the clip if there is nothing, a draw is missing, or there are the draws of several runs.
+    Raises: DataError naming the clip if there is nothing, a draw is missing, or the clip lies there several times.
     """
     if not key or Path(key).name != key:
         raise DataError(f"saved frames are found by the clip's name, which must be a file name, got {key!r}")
-    samples = {int(named[1]): path for path, named in _draws_in(folder / key, _SAMPLE)}
-    alone = [path for path in (folder / key, folder / key / "frames", folder / (key + _VIDEO)) if _is_draw(path)]
-    found = _numbered(samples, folder / key) or alone[:1]
+    at = folder / key
+    samples = _numbered({int(named[1]): path for path, named in _draws_in(at, _SAMPLE)}, at)
+    several = [each for each in (samples, *([path] for path in (at, at / "frames") if _is_draw(path))) if each]
+    if len(several) > 1:
+        raise DataError(f"{folder} holds clip {key} several times: {several[0][0]} and {several[1][0]}; keep one")
+    video = folder / (key + _VIDEO)
+    found = several[0] if several else [video] * _is_draw(video)
     found = found or _released(folder / "extra", key) or _released(folder, key)
     if not found:
         raise DataError(
