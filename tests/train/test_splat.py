@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gcd_model.geometry import Intrinsics
 from gcd_train.data.sample import SceneView
 from gcd_train.data.splat import Doubles, Splatted, ray_lengths, splat
-from gcd_train.data.visibility import depth_visibility, fill_holes, in_memory, published_tensor, render_lens, visibility
+from gcd_train.data.visibility import depth_visibility, fill_holes, published_tensor, quantised, render_lens, visibility
 
 SOURCE = Intrinsics.from_hfov(53.13, 72, 48)
 TARGET = Intrinsics.from_hfov(53.13, 52, 35)
@@ -296,7 +296,7 @@ def test_the_published_picture_is_within_50_db_of_plain_float64(room: list[Scene
     wanted = torch.nn.functional.interpolate(wanted, size=(40, 60), mode="bilinear")[0].permute(1, 2, 0)
     made = published_tensor(room, pose, SOURCE, (60, 40))
     assert -10 * np.log10(((made - wanted) ** 2).mean().item()) >= 50.0
-    assert np.abs(in_memory(made) / 255 - made.numpy()).max() < 0.5 / 255 + 1e-6
+    assert np.abs(quantised(made) / 255 - made.numpy()).max() < 0.5 / 255 + 1e-6
 
 
 @pytest.mark.parametrize(("width", "height", "crop"), [(90, 60, (0, 24, 640, 427)), (60, 60, (80, 0, 480, 480))])
@@ -315,7 +315,7 @@ def test_black_is_a_hole_in_published_pictures_only(grey: int, published: bool) 
     rgb[18:28, 30:42] = grey
     view = SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=np.eye(4), lens=SOURCE)
     made = published_tensor([view], np.eye(4), SOURCE, (66, 44), published=published)
-    middle = in_memory(made, published=published)[19:24, 31:36]
+    middle = quantised(made, published=published)[19:24, 31:36]
     if grey == 0 and published:
         assert middle.min() > 165  # filled from what is around it; its edges are nearly black
     else:
@@ -357,4 +357,4 @@ def test_digits_are_cut_off_in_published_pictures_only() -> None:
     for published in (False, True):
         made = published_tensor([view], np.eye(4), SOURCE, (64, 43), published=published)
         exact = np.floor(made.numpy() * 255 + (0.0 if published else 0.5)).astype(np.uint8)
-        np.testing.assert_array_equal(in_memory(made, published=published), exact)
+        np.testing.assert_array_equal(quantised(made, published=published), exact)

@@ -24,7 +24,7 @@ from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_man
 from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
 from gcd_train.data.splat import Number, splat
-from gcd_train.data.visibility import depth_visibility, in_memory, published_tensor, render_lens, visibility
+from gcd_train.data.visibility import depth_visibility, published_tensor, quantised, render_lens, visibility
 from gcd_train.errors import DataError, RenderError
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class SplatPictures(Pictures):
                 made.world_from_source = own.world_from_camera
                 made.source.append(trained_picture(own.rgb, *options.size))
             else:
-                made.source.append(in_memory(picture(views, draw.world_from_source), published=how[0]))
+                made.source.append(quantised(picture(views, draw.world_from_source), published=how[0]))
                 apart = np.abs(own.world_from_camera - draw.world_from_source).max() >= SAME_POSE
                 if apart and (options.visible or options.depth):
                     # what a camera at the drawn pose would have seen, with depth, from the points of all
@@ -135,7 +135,7 @@ class SplatPictures(Pictures):
             painted = None
             if self._ontology is not None and options.modality == "classes":
                 painted = [self._ontology.encode(ids) for ids in self._ids(views)]
-            made.target.append(in_memory(picture(views, world_from_target, values=painted), published=how[0]))
+            made.target.append(quantised(picture(views, world_from_target, values=painted), published=how[0]))
             if options.class_ids:
                 # of the point that shows most in each pixel: colours of edges are mixed, and read back as a third class
                 ids = points(views, world_from_target, labels=self._ids(views))

@@ -74,7 +74,7 @@ def published_tensor(
     return smaller[0].permute(1, 2, 0)
 
 
-def in_memory(picture: Tensor, *, published: bool = False) -> Bytes:
+def quantised(picture: Tensor, *, published: bool = False) -> Bytes:
     """A picture of published_tensor() as u8: digits are cut off with `published`, else rounded."""
     return (picture * 255 + (0.0 if published else 0.5)).clamp(0, 255).to(torch.uint8).cpu().numpy()
 
