@@ -8,8 +8,9 @@ is compared with; and ours, that it helps to be shown the source's points. A tra
 NAME-s1, NAME-s2 and so on. The figure is the mean paired difference over scenes and seeds; its 95 % interval draws both
 anew, scenes and seeds (bootstrap, 10 000 draws), and what seeds differ by is widened by sqrt(S / (S - 1)), as S of them
 drawn from S differ by less. A claim holds where the interval lies on the better side of zero and so does the difference
-of each of two seeds or more, which stands beside. Clips are paired by name where both show the same in the frames that
-count: models of two paths share the last frame alone. Writes findings.md and findings.csv.
+of each of two seeds or more. Clips are paired by name where both show the same in the frames that count: models of two
+paths share the last frame alone. Writes findings.md, the tables of docs/log/small-study.md (bold: the claim holds;
+slanted: its opposite does), and findings.csv, which has each seed's difference, too.
 """
 
 import argparse
@@ -18,37 +19,51 @@ from pathlib import Path
 
 import numpy as np
 
-from gcd_train.evaluation.paper import PICTURE_COLUMNS
+from gcd_train.evaluation.paper import PICTURE_COLUMNS, Column
 from gcd_train.evaluation.runs import Run, gather, targets_apart
 from gcd_train.evaluation.statistics import COVERAGE, DRAWS, FEW_SCENES, SEED, Interval, scene_weights
 from gcd_train.evaluation.tables import Difference, csv_text, markdown_rows
 
-GRADUAL, DROP = "study-gradual-pretrained", "study-drop-gradual-90-pretrained"
+GRADUAL, DROP, DROP_180 = (
+    "study-gradual-pretrained",
+    "study-drop-gradual-90-pretrained",
+    "study-drop-gradual-180-pretrained",
+)
+SCRATCH, DROP_SCRATCH = "study-gradual-scratch", "study-drop-gradual-90-scratch"
+DIRECT, DROP_DIRECT, DROP_DIRECT_180 = (each.replace("gradual", "direct") for each in (GRADUAL, DROP, DROP_180))
+BASELINES = {"Reproject RGB-D": "reproject_rgbd", "Vanilla SVD": "vanilla_svd", "HexPlane, one view": "hexplane_1"}
 CLAIMS = [
-    ("gradual > direct", GRADUAL, "study-direct-pretrained", "last"),
-    ("gradual > direct", "study-gradual-scratch", "study-direct-scratch", "last"),
-    ("gradual > direct", DROP, "study-drop-direct-90-pretrained", "last"),
-    ("gradual > direct", "study-drop-gradual-180-pretrained", "study-drop-direct-180-pretrained", "last"),
+    ("gradual > direct, pretrained", GRADUAL, DIRECT, "last"),
+    ("gradual > direct, scratch", SCRATCH, "study-direct-scratch", "last"),
+    ("gradual > direct, max 90, pretrained", DROP, DROP_DIRECT, "last"),
+    ("gradual > direct, max 180, pretrained", DROP_180, DROP_DIRECT_180, "last"),
     *(
         (*claim, frames)
         for claim in (
-            ("pretrained > scratch", GRADUAL, "study-gradual-scratch"),
-            ("pretrained > scratch", "study-direct-pretrained", "study-direct-scratch"),
-            ("pretrained > scratch", DROP, "study-drop-gradual-90-scratch"),
-            ("pretrained > scratch", "study-drop-gradual-180-pretrained", "study-drop-gradual-180-scratch"),
-            ("max 90 > max 180", DROP, "study-drop-gradual-180-pretrained"),
-            ("max 90 > max 180", "study-drop-direct-90-pretrained", "study-drop-direct-180-pretrained"),
-            ("max 90 > max 180", "study-drop-gradual-90-scratch", "study-drop-gradual-180-scratch"),
+            ("pretrained > scratch, gradual", GRADUAL, SCRATCH),
+            ("pretrained > scratch, direct", DIRECT, "study-direct-scratch"),
+            ("pretrained > scratch, gradual, max 90", DROP, DROP_SCRATCH),
+            ("pretrained > scratch, gradual, max 180", DROP_180, "study-drop-gradual-180-scratch"),
+            ("max 90 > max 180, gradual, pretrained", DROP, DROP_180),
+            ("max 90 > max 180, direct, pretrained", DROP_DIRECT, DROP_DIRECT_180),
+            ("max 90 > max 180, gradual, scratch", DROP_SCRATCH, "study-drop-gradual-180-scratch"),
         )
         for frames in ("last", "2-last")  # the paper's tables are of the last
     ),
-    ("splat, given depth > without", "study-gradual-pretrained-given", GRADUAL, "2-last"),
-    ("splat, estimated depth > without", "study-gradual-pretrained-estimated", GRADUAL, "2-last"),
-    *(("ours > baseline", GRADUAL, name, "2-last") for name in ("reproject_rgbd", "vanilla_svd", "hexplane_1")),
-    *(("ours > baseline", DROP, name, "2-last") for name in ("reproject_rgbd", "vanilla_svd", "hexplane_1")),
+    ("points by given depth > none", "study-gradual-pretrained-given", GRADUAL, "2-last"),
+    ("points by estimated depth > none", "study-gradual-pretrained-estimated", GRADUAL, "2-last"),
+    *((f"gradual > {text}", GRADUAL, name, "2-last") for text, name in BASELINES.items()),
+    *((f"gradual 90 > {text}", DROP, name, "2-last") for text, name in BASELINES.items()),
 ]
 HEADS = ["claim", "first", "other", "frames", "figure", "first ahead [95 %]", "each seed", "clips", "the claim"]
 VERDICTS = {"better": "holds", "worse": "the opposite holds", "open": "not shown"}
+MARKS = {"holds": "**", "the opposite holds": "*"}
+WORLDS = {"driving": "Driving", "kubric": "Things that fall"}
+GRADIENT = Column(heading="gradient energy", figure="gradient_energy")
+MEANS = [
+    *((column, "2-last") for column in (*PICTURE_COLUMNS, GRADIENT)),
+    *((column, "last") for column in PICTURE_COLUMNS),
+]
 
 
 def main():
@@ -56,7 +71,8 @@ def main():
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    methods = by_name(gather([Run.read(run) for run in options.runs]))
+    sets = gather([Run.read(run) for run in options.runs])
+    methods = by_name(sets)
     rows, notes = [], []
     seeds = sorted({seed for name in methods for seed in re.findall(r"-(s\d+)$", name)})
     for text, first, other, frames in CLAIMS:
@@ -79,7 +95,8 @@ def main():
             notes.append(f"{first} and {other}: without {', '.join(lacking)}, which is not there on both sides.")
         apart = [of for column in PICTURE_COLUMNS if (of := difference(pairs, column, frames, keys))] if keys else []
         rows += [[*head, *figures(*each)] for each in apart] or [[*head, "-", "no clips in common", "-", "-", "-"]]
-    table = "\n".join([*markdown_rows(HEADS, rows), *(f"\n{note}" for note in dict.fromkeys(notes))]) + "\n"
+    parts = [*claims_tables(rows), *means_tables(sets), *dict.fromkeys(notes)]
+    table = "\n\n".join(parts) + "\n"
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "findings.md").write_text(table)
     (options.out / "findings.csv").write_text(csv_text(HEADS, rows))
@@ -153,6 +170,43 @@ def figures(each, seeds):
     agree = len(seeds) > 1 and len({number > 0 for number in seeds}) == 1
     verdict = each.verdict if agree and each.clips >= FEW_SCENES else "open"
     return [each.column.heading, "{} [{}, {}]".format(*numbers), apart, str(each.clips), VERDICTS[verdict]]
+
+
+def claims_tables(rows):
+    """A table for each world, with a row for each claim and a column for each figure."""
+    found = {}
+    for claim, first, _, frames, figure, apart, _, _, verdict in rows:
+        world = WORLDS["kubric" if first.startswith("study-drop") else "driving"]
+        mark = MARKS.get(verdict, "")
+        found.setdefault(world, {}).setdefault((claim, frames), {})[figure] = f"{mark}{apart}{mark}"
+    for world, claims in found.items():
+        told = [column.heading for column in PICTURE_COLUMNS]
+        heads = [head for head in told if any(head in each for each in claims.values())] or told[:1]
+        cells = [[*claim, *(each.get(head, each.get("-", "-")) for head in heads)] for claim, each in claims.items()]
+        yield "\n".join(markdown_rows([world, "frames", *heads], cells))
+
+
+def means_tables(sets):
+    """A table for each world, of every method's own figures: the mean over clips and seeds."""
+    for kind, world in WORLDS.items():
+        named = {}
+        for method in (method for each in sets if each.note.kind == kind for method in each.methods):
+            named.setdefault(re.sub(r"-s\d+( |$)", r"\1", method.starred), []).append(method)
+        heads = [world, *(f"{frames}: {column.heading}" for column, frames in MEANS)]
+        cells = [[name, *(mean(each, column, frames) for column, frames in MEANS)] for name, each in named.items()]
+        used = [place for place in range(len(heads)) if any(row[place] != "-" for row in cells)]
+        if cells:
+            heads, *cells = ([row[place] for place in used] for row in (heads, *cells))
+            yield "\n".join(markdown_rows(heads, cells))
+
+
+def mean(methods, column, frames):
+    """Of one figure, over clips and then over trainings."""
+    every = [each.sums(frames, column.region).figure(column.figure) for each in methods]
+    known = [each[~np.isnan(each)] for each in every]
+    if not all(len(each) for each in known):
+        return "-"
+    return format(np.mean([each.mean() for each in known]), f".{column.digits}f")
 
 
 if __name__ == "__main__":
