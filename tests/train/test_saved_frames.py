@@ -89,10 +89,10 @@ def test_a_clip_that_is_not_there_is_named_with_what_was_looked_for(tmp_path: Pa
         predicted(tmp_path)
 
 
-@pytest.mark.parametrize("second", ["sample_0", "frames"])
+@pytest.mark.parametrize("second", [f"{KEY}/sample_0", f"{KEY}/frames", "extra/a_c02_scn02900_fs2_pred_s0"])
 def test_a_clip_that_lies_there_twice_is_refused(tmp_path: Path, second: str) -> None:
     save(tmp_path / KEY)
-    save(tmp_path / KEY / second, CLIP.target // 2)
+    save(tmp_path / second, CLIP.target // 2)
     with pytest.raises(DataError, match=f"holds clip {KEY} several times: .*; keep one"):
         predicted(tmp_path)
 

@@ -239,18 +239,17 @@ def find_draws(folder: Path, key: str) -> list[Path]:
         raise DataError(f"saved frames are found by the clip's name, which must be a file name, got {key!r}")
     at = folder / key
     samples = _numbered({int(named[1]): path for path, named in _draws_in(at, _SAMPLE)}, at)
-    several = [each for each in (samples, *([path] for path in (at, at / "frames") if _is_draw(path))) if each]
-    if len(several) > 1:
-        raise DataError(f"{folder} holds clip {key} several times: {several[0][0]} and {several[1][0]}; keep one")
-    video = folder / (key + _VIDEO)
-    found = several[0] if several else [video] * _is_draw(video)
-    found = found or _released(folder / "extra", key) or _released(folder, key)
+    video, released = folder / (key + _VIDEO), _released(folder / "extra", key) or _released(folder, key)
+    own = [each for each in (samples, *([path] for path in (at, at / "frames") if _is_draw(path))) if each]
+    found = [*(own or [[video]] * _is_draw(video)), *([released] if released else [])]
+    if len(found) > 1:
+        raise DataError(f"{folder} holds clip {key} several times: {found[0][0]} and {found[1][0]}; keep one")
     if not found:
         raise DataError(
             f"{folder} holds no frames for clip {key}: wanted {key}/0000.png and so on, {key}/sample_0/0000.png, "
             f"{key}.mp4, or extra/..._pred_s0 of its scene"
         )
-    return found
+    return found[0]
 
 
 def _released(folder: Path, key: str) -> list[Path]:
