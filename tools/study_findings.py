@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gcd_train.errors import TrainError
 from gcd_train.evaluation.paper import PICTURE_COLUMNS, Column
 from gcd_train.evaluation.runs import Run, gather, targets_apart
 from gcd_train.evaluation.statistics import COVERAGE, DRAWS, FEW_SCENES, SEED, Interval, scene_weights
@@ -71,7 +72,10 @@ def main():
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    sets = gather([Run.read(run) for run in options.runs])
+    try:
+        sets = gather([Run.read(run) for run in options.runs])
+    except TrainError as error:
+        raise SystemExit(str(error)) from error
     methods = by_name(sets)
     rows, notes = [], []
     seeds = sorted({seed for name in methods for seed in re.findall(r"-(s\d+)$", name)})
@@ -95,7 +99,8 @@ def main():
             notes.append(f"{first} and {other}: without {', '.join(lacking)}, which is not there on both sides.")
         apart = [of for column in PICTURE_COLUMNS if (of := difference(pairs, column, frames, keys))] if keys else []
         rows += [[*head, *figures(*each)] for each in apart] or [[*head, "-", "no clips in common", "-", "-", "-"]]
-    parts = [*claims_tables(rows), *means_tables(sets), *dict.fromkeys(notes)]
+    marks = "**Bold**: the claim holds. *Slanted*: its opposite does."
+    parts = [*claims_tables(rows), marks, *means_tables(sets), *dict.fromkeys(notes)]
     table = "\n\n".join(parts) + "\n"
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "findings.md").write_text(table)

@@ -28,7 +28,6 @@ class FakePictures:
     scenes: tuple[str, ...] = tuple(f"scene_{number:06d}" for number in range(3))
     broken: frozenset[tuple[str, int]] = frozenset()
     origin: str = "fake"
-    semantic: bool = False
     fps: float = 10.0
     length: int = FRAMES
 

@@ -215,9 +215,12 @@ def test_means_go_by_episode_split_and_group_without_black_targets(root: Path, t
     near = (near_a + db(60)) / 2
     wanted = {"far": db(90), "near: near_a": near_a, "near": near, "mean over groups": (db(90) + near) / 2}
     assert {label: got[label] for label in wanted} == pytest.approx(wanted)
-    assert ("5, 9 frames" in table.notes[0], "near_c" in table.notes[1]) == (True, True)
+    assert ("5, 9 frames" in table.notes[0], "or beyond --limit: near_c (1 of 1)." in table.notes[1]) == (True, True)
+    run(*line[:5], "--out", tmp_path / "first", "--methods", "copy_source", "--limit", "1")
+    assert "near_a (1 of 2), near_c (1 of 1)." in benchmark_table(gather([Run.read(tmp_path / "first")])[0]).notes[1]
     report = (tmp_path / "out" / "report.md").read_text()
     assert ("Published, not measured here" in report, "11.57" in report) == (True, True)
+    assert "flicker" in (tmp_path / "out" / "tables" / "regions.csv").read_text()
     assert "11.57" not in (tmp_path / "out" / "tables" / "anyviewbench.csv").read_text()
     assert "0 measured, 4 there already" in run(*line, "--methods", "copy_source")[1]  # goes on where it stopped
     code, said = run(*line, "--methods", "copy_source", "--frames", "5")
@@ -412,6 +415,7 @@ def test_scenes_of_both_layouts_become_episodes_that_are_measured(tmp_path: Path
     out = tmp_path / "out"
     code, said = run("export", "anyview", tmp_path / "kubric", out, "--view", "view1:view9")
     assert (code, (out / "splits.json").exists()) == (66, False), said
+    assert run("export", "anyview", tmp_path / "kubric", tmp_path / "kubric" / "in")[0] == 78
     for source, views in (("kubric", ["view1:view0", "view0:view1"]), ("driving", ["yaw-0:camera0"])):
         code, said = run("export", "anyview", tmp_path / source, out, *(word for v in views for word in ("--view", v)))
         assert code == 0, said

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
+from tiny_scenes4d import CAMERAS, VIEWS, write_driving, write_kubric
 from typer.testing import CliRunner
 
 from gcd_train.cli.main import app
@@ -16,21 +16,17 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError
 
-VIEWS = tuple(f"view{number}" for number in range(4))
-DRIVING = tuple(DRIVING_POSES)
-
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("source")
-    for number in (3, 7):
-        write_kubric(root / "kubric", number, frames=2)
+    write_kubric(root / "kubric", 3, 7, frames=2)
     write_driving(root / "driving", 5, frames=2)
     return root
 
 
 def packed(source: Path, out: Path, *options: str) -> tuple[int, list[str]]:
-    cameras = [word for name in (VIEWS if "kubric" in source.name else DRIVING) for word in ("--camera", name)]
+    cameras = [word for name in (VIEWS if "kubric" in source.name else CAMERAS) for word in ("--camera", name)]
     result = CliRunner().invoke(app, ["data", "compact", str(source), str(out), *cameras, *options])
     return result.exit_code, [
         line for line in result.output.splitlines() if line.startswith(("scn", "scene_", "scenes:"))
@@ -65,7 +61,7 @@ def test_kubric_scenes_are_read_as_before_and_packed_once(source: Path, tmp_path
 def test_driving_scenes_keep_classes_and_instances_of_two_bytes(source: Path, tmp_path: Path) -> None:
     code, lines = packed(source / "driving", tmp_path)
     assert code == 0, lines
-    sets = [ParallelDomain4D(root, cameras=DRIVING, instances=True) for root in (source / "driving", tmp_path)]
+    sets = [ParallelDomain4D(root, cameras=CAMERAS, instances=True) for root in (source / "driving", tmp_path)]
     most = 0
     for view, same in zip(*(of.views("scene_000005", 1) for of in sets), strict=True):
         assert view.classes is not None
@@ -82,24 +78,22 @@ def test_driving_scenes_keep_classes_and_instances_of_two_bytes(source: Path, tm
 def test_a_damaged_scene_is_one_line_and_the_next_line_packs_it(source: Path, tmp_path: Path) -> None:
     kubric = tmp_path / "kubric"
     shutil.copytree(source / "kubric", kubric)
-    whole = {
-        name: (kubric / "scn00003" / name).read_bytes()
-        for name in ("frames_p0_v2/depth_00001.tiff", "frames_p0_v1/rgba_00000.png")
-    }
-    depth, colour = (kubric / "scn00003" / name for name in whole)
-    depth.write_bytes(whole[str(depth.relative_to(kubric / "scn00003"))][:50])
+    scene = kubric / "scn00003"
+    depth, colour = scene / "frames_p0_v2" / "depth_00001.tiff", scene / "frames_p0_v1" / "rgba_00000.png"
+    whole = depth.read_bytes()
+    depth.write_bytes(whole[:50])
     colour.unlink()
     code, lines = packed(kubric, tmp_path / "out")
     assert (code, len(lines)) == (66, 2)
     assert lines[0].startswith(f"scn00003: 1 views lack a file and 1 are damaged; download them again. First: {colour}")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["scn00007"]
     assert packed(kubric, tmp_path / "out", "--gaps")[0] == 66
-    depth.write_bytes(whole["frames_p0_v2/depth_00001.tiff"])
+    depth.write_bytes(whole)
     assert "or give --gaps" in packed(kubric, tmp_path / "out")[1][0]
     code, lines = packed(kubric, tmp_path / "out", "--gaps")
     assert (code, lines[0]) == (0, "scn00003: packed without 1 views that are missing")
-    shutil.rmtree(kubric / "scn00003" / "frames_p0_v0")
-    (kubric / "scn00003" / "scn00003_p0_v0.json").unlink()
+    shutil.rmtree(scene / "frames_p0_v0")
+    (scene / "scn00003_p0_v0.json").unlink()
     assert packed(kubric, tmp_path / "other")[1][0].startswith("scn00003: ")
 
 

@@ -1,6 +1,5 @@
 """What a recipe's [data] makes of folders: parts, samplings, and what is refused."""
 
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cached_sets import CHOICE, CLIP, HEIGHT, WIDTH, cached
-from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
+from tiny_scenes4d import CAMERAS, VIEWS, copy_scene, write_driving, write_kubric
 from tiny_world import tiny_recipe
 
 from gcd_model.config import ModelConfig
@@ -27,40 +26,22 @@ from gcd_train.recipe import LossRecipe, Recipe
 from gcd_train.recipe_data import DataRecipe, FramesRecipe, OrbitRecipe
 from gcd_train.recipe_files import load_recipe
 from gcd_train.scenes.driving.world import driving_scene
-from gcd_train.scenes.worlds import (
-    SCENE_WORLDS,
-    CameraWay,
-    SceneFormat,
-    agree,
-    pair_world,
-)
+from gcd_train.scenes.worlds import SCENE_WORLDS, CameraWay, SceneFormat, agree, pair_world
 from gcd_train.training.setup import Draws, Precision, family_of, model_config
 
-VIEWS = tuple(f"view{number}" for number in range(4))
 CONFIG = ModelConfig(frames=3, height=32, width=48)
 KUBRIC = DataRecipe(kind="kubric4d", cameras=VIEWS, repeats=5)
-DRIVING = DataRecipe(kind="parallel_domain4d", cameras=tuple(DRIVING_POSES), repeats=5)
+DRIVING = DataRecipe(kind="parallel_domain4d", cameras=CAMERAS, repeats=5)
 
 
 @pytest.fixture(scope="module")
 def kubric(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kubric")
-    scene = write_kubric(root, 3, frames=8)
-    for number in (7, 2801):
-        copy = root / f"scn{number:05d}"
-        shutil.copytree(scene, copy)
-        for file in copy.glob("*.json"):
-            file.rename(copy / file.name.replace("scn00003", copy.name))
-    return root
+    return write_kubric(tmp_path_factory.mktemp("kubric"), 3, 7, 2801, frames=8).parent
 
 
 @pytest.fixture(scope="module")
 def driving(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("driving")
-    write_driving(root, 1, frames=5)
-    for number in (2, 5):
-        shutil.copytree(root / "scene_000001", root / f"scene_{number:06d}")
-    return root
+    return write_driving(tmp_path_factory.mktemp("driving"), 1, 2, 5, frames=5).parent
 
 
 def recipe(data: DataRecipe, **unet: object) -> Recipe:
@@ -105,14 +86,12 @@ def test_the_last_scenes_are_held_out_where_the_recipe_says_so(kubric: Path) -> 
 
 
 def test_a_folder_of_its_own_leaves_all_of_the_data_to_learn_from(kubric: Path, tmp_path: Path) -> None:
-    other = Path(shutil.copytree(kubric / "scn02801", tmp_path / "scn02802"))
-    for file in other.glob("*.json"):
-        file.rename(other / file.name.replace("scn02801", other.name))
+    copy_scene(kubric / "scn02801", tmp_path / "scn02802")
     assert lengths(opened(recipe(KUBRIC), kubric, tmp_path)) == (3, 1)
 
 
 def test_a_scene_that_is_learned_from_is_never_measured_on(kubric: Path, tmp_path: Path) -> None:
-    shutil.copytree(kubric / "scn02801", tmp_path / "scn02801")
+    copy_scene(kubric / "scn02801", tmp_path / "scn02801")
     with pytest.raises(DataError, match="scn02801"):
         opened(recipe(KUBRIC), kubric, tmp_path)
     with pytest.raises(DataError, match="scn00003, scn00007, scn02801"):

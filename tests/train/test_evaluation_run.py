@@ -1,6 +1,6 @@
 """Runs that are kept: records, resuming, failures, processes, frames that are read back."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from driving_plane import PlaneClips
 from made_records import note, record
 from typer.testing import CliRunner
 
+from gcd_model.errors import ViewRangeError
 from gcd_train.cli.main import app
 from gcd_train.data.pairs import PairedClips
 from gcd_train.errors import DataError, RunError
@@ -28,13 +29,14 @@ class Counting:
 
     name: str = "counting"
     refused: Sequence[str] = ()
+    error: Callable[[str], Exception] = DataError
     privileged: bool = False
     met: list[str] = field(default_factory=list)
 
     def predict(self, clip: SourceClip) -> Prediction:
         self.met.append(clip.key)
         if clip.key in self.refused:
-            raise DataError(f"no frames for {clip.key}")
+            raise self.error("no frames here")
         return Prediction(video=to_pictures(clip.source))
 
 
@@ -162,7 +164,7 @@ def test_a_clip_that_cannot_be_read_is_named_and_the_others_are_measured(tmp_pat
 
 def test_a_method_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> None:
     account = finished(tmp_path, pairs(2), Counting(refused=["plane-00000000"]), CopySource())
-    assert account.failures == {"plane-00000000, counting": "no frames for plane-00000000"}
+    assert account.failures == {"plane-00000000, counting": "no frames here"}
     others = ["copy_source/plane-00000000.json", "copy_source/plane-00000001.json", "counting/plane-00000001.json"]
     assert records_in(tmp_path) == others
 
@@ -172,6 +174,13 @@ def test_a_run_in_which_nothing_goes_right_gives_up(tmp_path: Path) -> None:
     assert (account.measured, account.done, account.gave_up) == (0, GIVE_UP_AFTER, True)
     assert account.lines()[0] == f"clips: 0 measured, 0 there already; {GIVE_UP_AFTER} failures"
     assert "gave up" in account.lines()[-1]
+
+
+def test_views_that_a_model_does_not_take_end_no_run(tmp_path: Path) -> None:
+    clips = pairs(GIVE_UP_AFTER + 2)
+    refused = Counting(refused=clips.keys[:-1], error=lambda why: ViewRangeError(why, {}))
+    account = finished(tmp_path, clips, refused)
+    assert (account.measured, len(account.failures), account.gave_up) == (1, GIVE_UP_AFTER + 1, False)
 
 
 def test_a_folder_that_cannot_be_written_ends_the_run(tmp_path: Path) -> None:

@@ -10,22 +10,14 @@ import numpy as np
 import pytest
 import torch
 from fake_model import FakeModel, traits_of
-from tiny_world import write_untrained
-from typer import Typer
-from typer.testing import CliRunner
+from tiny_world import ran, write_untrained
 
-from gcd_model import (
-    CameraMount,
-    SphericalDelta,
-    Traits,
-    load_synthesizer,
-)
+from gcd_model import CameraMount, SphericalDelta, Traits, load_synthesizer
 from gcd_model.config import SMALL
 from gcd_model.errors import OptionError
 from gcd_model.geometry import Intrinsics
 from gcd_model.traits import ASSUMED_SOURCE
 from gcd_model.weights.card import FAMILIES, FamilyName
-from gcd_train.cli.look import gallery_command
 from gcd_train.errors import DataError
 from gcd_train.look.gallery import (
     GalleryOptions,
@@ -192,18 +184,11 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_untrained(tmp_path_factory.mktemp("weights"))
 
 
-def run(*words: object) -> tuple[int, str]:
-    app = Typer()
-    app.command()(gallery_command)
-    made = CliRunner().invoke(app, [*map(str, words)])
-    return made.exit_code, " ".join(made.output.split())
-
-
 def test_the_command_shows_good_videos_and_names_bad_ones(tmp_path: Path, weights: Path) -> None:
     write_video(tmp_path / "in" / "a<b>.avi", 6, 10.0)
     (tmp_path / "in" / "bad.mp4").write_bytes(b"no video")
     out = tmp_path / "out"
-    code, said = run(tmp_path / "in", "--weights", weights, "--out", out)
+    code, said = ran("gallery", tmp_path / "in", "--weights", weights, "--out", out)
     assert code == 0, said
     assert "bad.mp4 is no whole video file" in said
     page = (out / "index.html").read_text()
@@ -229,6 +214,6 @@ def test_the_command_shows_good_videos_and_names_bad_ones(tmp_path: Path, weight
 )
 def test_what_cannot_be_shown_is_one_line(tmp_path: Path, weights: Path, more: list[str], code: int, said: str) -> None:
     (tmp_path / "bad.mp4").write_bytes(b"no video")
-    found, shown = run(tmp_path / "bad.mp4", "--weights", weights, "--out", tmp_path / "out", *more)
+    found, shown = ran("gallery", tmp_path / "bad.mp4", "--weights", weights, "--out", tmp_path / "out", *more)
     assert found == code
     assert said in shown

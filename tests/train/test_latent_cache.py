@@ -23,13 +23,11 @@ from cached_sets import (
     tiny_encoders,
     tiny_identity,
 )
-from tiny_scenes4d import DRIVING_POSES, write_driving
-from tiny_world import tiny_recipe
+from tiny_scenes4d import CAMERAS, write_driving
+from tiny_world import ran, tiny_recipe
 from torch.testing import assert_close
-from typer.testing import CliRunner
 
 from gcd_model.loading import random_weights
-from gcd_train.cli.main import app
 from gcd_train.data.batches import CachedBatches
 from gcd_train.data.cache import (
     CachedLatents,
@@ -116,7 +114,7 @@ def test_log_variances_survive_one_byte() -> None:
 
 
 def test_semantic_targets_keep_their_class_emphasis(tmp_path: Path) -> None:
-    cached(tmp_path, FakePictures(scenes=("a",), semantic=True), emphasis=True)
+    cached(tmp_path, FakePictures(scenes=("a",)), emphasis=True)
     clip = CachedLatents.open(tmp_path).clip("a", ClipPlace(0, 1), "gradual")
     assert clip.emphasis is not None
     assert clip.emphasis.shape == (CLIP, 1, *clip.target.shape[-2:])
@@ -154,7 +152,7 @@ def test_batches_tell_each_clip_its_own_frame_rate(folder: Path) -> None:
 
 def test_a_job_travels_to_another_process(tmp_path: Path) -> None:
     write_driving(tmp_path, 3, frames=2)
-    data = ParallelDomain4D(tmp_path, cameras=tuple(DRIVING_POSES))
+    data = ParallelDomain4D(tmp_path, cameras=CAMERAS)
     pictures = DrivingPictures(data, CLIP, PictureOptions(size=(WIDTH, HEIGHT)))
     job = CacheJob(folder=tmp_path, pictures=pictures, choice=CHOICE, identity=tiny_identity())
     arrived = pickle.loads(pickle.dumps(job))
@@ -272,30 +270,16 @@ def test_a_disk_that_fills_up_names_the_shard_and_leaves_nothing_behind(
 # the command
 
 
-def ran(*arguments: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["cache", *map(str, arguments)])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, " ".join(result.output.split())
-
-
 def test_the_command_caches_a_set_in_the_published_layout_and_then_has_nothing_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ParallelDomain4D.__init__, "__kwdefaults__", _three_cameras())
+    usual = ParallelDomain4D.__init__.__kwdefaults__
+    monkeypatch.setattr(ParallelDomain4D.__init__, "__kwdefaults__", usual | {"cameras": CAMERAS})
     scene = write_driving(tmp_path / "set", 3, frames=16)
     broken = scene / "rgb" / "camera0" / f"{10 * 0 + 5:018d}.png"
     broken.write_bytes(broken.read_bytes()[:40])
-    told = (
-        tmp_path / "set",
-        "--weights",
-        "random:driving",
-        "--out",
-        tmp_path / "cache",
-        "--copies",
-        1,
-        "--path",
-        "direct",
-    )
+    where = (tmp_path / "set", "--out", tmp_path / "cache")
+    told = ("cache", *where, "--weights", "random:driving", "--copies", 1, "--path", "direct")
     code, said = ran(*told)
     assert code == 0
     assert "scene_000003" in said
@@ -315,14 +299,9 @@ def test_the_command_caches_a_set_in_the_published_layout_and_then_has_nothing_t
     assert (code, "seed 0, now 1" in said) == (RunError.exit_code, True)
 
 
-def _three_cameras() -> dict[str, object]:
-    told = dict(ParallelDomain4D.__init__.__kwdefaults__)
-    return told | {"cameras": tuple(DRIVING_POSES)}
-
-
 def test_a_part_of_the_set_wants_its_split_file(tmp_path: Path) -> None:
     write_driving(tmp_path, 3, frames=1)
-    told = (tmp_path, "--weights", "random:driving", "--out", tmp_path / "cache", "--split", "train")
+    told = ("cache", tmp_path, "--weights", "random:driving", "--out", tmp_path / "cache", "--split", "train")
     code, said = ran(*told)
     assert (code, "both --split and --split-file" in said) == (RecipeError.exit_code, True)
     split = tmp_path / "split.json"

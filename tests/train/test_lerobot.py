@@ -15,23 +15,18 @@ import pytest
 import torch
 from fake_model import FakeModel, traits_of
 from headless import needs_egl
-from tiny_world import tiny_recipe
-from typer.testing import CliRunner
+from tiny_scenes4d import edit_json
+from tiny_world import ran, tiny_recipe
 
 from gcd_model import RenderOptions, SourceFeatures, Trajectory, View
 from gcd_model.config import ModelConfig
 from gcd_model.live.config import LiveConfig
 from gcd_model.weights.card import FAMILIES
-from gcd_train.cli.main import app
 from gcd_train.data import lerobot_augment
 from gcd_train.data.files import FileFault
 from gcd_train.data.lerobot import CAMERA_FILE, CameraCalibration, LeRobotPairs, read_set
 from gcd_train.data.lerobot_augment import Augmentation, AugmentOptions
-from gcd_train.data.lerobot_export import (
-    LeRobotWriter,
-    TabletopExport,
-    export_tabletop,
-)
+from gcd_train.data.lerobot_export import LeRobotWriter, TabletopExport, export_tabletop
 from gcd_train.data.open import RunData, open_data
 from gcd_train.data.sample import Sample
 from gcd_train.data.videos import nearest_pictures
@@ -83,7 +78,7 @@ def _episode(number: int) -> tuple[dict[str, np.ndarray], str]:
 
 
 def _write(folder: Path, *numbers: int) -> Path:
-    with LeRobotWriter(folder, _calibrations(), robot="test", fps=FPS, names={}, crf=4) as writer:
+    with LeRobotWriter(folder, _calibrations(), robot="test", fps=FPS, names={}) as writer:
         for number in numbers:
             writer.add(*_episode(number), _pictures(number, ROWS))
     return folder
@@ -253,9 +248,7 @@ def test_a_calibration_can_be_given_as_a_file(copied: Path, tmp_path: Path) -> N
     ],
 )
 def test_a_wrong_calibration_is_named(copied: Path, change: dict[str, Any], said: str) -> None:
-    told = json.loads((copied / CAMERA_FILE).read_text())
-    told["cameras"][LEFT].update(change)
-    (copied / CAMERA_FILE).write_text(json.dumps(told))
+    edit_json(copied / CAMERA_FILE, lambda told: told["cameras"][LEFT].update(change))
     with pytest.raises(FileFault, match=said) as caught:
         LeRobotPairs(copied)
     assert caught.value.path == copied / CAMERA_FILE
@@ -358,8 +351,7 @@ def test_an_episode_shorter_than_the_window_is_left_out_and_a_set_of_such_is_an_
     ],
 )
 def test_a_wrong_description_is_named(copied: Path, change: dict[str, object], said: str) -> None:
-    info = json.loads((copied / "meta/info.json").read_text())
-    (copied / "meta/info.json").write_text(json.dumps(info | change))
+    edit_json(copied / "meta/info.json", lambda info: info.update(change))
     with pytest.raises(DataError, match=said):
         LeRobotPairs(copied)
 
@@ -540,14 +532,14 @@ def test_a_view_goes_where_its_angles_say(made: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_live_model_augments_by_the_command(copied: Path, tmp_path: Path) -> None:
     """Frames of its view agree with the camera's where it stands in the same place."""
-    line = ["augment", "lerobot", str(copied), "--out", str(tmp_path / "out"), "--camera", "left"]
-    done = CliRunner().invoke(app, [*line, "--view", "same=0", "--source-radius", "1.0", "--workers", "2"])
-    assert done.exit_code == 0, done.output
+    line = ["augment", "lerobot", copied, "--out", tmp_path / "out", "--camera", "left", "--view", "same=0"]
+    code, said = ran(*line, "--source-radius", "1.0", "--workers", "2")
+    assert code == 0, said
     for number in range(3):
         view, filmed = (_film(tmp_path / "out", name, number).astype(int) for name in (f"{LEFT}_same", LEFT))
         assert np.abs(view - filmed).mean() < 4.0
     assert (_film(tmp_path / "out", f"{LEFT}_same_visibility", 0) == 255).mean() > 0.9
-    assert CliRunner().invoke(app, [*line, "--view", "same=0"]).exit_code == RunError.exit_code
+    assert ran(*line)[0] == RunError.exit_code
 
 
 # the tabletop world
@@ -574,7 +566,7 @@ def test_a_tabletop_episode_is_exported_and_read_back(tmp_path: Path) -> None:
 
 
 def test_the_command_says_what_it_read(made: Path) -> None:
-    done = CliRunner().invoke(app, ["lerobot", str(made), "--samples", "2", "--frames", "4"])
-    assert done.exit_code == 0, done.output
-    assert "3 episodes at 20 frames per second" in done.output
-    assert done.output.count("m apart") == 2
+    code, said = ran("lerobot", made, "--samples", "2", "--frames", "4")
+    assert code == 0, said
+    assert "3 episodes at 20 frames per second" in said
+    assert said.count("m apart") == 2

@@ -31,7 +31,7 @@ from gcd_model.live.depth_net import (
 from gcd_model.live.paint_net import Painted, PaintNet, Seen, filled
 from gcd_model.networks import LiveNetworks
 from gcd_train.data.sample import to_network
-from gcd_train.errors import DataError, Interrupted, RecipeError
+from gcd_train.errors import DataError, Interrupted
 from gcd_train.live.batches import FrameBatches, pictures_of
 from gcd_train.live.calibration import SpreadHistogram, calibrate, floors_of, frames_of
 from gcd_train.live.clips import Shelf, TrainingClips, read_clip, training_paths
@@ -50,7 +50,6 @@ from gcd_train.live.views import (
 )
 from gcd_train.recipe import LiveRecipe, LiveStage, OptimiserRecipe
 from gcd_train.recipe_data import Budget, ComputeRecipe, LogRecipe
-from gcd_train.recipe_files import load_recipe
 from gcd_train.training.distributed import ALONE, Processes, processes_of
 from gcd_train.training.loop import Progress
 from gcd_train.training.monitor import RunFolder
@@ -209,13 +208,6 @@ def test_two_processes_end_with_the_weights_of_one(data: Path) -> None:
 def test_stages_kept_of_no_weights_and_a_detail_of_several_batches_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"weights|detail"):
         changed(RECIPE, **change)
-
-
-def test_an_unknown_key_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "live.toml"
-    path.write_text('kind = "live"\nname = "x"\nspeed = 1\n')
-    with pytest.raises(RecipeError, match="speed"):
-        load_recipe(str(path))
 
 
 def test_batches_follow_from_the_update_alone(data: Path) -> None:

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,13 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scenes4d import (
     BOX,
+    CAMERAS,
     DRIVING_LENS,
-    DRIVING_POSES,
     GROUND,
     KUBRIC_LENS,
     SKY,
+    VIEWS,
+    copy_scene,
     draw,
     driving_pose,
+    edit_json,
     kubric_poses,
     ontology,
     palette_png,
@@ -33,9 +38,6 @@ from gcd_train.data.files import FileFault
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
 from gcd_train.errors import DataError
-
-VIEWS = tuple(f"view{number}" for number in range(4))
-CAMERAS = tuple(DRIVING_POSES)
 
 
 @pytest.fixture(scope="module")
@@ -57,15 +59,13 @@ def driving_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def kubric(kubric_root: Path, tmp_path: Path) -> Path:
     """A scene that a test may damage."""
-    shutil.copytree(kubric_root / "scn00007", tmp_path / "scn00007")
-    return tmp_path / "scn00007"
+    return copy_scene(kubric_root / "scn00007", tmp_path / "scn00007")
 
 
 @pytest.fixture
 def driving(driving_root: Path, tmp_path: Path) -> Path:
     """A scene that a test may damage."""
-    shutil.copytree(driving_root / "scene_000004", tmp_path / "scene_000004")
-    return tmp_path / "scene_000004"
+    return copy_scene(driving_root / "scene_000004", tmp_path / "scene_000004")
 
 
 def open_kubric(root: Path, **options: bool) -> Kubric4D:
@@ -209,10 +209,7 @@ def test_mixed_sizes_are_named(kubric: Path, driving: Path) -> None:
     expect_fault(driving, driving_file("rgb"), "40 x 30 where .* 48 x 36: sizes are mixed")
     write_png(kubric / kubric_file("rgba"), np.zeros((30, 40, 3), np.uint8), alpha=True)
     expect_fault(kubric, kubric_file("rgba"), "40 x 30 where .* 48 x 32: sizes are mixed")
-    path = kubric / "scn00007_p0_v2.json"
-    told = json.loads(path.read_text())
-    told["scene"]["resolution"] = [96, 64]
-    path.write_text(json.dumps(told))
+    edit_json(kubric / "scn00007_p0_v2.json", lambda told: told["scene"].update(resolution=[96, 64]))
     expect_fault(kubric, "scn00007_p0_v2.json", "96 x 64 pixels, .* sizes are mixed")
 
 
@@ -226,21 +223,21 @@ def test_mixed_sizes_are_named(kubric: Path, driving: Path) -> None:
         (lambda told: told["scene"].update(resolution=[0, 0]), "is damaged or lacks"),
     ],
 )
-def test_damaged_kubric_metadata_is_named(kubric: Path, change: object, match: str) -> None:
-    path = kubric / "scn00007_p0_v1.json"
-    told = json.loads(path.read_text())
-    change(told)  # pyright: ignore[reportCallIssue]
-    path.write_text(json.dumps(told))
+def test_damaged_kubric_metadata_is_named(kubric: Path, change: Callable[[Any], object], match: str) -> None:
+    edit_json(kubric / "scn00007_p0_v1.json", change)
     expect_fault(kubric, "scn00007_p0_v1.json", match)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b'{"scene": {}}', b"\xff\xfe", b"null"])
+TWICE = json.dumps({"items": 2 * ontology()["items"]}).encode()
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b'{"scene": {}}', b"\xff\xfe", b"null", TWICE])
 def test_json_that_is_none_is_named(kubric: Path, driving: Path, content: bytes) -> None:
     (kubric / "scn00007_p0_v1.json").write_bytes(content)
     expect_fault(kubric, "scn00007_p0_v1.json", "is empty|is damaged")
     dataset = open_driving(driving.parent)
     (driving / "ontology" / "d4e5f6.json").write_bytes(content)
-    with pytest.raises(FileFault, match=r"d4e5f6\.json is (empty|no ontology)"):
+    with pytest.raises(FileFault, match=r"d4e5f6\.json is (empty|no ontology|no usable ontology)"):
         dataset.views("scene_000004", 0)
     (driving / "calibration" / "a1b2c3.json").write_bytes(content)
     with pytest.raises(FileFault, match=r"a1b2c3\.json is (empty|no calibration)"):
@@ -261,20 +258,15 @@ def test_json_that_is_none_is_named(kubric: Path, driving: Path, content: bytes)
         (lambda told: told["intrinsics"].__setitem__(1, None), "without a number for fx"),
     ],
 )
-def test_a_damaged_calibration_is_named(driving: Path, change: object, match: str) -> None:
-    path = driving / "calibration" / "a1b2c3.json"
-    told = json.loads(path.read_text())
-    change(told)  # pyright: ignore[reportCallIssue]
-    path.write_text(json.dumps(told))
+def test_a_damaged_calibration_is_named(driving: Path, change: Callable[[Any], object], match: str) -> None:
+    edit_json(driving / "calibration" / "a1b2c3.json", change)
     expect_fault(driving, "calibration/a1b2c3.json", match)
 
 
 def test_a_scene_with_another_ontology_is_refused(driving_root: Path, tmp_path: Path) -> None:
     shutil.copytree(driving_root, tmp_path / "set")
     path = tmp_path / "set" / "scene_002143" / "ontology" / "d4e5f6.json"
-    told = json.loads(path.read_text())
-    told["items"][0]["name"] = "Moon"
-    path.write_text(json.dumps(told))
+    edit_json(path, lambda told: told["items"][0].update(name="Moon"))
     dataset = open_driving(tmp_path / "set")
     with pytest.raises(FileFault, match=r"wrong ontology: it differs from the first scene's by Moon, Road"):
         dataset.views("scene_002143", 0)
@@ -331,9 +323,7 @@ def test_whatever_a_file_holds_it_is_read_or_named(driving: Path, kubric: Path, 
 
 def test_classes_that_share_a_colour_are_reported(driving: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = driving / "ontology" / "d4e5f6.json"
-    told = json.loads(path.read_text())
-    told["items"][1]["color"] = told["items"][0]["color"]
-    path.write_text(json.dumps(told))
+    edit_json(path, lambda told: told["items"][1].update(color=told["items"][0]["color"]))
     dataset = open_driving(driving.parent)
     assert dataset.ontology is not None
     assert dataset.ontology.duplicates == ((5, 24),)
@@ -389,7 +379,6 @@ def test_unlisted_ids_are_black_and_without_a_place() -> None:
     [
         (),
         (OntologyItem(id=1, name="a", colour=(0, 0, 0)), OntologyItem(id=1, name="b", colour=(1, 0, 0))),
-        (OntologyItem(id=256, name="a", colour=(0, 0, 0)),),
         (OntologyItem(id=1, name="a", colour=(0, 0, 256)),),
     ],
 )
@@ -404,13 +393,4 @@ def test_an_ontology_is_read_from_the_scene(tmp_path: Path) -> None:
     assert [item.id for item in read_ontology(tmp_path).items] == [BOX, GROUND, SKY, 255]
     (tmp_path / "bb.json").unlink()
     with pytest.raises(FileFault, match=r"aa\.json is no ontology"):
-        read_ontology(tmp_path)
-
-
-def test_a_twice_listed_id_is_named_with_its_file(tmp_path: Path) -> None:
-    told = {"items": [{"id": 1, "name": name, "color": {"r": 1, "g": 2, "b": 3}} for name in "ab"]}
-    (tmp_path / "o.json").write_text(json.dumps(told))
-    with pytest.raises(
-        FileFault, match=r"o\.json is no usable ontology: an ontology has each id once, got \[1\] twice"
-    ):
         read_ontology(tmp_path)

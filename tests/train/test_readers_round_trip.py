@@ -13,48 +13,54 @@ from gcd_model.geometry import Intrinsics
 from gcd_train.data.encodings import SKY_M
 from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.parallel_domain4d import ParallelDomain4D
-from gcd_train.data.paths import DRIVING, MAX90, FrameSampling, generator
+from gcd_train.data.paths import DRIVING, MAX90, FrameSampling
 from gcd_train.data.pictures import PictureOptions, ViewPairs
 from gcd_train.errors import DataError
 from gcd_train.evaluation.clips import further_poses
 from gcd_train.evaluation.opening import ClipOptions, open_clips
+from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving.classes import class_ids
 from gcd_train.scenes.driving.world import driving_drive
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.scene_writer import write_scene
 from gcd_train.scenes.triangles import freeze
-from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat
+from gcd_train.scenes.worlds import SCENE_WORLDS, SceneFormat, SceneWorld
 
 SEED, FRAMES, WIDTH, HEIGHT = 3, 2, 48, 36
+SIZE = (WIDTH, HEIGHT)
 CLIP = FrameSampling(clip=2, reach_last=True)
 
 pytestmark = needs_egl
 
 
+def written(root: Path, world: SceneWorld, *, compact: bool = False) -> Path:
+    form = SceneFormat(width=WIDTH, height=HEIGHT, frames=FRAMES, oversample=1, compact=compact)
+    write_scene(root, world, form, SEED)
+    return root
+
+
+def drawn(scene: Scene) -> dict[tuple[int, str], Rendering]:
+    with Renderer(WIDTH, HEIGHT, oversample=1) as renderer:
+        return {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
+
+
 @pytest.fixture(scope="module")
 def stage_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stage in the published layout."""
-    return write_stage(tmp_path_factory.mktemp("stage"))
-
-
-def write_stage(root: Path, *, compact: bool = False) -> Path:
-    form = SceneFormat(width=48, height=32, frames=FRAMES, oversample=1, compact=compact)
-    write_scene(root, STAGE, form, 0)
-    return root
+    return written(tmp_path_factory.mktemp("stage"), STAGE)
 
 
 @pytest.mark.parametrize("compact", [False, True])
 def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path, tmp_path: Path, compact: bool) -> None:
-    stage_root = write_stage(tmp_path, compact=True) if compact else stage_root
+    stage_root = written(tmp_path, STAGE, compact=True) if compact else stage_root
     dataset = Kubric4D(stage_root, instances=True)
-    scene = stage(0, FRAMES)
-    with Renderer(48, 32, oversample=1) as renderer:
-        drawn = {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
-    assert dataset.frames("scn00000") == FRAMES
+    scene = stage(SEED, FRAMES)
+    pictures = drawn(scene)
+    assert dataset.frames("scn00003") == FRAMES
     assert any(stage_root.rglob("*.webp")) == compact
     for time in range(FRAMES):
-        for camera, view in zip(dataset.cameras, dataset.views("scn00000", time), strict=True):
-            wanted = drawn[time, camera]
+        for camera, view in zip(dataset.cameras, dataset.views("scn00003", time), strict=True):
+            wanted = pictures[time, camera]
             near = wanted.depth > 0
             assert np.abs(view.rgb.astype(int) - wanted.rgb).mean() <= (6 if compact else 0)
             np.testing.assert_allclose(view.depth[near], wanted.depth[near], rtol=6e-4 if compact else 1e-6)
@@ -66,8 +72,8 @@ def test_a_kubric_scene_is_read_as_it_was_drawn(stage_root: Path, tmp_path: Path
 
 def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
     dataset, orbit = Kubric4D(stage_root), replace(MAX90, frames=CLIP)
-    exact = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), exact=True, visible=True)).sample(2)
-    splatted = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), visible=True)).sample(2)
+    exact = ViewPairs(dataset, orbit, 4, PictureOptions(size=SIZE, exact=True, visible=True)).sample(2)
+    splatted = ViewPairs(dataset, orbit, 4, PictureOptions(size=SIZE, visible=True)).sample(2)
     assert exact.skipped == splatted.skipped == ()
     np.testing.assert_array_equal(exact.source_from_target, splatted.source_from_target)
     np.testing.assert_array_equal(exact.source[0], exact.target[0])
@@ -79,22 +85,22 @@ def test_an_exact_orbit_looks_like_its_point_cloud(stage_root: Path) -> None:
 
 def test_a_camera_that_is_drawn_for_an_exact_scene_sees_what_one_there_sees(stage_root: Path) -> None:
     dataset, orbit = Kubric4D(stage_root), replace(MAX90, frames=CLIP)
-    pairs = ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32), exact=True))
-    own = [dataset.views("scn00000", time, ["view3", "view9"]) for time in (0, 1)]
+    pairs = ViewPairs(dataset, orbit, 4, PictureOptions(size=SIZE, exact=True))
+    own = [dataset.views("scn00003", time, ["view3", "view9"]) for time in (0, 1)]
     poses = np.stack([view.world_from_camera for view in own[0]])
-    for seen, there in zip(pairs.seen_from("scn00000", (0, 1), poses), own, strict=True):
+    for seen, there in zip(pairs.seen_from("scn00003", (0, 1), poses), own, strict=True):
         for one, other in zip(seen, there, strict=True):
             assert np.abs(one.rgb.astype(int) - other.rgb).mean() < 3  # drawn with twice the samples
             np.testing.assert_array_equal(one.world_from_camera, other.world_from_camera)
             near = (one.depth > 0) & (other.depth < SKY_M / 2)
             assert np.median(np.abs(one.depth[near] / other.depth[near] - 1)) < 0.03  # half a pixel apart
     with pytest.raises(DataError, match="--exact"):
-        ViewPairs(dataset, orbit, 4, PictureOptions(size=(48, 32))).seen_from("scn00000", (0,), poses)
+        ViewPairs(dataset, orbit, 4, PictureOptions(size=SIZE)).seen_from("scn00003", (0,), poses)
 
 
 def test_a_method_gets_the_scenes_own_cameras_first_and_drawn_ones_then(stage_root: Path) -> None:
     options = ClipOptions(data=[stage_root], exact=True, trajectories=1, frame_start=0, frame_skip=1)
-    clips, _ = open_clips(options, size=(1, 32, 48))
+    clips, _ = open_clips(options, size=(1, HEIGHT, WIDTH))
     assert clips.cameras == 16 + 48
     seen = clips.clip(clips.keys[0]).seen
     assert seen.others is not None
@@ -110,27 +116,13 @@ def test_a_method_gets_the_scenes_own_cameras_first_and_drawn_ones_then(stage_ro
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A drive in the published layout."""
-    return write_drive(tmp_path_factory.mktemp("driving"))
-
-
-def write_drive(root: Path, *, compact: bool = False) -> Path:
-    form = SceneFormat(width=WIDTH, height=HEIGHT, frames=FRAMES, oversample=1, compact=compact)
-    write_scene(root, SCENE_WORLDS["driving"], form, SEED)
-    return root
-
-
-@pytest.fixture(scope="module")
-def drawn() -> dict[tuple[int, str], Rendering]:
-    scene = driving_drive(SEED, frames=FRAMES)
-    with Renderer(WIDTH, HEIGHT, oversample=1) as renderer:
-        return {(step, name): view for step, name, view in renderer.views(freeze(scene), scene.cameras)}
+    return written(tmp_path_factory.mktemp("driving"), SCENE_WORLDS["driving"])
 
 
 @pytest.mark.parametrize("compact", [False, True])
-def test_a_driving_scene_is_read_as_it_was_drawn(
-    root: Path, drawn: dict[tuple[int, str], Rendering], tmp_path: Path, compact: bool
-) -> None:
-    root = write_drive(tmp_path, compact=True) if compact else root
+def test_a_driving_scene_is_read_as_it_was_drawn(root: Path, tmp_path: Path, compact: bool) -> None:
+    root = written(tmp_path, SCENE_WORLDS["driving"], compact=True) if compact else root
+    pictures = drawn(driving_drive(SEED, frames=FRAMES))
     dataset = ParallelDomain4D(root, instances=True)
     (scene,) = dataset.scenes
     assert any((root / scene / "rgb").rglob("*.webp")) == compact
@@ -138,7 +130,7 @@ def test_a_driving_scene_is_read_as_it_was_drawn(
     assert vehicle_from_camera is not None
     for time in range(FRAMES):
         for camera, view in zip(dataset.cameras, dataset.views(scene, time), strict=True):
-            wanted = drawn[time, camera]
+            wanted = pictures[time, camera]
             depth = np.where(wanted.depth > 0, wanted.depth, np.float32(SKY_M))
             if compact:
                 np.testing.assert_array_less(np.abs(1 / view.depth - 1 / depth), 0.0013 * (1 / depth + 1 / 20))
@@ -150,12 +142,6 @@ def test_a_driving_scene_is_read_as_it_was_drawn(
             np.testing.assert_array_equal(view.instances, wanted.instances)
             np.testing.assert_allclose(view.world_from_camera, vehicle_from_camera()[camera], atol=1e-6)
             assert view.lens == Intrinsics.from_hfov(85.0, WIDTH, HEIGHT)
-
-
-def test_the_driving_source_stands_where_the_path_starts(root: Path) -> None:
-    dataset = ParallelDomain4D(root)
-    draw = DRIVING.draw(generator(0, 0), 50, 10.0)
-    np.testing.assert_allclose(dataset.pose(dataset.scenes[0], "yaw-0"), draw.world_from_source, atol=1e-6)
 
 
 def test_exact_pairs_start_with_the_same_picture(root: Path) -> None:

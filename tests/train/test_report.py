@@ -237,6 +237,9 @@ def test_error_against_angle_is_of_the_last_frame_and_either_way_round() -> None
     assert [point.x for point in points] == [0.0, 15.0, 30.0, 45.0, 60.0, 75.0]
     assert [point.y.value for point in points] == pytest.approx([18.125 + scene for scene in range(SCENES)])
     assert {point.clips for point in points} == {2}
+    drawn = [msgspec.structs.replace(each, change=(each.change[0] + 0.3, 5.0, 0.0)) for each in records("a")]
+    (points,) = all_plots(measured(drawn))[0].curves.values()
+    assert [point.x for point in points] == [7.5 + 15 * number for number in range(6)]
 
 
 def test_each_curve_over_views_is_of_its_own_method_and_pixels() -> None:
@@ -264,6 +267,16 @@ def test_runs_on_the_same_clips_make_one_set_and_others_their_own() -> None:
     sets = gather([one, other, two])
     assert [[method.name for method in each.methods] for each in sets] == [["a", "b"], ["a"]]
     assert sets[0].method("a").folder == Path("one")
+    part = run(note(methods={"a": WEIGHTS}), records("a")[:3], folder="part")
+    assert gather([part, one])[0].method("a").folder == Path("one")  # where more clips were measured
+
+
+def test_clips_without_a_record_count_and_frames_that_equal_the_target_are_told() -> None:
+    table = main_tables(measured(records("a")[:3], two("b"), clips=5))[0]
+    assert [row.clips for row in table.rows] == ["3 of 5", "2 of 5"]
+    assert "equal the target" not in "".join(table.notes)
+    table = main_tables(measured(records("a"), [record("b", "scn00001.sample_00", psnr_db=100.0)]))[0]
+    assert "Frames that equal the target count as 100 dB: some of b do." in table.notes
 
 
 def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay_one_method() -> None:

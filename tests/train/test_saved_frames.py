@@ -102,8 +102,22 @@ def test_clips_that_lie_there_beside_those_of_the_set_are_named(tmp_path: Path) 
     save(tmp_path / "more" / "sample_0")
     save_video(tmp_path / "most.mp4")
     save(tmp_path / "extra" / "a_c00_scn02900_fs2_pred_s0")
+    save(tmp_path / "anyview" / "frames")
     (tmp_path / "notes").mkdir()
-    assert SavedFrames(name="other", folder=tmp_path).beside([KEY]) == ["more", "most"]
+    assert list(SavedFrames(name="other", folder=tmp_path).oddities([KEY])) == [
+        f"{tmp_path} holds frames that are of no clip of the set: 4, first a_c00_scn02900_fs2_pred_s0"
+    ]
+
+
+def test_draws_that_are_empty_are_refused_and_unequal_numbers_of_them_told(tmp_path: Path) -> None:
+    for sample in (0, 1):
+        save(tmp_path / KEY / f"sample_{sample}")
+    save(tmp_path / "other")
+    told = f"{tmp_path} does not hold as many draws of every clip: 1 of 1 clips, 2 of 1 clips"
+    assert list(SavedFrames(name="other", folder=tmp_path).oddities([KEY, "other", "lacking"])) == [told]
+    (tmp_path / KEY / "sample_2").mkdir()
+    with pytest.raises(DataError, match="sample_2 holds no frames"):
+        predicted(tmp_path)
 
 
 def test_another_length_or_size_is_refused_not_resized(tmp_path: Path) -> None:

@@ -19,7 +19,15 @@ from gcd_model.weights.card import FamilyName
 from gcd_train.cli.main import app
 from gcd_train.data.files import MANIFEST, SceneManifest
 from gcd_train.data.paths import FrameSampling, OrbitSampling
-from gcd_train.data.splits import RELEASED_SOURCE, SceneControls, public_split, public_splits, released_controls
+from gcd_train.data.splits import (
+    RELEASED_SOURCE,
+    SceneControls,
+    public_split,
+    public_splits,
+    read_controls,
+    released_controls,
+    write_controls,
+)
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.evaluation.clips import EvaluationSet, SceneSet
 from gcd_train.evaluation.opening import ClipOptions, open_clips
@@ -117,6 +125,10 @@ def test_a_control_list_says_which_clips_there_are_and_who_is_missing_is_told(ku
     clip = clips.clip("scn02901.sample_01")
     assert clip.change == pytest.approx((30.0, 5.0, -1.0))
     assert clip.seen.fps == 24.0
+    write_controls(tmp_path / "again.json", clips.listed())
+    assert read_controls(tmp_path / "again.json")["scn02901"] == read_controls(listed)["scn02901"][:2]
+    _, notes = open_clips(replace(DRAWN, data=(kubric,)), size=(3, 64, 96))
+    assert "pictures of 48 x 32, measured at 96 x 64" in notes[-1]
 
 
 def test_a_control_list_that_does_not_fit_is_refused_at_once(kubric: Path, driving: Path, tmp_path: Path) -> None:
@@ -271,3 +283,6 @@ def test_the_command_measures_whole_scenes(tmp_path: Path) -> None:
     told, (record,) = run.note, run.records
     assert (told.kind, told.protocol, told.frames, told.width) == ("kubric", "paper", 14, 384)
     assert (record.key, record.scene, len(record.regions)) == ("scn02900.sample_00", "scn02900", 3)
+    (control,) = read_controls(tmp_path / "run" / "controls.json")["scn02900"]
+    assert control.frame_start == 0
+    assert control.goal.azimuth_deg - control.start.azimuth_deg == pytest.approx(record.change[0])

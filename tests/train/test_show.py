@@ -12,9 +12,8 @@ import pytest
 from box_world import STAGE, box_scene
 from headless import needs_egl
 from tiny_scenes4d import write_driving, write_kubric
-from typer.testing import CliRunner
+from tiny_world import ran
 
-from gcd_train.cli.main import app
 from gcd_train.data.files import GEOMETRY, FileFault
 from gcd_train.errors import DataError, RecipeError
 from gcd_train.look.sheet import SKY_M, UNSEEN, Footage
@@ -62,13 +61,6 @@ def write_pairs(folder: Path, height: int = 32, width: int = 48) -> None:
 
 def opened(path: Path, **options: object) -> Footage:
     return open_scene(path, ShowOptions(**options))  # pyright: ignore[reportArgumentType]
-
-
-def shown(*arguments: object) -> tuple[int, str]:
-    """Exit code and everything printed, on one line."""
-    result = CliRunner().invoke(app, ["show", *map(str, arguments)], env={"COLUMNS": "240"})
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, " ".join(result.output.split())
 
 
 @pytest.mark.parametrize("layout", ["orbit", "drive", "pairs"])
@@ -124,25 +116,25 @@ def test_a_broken_file_is_named_and_there_is_no_traceback(tmp_path: Path, file: 
     path.write_bytes(path.read_bytes()[:60])
     if path.suffix == ".tiff":
         path.unlink()
-    code, told = shown(path.parents[len(Path(file).parts) - 1], "--out", tmp_path / "out")
+    code, told = ran("show", path.parents[len(Path(file).parts) - 1], "--out", tmp_path / "out")
     assert code == DataError.exit_code
     assert path.name in told
     assert not (tmp_path / "out").exists()
 
 
 def test_what_is_no_scene_is_refused_with_what_to_give_instead(orbit: Path, tmp_path: Path) -> None:
-    assert f"show one, such as {orbit}" in shown(orbit.parent)[1]
-    assert "neither scnNNNNN" in shown(tmp_path)[1]
-    assert "is no folder" in shown(tmp_path / "scn00001")[1]
+    assert f"show one, such as {orbit}" in ran("show", orbit.parent)[1]
+    assert "neither scnNNNNN" in ran("show", tmp_path)[1]
+    assert "is no folder" in ran("show", tmp_path / "scn00001")[1]
 
 
 def test_pair_shards_name_an_unknown_clip_and_a_damaged_shard(pairs: Path, tmp_path: Path) -> None:
-    code, told = shown(pairs, "--seed", 9)
+    code, told = ran("show", pairs, "--seed", 9)
     assert (code, "no clip of seed 9" in told) == (RecipeError.exit_code, True)
     write_pairs(tmp_path)
     shard = tmp_path / "shard-00000005-1.zip"
     shard.write_bytes(shard.read_bytes()[:-40])
-    code, told = shown(tmp_path)
+    code, told = ran("show", tmp_path)
     assert (code, shard.name in told) == (DataError.exit_code, True)
 
 
@@ -151,7 +143,7 @@ def test_pair_shards_name_an_unknown_clip_and_a_damaged_shard(pairs: Path, tmp_p
 
 def test_the_command_writes_sheet_path_and_video_and_tells_facts_with_units(drive: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="figures need the extra `train`")
-    code, told = shown(drive, "--out", tmp_path)
+    code, told = ran("show", drive, "--out", tmp_path)
     assert code == 0
     for words in ("4 frames at 10 fps", "3 cameras", "hfov 85.0°", "m (1st to 99th percentile)", "Car", "Road", "%"):
         assert words in told

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from tiny_scenes4d import DRIVING_POSES, write_driving
+from tiny_scenes4d import CAMERAS, write_driving
 from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, TinyOrbits, measured, rendered, tiny_recipe, trainer
 from torch import Tensor
 
@@ -103,19 +103,17 @@ def test_a_run_on_painted_clips_ends_in_a_file_that_makes_class_maps(painted_run
 
 @pytest.mark.slow
 def test_the_classes_of_a_driving_set_are_measured_and_end_in_the_weight_file(tmp_path: Path) -> None:
-    for number in (1, 2):
-        write_driving(tmp_path / "set", number, frames=FRAMES + 1)
+    places = write_driving(tmp_path / "set", 1, 2, frames=FRAMES + 1).parent
     data = DataRecipe(
         kind="parallel_domain4d",
         modality="semantic",
-        cameras=tuple(DRIVING_POSES),
+        cameras=CAMERAS,
         frames=FramesRecipe(strides=(1,), reach_last=True),
         split="last",
         held_out=1,
         repeats=2,
     )
     recipe = msgspec.structs.replace(painted_recipe(), data=data)
-    places = tmp_path / "set"
     opened = open_data(recipe, model_config(recipe.model), FAMILIES["driving-semantic"], places)
     truth = opened.valid.sample(0).target_classes
     assert [kind.name for kind in opened.valid.classes] == ["Car", "Road", "Sky", "Void"]

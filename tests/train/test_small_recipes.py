@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 from box_world import STAGE
 from headless import needs_egl
-from tiny_scenes4d import DRIVING_POSES, write_driving, write_kubric
-from typer.testing import CliRunner
+from tiny_scenes4d import CAMERAS, VIEWS, write_driving, write_kubric
+from tiny_world import ran
 
 from gcd_model import load_synthesizer
-from gcd_train.cli.main import app
 from gcd_train.recipe_files import load_recipe, packaged_recipes
 from gcd_train.scenes.scene_writer import write_scene
 from gcd_train.scenes.worlds import SceneFormat
@@ -37,32 +36,25 @@ TINY: dict[str, object] = {
     "unet.batch": 2,
     "log.log_s": 1e-6,
 }
-KUBRIC: dict[str, object] = {"data.cameras": [f"view{number}" for number in range(4)]}
-DRIVING: dict[str, object] = {"data.cameras": list(DRIVING_POSES)}
+KUBRIC: dict[str, object] = {"data.cameras": VIEWS}
+DRIVING: dict[str, object] = {"data.cameras": CAMERAS}
 
 
 @pytest.fixture(scope="module")
 def kubric(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kubric")
-    for number in (0, 1):
-        write_kubric(root, number, frames=7)
-    return root
+    return write_kubric(tmp_path_factory.mktemp("kubric"), 0, 1, frames=7).parent
 
 
 @pytest.fixture(scope="module")
 def driving(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("driving")
-    for number in (0, 1):
-        write_driving(root, number, frames=7)
-    return root
+    return write_driving(tmp_path_factory.mktemp("driving"), 0, 1, frames=7).parent
 
 
 def trained(recipe: str, data: Path, out: Path, changes: dict[str, object]) -> list[dict[str, float]]:
     """Run `gcd-train train --small`; the lines of its metrics about the U-Net."""
     told = [f"--set={key}={json.dumps(value)}" for key, value in (TINY | changes).items()]
-    where = [f"package:{recipe}", f"--data={data}", f"--out={out}", "--small"]
-    result = CliRunner().invoke(app, ["train", *where, *told], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    code, said = ran("train", f"package:{recipe}", f"--data={data}", f"--out={out}", "--small", *told)
+    assert code == 0, said
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     return [line for line in lines if line["stage"] == "unet"]
 
@@ -109,9 +101,7 @@ def test_tabletop_trains_on_exact_pictures(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_lerobot_trains_on_pairs_of_cameras(tmp_path: Path) -> None:
     """A data set of three calibrated cameras, written and read as LeRobot's."""
-    pytest.importorskip("pyarrow", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
-    pytest.importorskip("av", reason="needs the extra `lerobot`: pip install 'gcd-node[lerobot]'")
-    from test_lerobot import _write  # pyright: ignore[reportPrivateUsage]
+    from test_lerobot import _write  # pyright: ignore[reportPrivateUsage]  (is skipped without the extra)
 
     folder = _write(tmp_path / "data", 0, 1, 2)
     require_learned(trained("lerobot", folder, tmp_path / "run", {"data.held_out": 1}))

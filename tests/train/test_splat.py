@@ -313,8 +313,7 @@ def test_black_is_a_hole_in_published_pictures_only(grey: int, published: bool) 
     depth = np.full((48, 72), 5.0, np.float32)
     rgb = np.full((48, 72, 3), 200, np.uint8)
     rgb[18:28, 30:42] = grey
-    view = SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=np.eye(4), lens=SOURCE)
-    made = published_tensor([view], np.eye(4), SOURCE, (66, 44), published=published)
+    made = published_tensor([flat_view(depth, rgb)], HERE, SOURCE, (66, 44), published=published)
     middle = quantised(made, published=published)[19:24, 31:36]
     if grey == 0 and published:
         assert middle.min() > 165  # filled from what is around it; its edges are nearly black
@@ -353,8 +352,7 @@ def test_digits_are_cut_off_in_published_pictures_only() -> None:
     rgb = np.full((48, 72, 3), 100, np.uint8)
     rgb[::2] = 101
     depth = np.full((48, 72), 5.0, np.float32)
-    view = SceneView(rgb=rgb, depth=depth, classes=None, instances=None, world_from_camera=np.eye(4), lens=SOURCE)
     for published in (False, True):
-        made = published_tensor([view], np.eye(4), SOURCE, (64, 43), published=published)
+        made = published_tensor([flat_view(depth, rgb)], HERE, SOURCE, (64, 43), published=published)
         exact = np.floor(made.numpy() * 255 + (0.0 if published else 0.5)).astype(np.uint8)
         np.testing.assert_array_equal(quantised(made, published=published), exact)

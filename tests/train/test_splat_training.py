@@ -10,10 +10,9 @@ from cached_sets import CLIP, PLAN, FakePictures, cached, tiny_encoders
 from driving_plane import PlaneClips
 from test_objective import PRECISION, draws
 from test_start import SEED, given, published, random_batch, starting, write
-from tiny_world import TinyClips, tiny_recipe, trainer
+from tiny_world import TinyClips, ran, tiny_recipe, trainer
 from torch import Tensor
 from torch.testing import assert_close
-from typer.testing import CliRunner
 
 from gcd_model import load_synthesizer
 from gcd_model.conditioning import splat_channels
@@ -22,7 +21,6 @@ from gcd_model.networks import Networks, random_networks
 from gcd_model.weights.adapter import adapted, base_digest
 from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import save_weights
-from gcd_train.cli.main import app
 from gcd_train.data.batches import SampleBatches
 from gcd_train.data.cache import CachedLatents, ClipPlace
 from gcd_train.data.latents import LatentClips
@@ -155,15 +153,14 @@ def test_from_a_recipe_to_figures_which_are_marked_where_depth_is_given(tmp_path
     start = load_recipe("package:study", small=True)
     base = written(tmp_path / "start.safetensors", random_networks(model_config(start.model), seed=0))
 
-    def run(*words: object) -> None:
-        result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-
     changes = (f"--set=model.weights={base}", f"--set=model.splat={splat}")
     where = (f"--data={data}", f"--valid={valid}", f"--out={tmp_path / 'run'}")
-    run("train", "package:study", "--small", *where, *changes)
+    code, said = ran("train", "package:study", "--small", *where, *changes)
+    assert code == 0, said
     weights = tmp_path / "run" / "study-small.safetensors"
     assert load_synthesizer(weights, device="cpu").traits.splat == splat
-    run("evaluate", f"--weights={weights}", "--no-baselines", f"--data={valid}", f"--out={tmp_path / 'report'}")
+    out = f"--out={tmp_path / 'report'}"
+    code, said = ran("evaluate", f"--weights={weights}", "--no-baselines", f"--data={valid}", out)
+    assert code == 0, said
     (record,) = Run.read(tmp_path / "report").records
     assert record.privileged == (splat == "given")

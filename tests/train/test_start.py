@@ -8,10 +8,9 @@ import msgspec
 import pytest
 import torch
 from safetensors.torch import save_file
-from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, noise_batch, saved, trainer
+from tiny_world import FRAMES, HEIGHT, WIDTH, TinyClips, noise_batch, ran, saved, trainer
 from torch import Tensor
 from torch.testing import assert_close
-from typer.testing import CliRunner
 
 from gcd_model.config import SVD_14, ModelConfig
 from gcd_model.networks import Networks, empty_networks, random_networks
@@ -19,7 +18,6 @@ from gcd_model.weights.adapter import adapted, base_digest
 from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import load_adapted, load_weights, read_adapter, save_weights
 from gcd_model.weights.save import gcd_state, write_published
-from gcd_train.cli.main import app
 from gcd_train.errors import RecipeError
 from gcd_train.recipe import LoraRecipe, LossRecipe, ModelRecipe, NoiseRecipe, Recipe
 from gcd_train.recipe_files import load_recipe
@@ -350,9 +348,8 @@ def test_a_run_leaves_the_adapter_apart_and_merged_weights(tmp_path: Path) -> No
     merged = load_weights(out / "mine.safetensors")
     for name, value in merged.networks.state_dict().items():
         assert torch.equal(value, joined.networks.state_dict()[name]), name
-    result = CliRunner().invoke(
-        app, ["lora", "merge", str(base), str(out / "mine-adapter.safetensors"), str(tmp_path / "joined.safetensors")]
-    )
-    assert result.exit_code == 0, result.output
-    again = load_weights(tmp_path / "joined.safetensors").networks.state_dict()
+    adapter, merged_again = out / "mine-adapter.safetensors", tmp_path / "joined.safetensors"
+    code, said = ran("lora", "merge", base, adapter, merged_again)
+    assert code == 0, said
+    again = load_weights(merged_again).networks.state_dict()
     assert all(torch.equal(value, again[name]) for name, value in merged.networks.state_dict().items())

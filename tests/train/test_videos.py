@@ -10,6 +10,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from tiny_scenes4d import edit_json
 from tiny_world import tiny_recipe
 
 from gcd_model.config import ModelConfig
@@ -130,12 +131,7 @@ def test_the_last_scene_is_held_out_and_none_is_on_both_sides(folder: Path, tmp_
 
 
 def edited(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
-    def edit(folder: Path) -> None:
-        content = json.loads((folder / CAMERA_FILE).read_text())
-        change(content)
-        (folder / CAMERA_FILE).write_text(json.dumps(content))
-
-    return edit
+    return lambda folder: edit_json(folder / CAMERA_FILE, change)
 
 
 WRONG: dict[str, tuple[Callable[[Path], object], str]] = {

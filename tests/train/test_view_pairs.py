@@ -1,6 +1,5 @@
 """Training pairs out of scenes in the published layouts: what they show, and what happens to bad data."""
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,14 +10,16 @@ import pytest
 import torch
 from tiny_scenes4d import (
     BOX,
+    CAMERAS,
     COLOURS,
     DRIVING_LENS,
-    DRIVING_POSES,
     GROUND,
     KUBRIC_LENS,
     SKY,
+    VIEWS,
     draw,
     driving_pose,
+    edit_json,
     write_driving,
     write_kubric,
 )
@@ -34,8 +35,6 @@ from gcd_train.data.sample import Sample, collate
 from gcd_train.data.visibility import render_lens
 from gcd_train.errors import DataError, RenderError
 
-VIEWS = tuple(f"view{number}" for number in range(4))
-CAMERAS = tuple(DRIVING_POSES)
 SIZE = (48, 32)
 FRAMES = 6
 CLIP = FrameSampling(clip=4)
@@ -43,18 +42,8 @@ ORBIT, PATH = replace(MAX90, frames=CLIP), replace(DRIVING, frames=CLIP)
 
 
 @pytest.fixture(scope="module")
-def kubric_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kubric")
-    write_kubric(root, 3, frames=FRAMES)
-    return root
-
-
-@pytest.fixture(scope="module")
 def driving_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("driving")
-    write_driving(root, 4, frames=FRAMES)
-    shutil.copytree(root / "scene_000004", root / "scene_000009")
-    return root
+    return write_driving(tmp_path_factory.mktemp("driving"), 4, 9, frames=FRAMES).parent
 
 
 @pytest.fixture
@@ -65,8 +54,8 @@ def two_scenes(driving_root: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def kubric(kubric_root: Path) -> Kubric4D:
-    return Kubric4D(kubric_root, cameras=VIEWS)
+def kubric(tmp_path_factory: pytest.TempPathFactory) -> Kubric4D:
+    return Kubric4D(write_kubric(tmp_path_factory.mktemp("kubric"), 3, frames=FRAMES).parent, cameras=VIEWS)
 
 
 def driving_pairs(root: Path, repeats: int = 400, **options: object) -> ViewPairs:
@@ -134,10 +123,9 @@ def test_classes_come_as_colours_and_as_ids(driving_root: Path) -> None:
 
 def test_no_edge_is_of_a_third_class_whose_colour_lies_between_and_holes_are_of_none(two_scenes: Path) -> None:
     between = [(one + other) // 2 for one, other in zip(COLOURS[BOX], COLOURS[GROUND], strict=True)]
+    rider = {"id": 7, "name": "Rider", "color": dict(zip("rgb", between, strict=True))}
     for path in two_scenes.glob("*/ontology/*.json"):
-        told = json.loads(path.read_text())
-        told["items"] = [{"id": 7, "name": "Rider", "color": dict(zip("rgb", between, strict=True))}, *told["items"]]
-        path.write_text(json.dumps(told))
+        edit_json(path, lambda told: told["items"].insert(0, rider))
     ids = driving_pairs(two_scenes, class_ids=True).sample(1).target_classes
     assert ids is not None
     assert set(np.unique(ids).tolist()) == {BOX, GROUND, SKY, VOID}

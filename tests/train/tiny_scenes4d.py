@@ -1,10 +1,13 @@
 """Tiny scenes in the published layouts, drawn by analytic ray casting and written without our writers."""
 
 import json
+import shutil
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -99,8 +102,25 @@ def kubric_poses(views: int = 4) -> list[NDArray[np.float64]]:
     ]
 
 
-def write_kubric(root: Path, number: int = 0, *, views: int = 4, frames: int = FRAMES) -> Path:
-    """A scene folder as published."""
+def copy_scene(scene: Path, copy: Path) -> Path:
+    """The same scene under another name."""
+    shutil.copytree(scene, copy)
+    for file in copy.glob(f"{scene.name}*"):
+        file.rename(copy / file.name.replace(scene.name, copy.name))
+    return copy
+
+
+def edit_json(path: Path, change: Callable[[Any], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+VIEWS = tuple(f"view{number}" for number in range(4))
+
+
+def write_kubric(root: Path, number: int = 0, *others: int, views: int = 4, frames: int = FRAMES) -> Path:
+    """A scene folder as published, and others of the same scene; the first."""
     scene = root / f"scn{number:05d}"
     lens = KUBRIC_LENS
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
@@ -126,6 +146,8 @@ def write_kubric(root: Path, number: int = 0, *, views: int = 4, frames: int = F
             assert cv2.imwrite(str(folder / f"depth_{time:05d}.tiff"), (drawn.depth * lengths).astype(np.float32))
             ids = np.where(drawn.ids == BOX, 1, 0).astype(np.uint8)
             (folder / f"segmentation_{time:05d}.png").write_bytes(palette_png(ids))
+    for other in others:
+        copy_scene(scene, root / f"scn{other:05d}")
     return scene
 
 
@@ -135,6 +157,7 @@ DRIVING_POSES = {
     "camera0": ((-2.0, -6.0, 5.0), (9.0, 0.0, 0.5)),
 }
 """Position and looked-at point in the vehicle's frame."""
+CAMERAS = tuple(DRIVING_POSES)
 
 
 def driving_pose(camera: str) -> NDArray[np.float64]:
@@ -142,8 +165,8 @@ def driving_pose(camera: str) -> NDArray[np.float64]:
     return look_at(position, target).numpy()
 
 
-def write_driving(root: Path, number: int = 0, *, frames: int = FRAMES, spelling: int = 0) -> Path:
-    """A scene folder as published; spelling 1 has the other names of poses."""
+def write_driving(root: Path, number: int = 0, *others: int, frames: int = FRAMES, spelling: int = 0) -> Path:
+    """As write_kubric; spelling 1 has the other names of poses."""
     scene = root / f"scene_{number:06d}"
     lens = DRIVING_LENS
     for camera in DRIVING_POSES:
@@ -162,6 +185,8 @@ def write_driving(root: Path, number: int = 0, *, frames: int = FRAMES, spelling
     (scene / "calibration" / "a1b2c3.json").write_text(json.dumps(calibration(spelling)))
     (scene / "ontology").mkdir()
     (scene / "ontology" / "d4e5f6.json").write_text(json.dumps(ontology()))
+    for other in others:
+        copy_scene(scene, root / f"scene_{other:06d}")
     return scene
 
 

@@ -1,4 +1,4 @@
-"""Clips, networks and recipes small enough to train in a second."""
+"""Clips, networks and recipes small enough to train in a second, and the command line."""
 
 import json
 from dataclasses import replace
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch import nn
+from typer.testing import CliRunner
 
 from gcd_model import Clip, Traits, View, load_synthesizer
 from gcd_model.config import DRIVING_CLASSES, PLAIN_SMALL, CameraControl, ModelConfig
@@ -25,6 +26,7 @@ from gcd_model.geometry import (
 from gcd_model.networks import random_networks
 from gcd_model.weights.card import FAMILIES, Card
 from gcd_model.weights.load import save_weights
+from gcd_train.cli.main import new_app
 from gcd_train.data.open import RunData
 from gcd_train.data.sample import Clips, Sample, to_network
 from gcd_train.recipe import EmaRecipe, OptimiserRecipe, Recipe, UNetRecipe
@@ -256,6 +258,13 @@ def write_untrained(folder: Path) -> Path:
     card = Card(name="untrained", config=config, family=FAMILIES["driving"], move_time=FRAMES - 1, trained=False)
     save_weights(random_networks(config, seed=0), path, card)
     return path
+
+
+def ran(*words: object) -> tuple[int, str]:
+    """`gcd-train` with these words: its exit code, and on one line all that it prints."""
+    app, line = new_app([str(words[0])]), [str(word) for word in words]
+    made = CliRunner().invoke(app, line, env={"COLUMNS": "240"}, catch_exceptions=False)
+    return made.exit_code, " ".join(made.output.split())
 
 
 def smaller(frames: int, height: int, width: int) -> ModelConfig:

@@ -26,7 +26,7 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.lerobot_augment import Augmentation, AugmentOptions
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
-from gcd_train.data.splits import write_sweep
+from gcd_train.data.splits import SWEPT_FRAMES, write_sweep
 from gcd_train.errors import DataError
 from gcd_train.files import only_writer, remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
@@ -47,9 +47,7 @@ def about() -> None:
 
 @data.command()
 def compact(
-    source: Annotated[
-        Path, typer.Argument(help="Folder with scn00000 or scene_000000 and so on; nothing in it changes.")
-    ],
+    source: Annotated[Path, typer.Argument(help="Folder with scn00000 or scene_000000 and so on; stays as it is.")],
     out: Annotated[Path, typer.Argument(help="Folder for the packed scenes; those that are there are kept.")],
     gaps: Annotated[
         bool, typer.Option("--gaps", help="Pack scenes that lack pictures, too; training passes these over.")
@@ -188,7 +186,11 @@ def sweep(
     `gcd-train evaluate --controls FILE` measures them, `gcd-train figure angles` draws them.
     """
     with errors_shown():
-        names = Kubric4D(scenes).scenes[:limit]
+        data = Kubric4D(scenes)
+        names = data.scenes[:limit]
+        for name in names:
+            if (there := data.frames(name)) < SWEPT_FRAMES:
+                raise DataError(f"{name} has {there} frames, a sweep wants {SWEPT_FRAMES}; leave it out")
         count = write_sweep(out, names, step_deg=step_deg, seed=seed)
     say(f"wrote {out}: {count} clips of each of {len(names)} scenes")
 

@@ -20,9 +20,10 @@ from gcd_train.cli.common import (
     say,
     with_fields_of,
 )
+from gcd_train.data.splits import write_controls
 from gcd_train.errors import DataError, RecipeError, TrainError
 from gcd_train.evaluation.calibration import CalibrationNote, Distances, calibrate, distances, write_calibration
-from gcd_train.evaluation.clips import EvaluationSet
+from gcd_train.evaluation.clips import EvaluationSet, SceneSet
 from gcd_train.evaluation.figures import FigureKind, make_figure
 from gcd_train.evaluation.galleries import KeptViews
 from gcd_train.evaluation.measure import Account, ClipWork, assign_gpus, measure_all
@@ -40,9 +41,7 @@ Workers = Annotated[int, Option(min=1, help="Processes; where there are several 
 
 @with_fields_of(EvaluateOptions)
 def evaluate_command(
-    out: Annotated[
-        Path, Option(help="Folder of the run: run.json, records, tables; one that is there is gone on with.")
-    ],
+    out: Annotated[Path, Option(help="Folder of the run; one that is there is gone on with.")],
     views: Views = "few",
     workers: Workers = 1,
     ray: Ray = None,
@@ -56,6 +55,8 @@ def evaluate_command(
         for line in notes:
             say(line)
         with RunKeeper(out).in_use(run_note(clips, methods, asked, command_line())):
+            if isinstance(clips, SceneSet):
+                write_controls(out / "controls.json", clips.listed())
             work = ClipWork(
                 folder=out.resolve(),
                 clips=clips,

@@ -279,6 +279,8 @@ class EpisodeExport:
         Raises: DataError: there is nothing to export, or no such camera. RecipeError: views of pairs, or not two.
         """
         source, out, layout = source.resolve(), out.resolve(), layout_in(source)
+        if source == out or source in out.parents:
+            raise RecipeError(f"{out} lies in {source}, where nothing is written; choose another OUT")
         if layout is None:
             if views:
                 raise RecipeError(f"{source} holds pairs, which have two cameras each: leave out --view")

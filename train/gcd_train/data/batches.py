@@ -6,7 +6,6 @@ augmentation noise, and targets drawn from their posterior. From latents and a c
 
 import signal
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count as counting
@@ -30,7 +29,7 @@ from gcd_train.parallel import one_thread_each
 from gcd_train.recipe import UNetRecipe
 from gcd_train.recipe_data import LoaderRecipe
 from gcd_train.training.losses import COLOUR_WEIGHTS, class_emphasis
-from gcd_train.training.objective import Batch, drop_streams
+from gcd_train.training.objective import Batch, BatchSource, drop_streams
 from gcd_train.training.setup import Conditioner, Draws, Precision
 
 
@@ -57,18 +56,14 @@ def encode_frames(
     )
 
 
-class Batches(ABC):
-    """Where batches come from. A batch follows from its draws alone."""
+class Batches(BatchSource):
+    """What all batches have in common: what the network is told of their clips."""
 
     def __init__(
         self, config: ModelConfig, recipe: UNetRecipe, precision: Precision, family: Family | None = None
     ) -> None:
         self._config, self._recipe, self._precision = config, recipe, precision
         self._conditioner = Conditioner(config, recipe, precision, family)
-
-    @abstractmethod
-    def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
-        """`count` random clips; or single frames of as many, which encoded clips alone offer."""
 
     def _together(
         self,
@@ -105,7 +100,7 @@ class EncodedBatches(Batches):
         self._clips = clips
 
     def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
-        """See Batches."""
+        """See BatchSource."""
         meta = self._clips.meta
         clips = draws.below(meta.clips, count)
         frames = draws.below(meta.frames, count) if single else torch.arange(meta.frames).repeat(count)
@@ -261,7 +256,7 @@ class SampleBatches(Batches):
         self._networks, self._loader = networks, SampleLoader(samples, seed, loader, turns, recipe.parts)
 
     def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
-        """See Batches. Raises DataError if samples cannot be read or do not fit the model."""
+        """See BatchSource. Raises DataError if samples cannot be read or do not fit the model."""
         assert not single, "the recipe refuses it"
         started, config, recipe = time.perf_counter(), self._config, self._recipe
         loaded, numbers = self._loader.batch(draws.number, count)
@@ -306,7 +301,7 @@ class CachedBatches(Batches):
         self._path: PathKind = path
 
     def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
-        """See Batches."""
+        """See BatchSource."""
         assert not single, "the recipe refuses it"
         started, on_cpu = time.perf_counter(), Draws(int(draws.below(2**31, 1)), "latent cache", 0, torch.device("cpu"))
         places, clips = list[tuple[str, ClipPlace]](), list[EncodedRows]()

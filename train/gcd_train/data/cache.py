@@ -48,6 +48,7 @@ FORMAT = 2
 _INDEX, _MOST_INDEX = "index.json", 1 << 26
 PathKind = Literal["gradual", "direct"]
 _LOWEST, _SPAN, _CODES = -30.0, 50.0, 255
+_KEPT_SHARDS = 8
 Made = TypeVar("Made")
 
 
@@ -292,19 +293,19 @@ class EncodedRows:
 
 
 class CachedLatents:
-    """An opened cache. Every shard's SHA-256 is checked when it is first read; `keep` shards stay in memory."""
+    """An opened cache. Every shard's SHA-256 is checked when it is first read; some shards stay in memory."""
 
-    def __init__(self, folder: Path, index: CacheIndex, keep: int = 8) -> None:
+    def __init__(self, folder: Path, index: CacheIndex) -> None:
         self.folder, self.index = folder, index
-        self._shard = Recent(self._read, keep)
+        self._shard = Recent(self._read, _KEPT_SHARDS)
 
     @classmethod
-    def open(cls, folder: Path | str, keep: int = 8) -> "CachedLatents":
+    def open(cls, folder: Path) -> "CachedLatents":
         """Raises DataError where there is no cache, RunError where its index cannot be read."""
-        index = read_index(Path(folder), CacheIndex)
+        index = read_index(folder, CacheIndex)
         if index is None or not index.scenes:
             raise DataError(f"{folder} holds no cached scene; make them with `gcd-train cache DATA --weights W --out`")
-        return cls(Path(folder), index, keep)
+        return cls(folder, index)
 
     @property
     def scenes(self) -> Sequence[str]:
@@ -312,9 +313,7 @@ class CachedLatents:
         return tuple(self.index.scenes)
 
     def clips(self, scene: str) -> list[ClipPlace]:
-        """The clips of a scene whose frames are all there. Raises DataError for an unknown scene."""
-        if scene not in self.index.scenes:
-            raise DataError(f"{self.folder} has no scene {scene!r}; it has {len(self.scenes)}, first {self.scenes[0]}")
+        """The clips of a scene whose frames are all there."""
         entry = self.index.scenes[scene]
         return self.index.identity.plan.clips(entry.frames, set(entry.times))
 

@@ -123,9 +123,9 @@ class DrivingPictures:
     """
 
     def __init__(self, data: Dataset4D, clip_frames: int, options: PictureOptions) -> None:
-        self.data, self.semantic, self._options = data, options.modality == "classes", options
+        self.data, self._options = data, options
         self.scenes, self.fps = data.scenes, data.fps
-        kind = "classes" if self.semantic else "colour"
+        kind = "classes" if options.modality == "classes" else "colour"
         self.origin = f"parallel-domain-4d, {kind}, {'exact' if options.exact else 'points'}"
         path = driving_trajectory(frames=clip_frames, move_time=clip_frames - 1)
         self._source_from_target, self._pictures = path.source_from_target.numpy(), pictures_of(data, options)
@@ -146,7 +146,7 @@ class DrivingPictures:
         made = self._pictures.sample(scene, draw)
         if not self._options.exact:
             return made
-        view = self.data.views(scene, time, [self.data.source_camera])[0]
+        view = self.data.view(scene, self.data.source_camera, time)
         source = trained_picture(view.rgb, *self._options.size)
         return replace(made, source=np.repeat(source[None], len(made.target), axis=0))
 

@@ -77,7 +77,7 @@ class Compaction:
             written = self._write_views(reader, scene, files)
             packed = self._reader(folder.parent, scene)
             for time, camera in written:
-                (same,), (view,) = packed.views(scene, time, [camera]), reader.views(scene, time, [camera])
+                same, view = packed.view(scene, camera, time), reader.view(scene, camera, time)
                 _require_alike(same, view, f"{camera} at frame {time}", street=not self.orbits)
             if (self.source / scene / MANIFEST).exists():  # a scene of ours, whose files are others now
                 told = read_manifest(self.source / scene)
@@ -86,16 +86,12 @@ class Compaction:
         gaps = frames * len(self.cameras) - len(written)
         return Packed(made=True, written=files.size, gaps=gaps)
 
-    @property
-    def _ahead(self) -> str:
-        """The camera that tells how many frames there are."""
-        forward = parallel_domain4d.FORWARD
-        return forward if forward in self.cameras else self.cameras[0]
-
     def _reader(self, root: Path, scene: str) -> Kubric4D | ParallelDomain4D:
         if self.orbits:
             return Kubric4D(root, [scene], cameras=self.cameras, instances=True)
-        return ParallelDomain4D(root, [scene], cameras=self.cameras, source_camera=self._ahead, instances=True)
+        forward = parallel_domain4d.FORWARD  # it tells how many frames there are, or the first one does
+        ahead = forward if forward in self.cameras else self.cameras[0]
+        return ParallelDomain4D(root, [scene], cameras=self.cameras, source_camera=ahead, instances=True)
 
     def _facts(self, scene: str) -> Iterator[Path]:
         """Files of a scene that are no pictures."""
@@ -111,7 +107,7 @@ class Compaction:
         written, faults = list[tuple[int, str]](), list[FileFault]()
         for time, camera in product(range(reader.frames(scene)), self.cameras):
             try:
-                (view,) = reader.views(scene, time, [camera])
+                view = reader.view(scene, camera, time)
             except FileFault as fault:
                 if fault.path.exists() or not self.gaps:
                     faults.append(fault)

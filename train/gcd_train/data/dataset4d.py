@@ -11,6 +11,7 @@ from typing import Literal, Self
 
 import msgspec
 import numpy as np
+from msgspec.structs import astuple
 from numpy.typing import NDArray
 
 from gcd_model.config import SemanticClass
@@ -42,7 +43,7 @@ class OntologyItem:
 
 @dataclass(frozen=True)
 class Ontology:
-    """Classes by id. Raises DataError for no class, an id twice, or an id or colour outside 0..255."""
+    """Classes by id, 0..255. Raises DataError for no class, an id twice, or a colour outside 0..255."""
 
     items: tuple[OntologyItem, ...]
 
@@ -52,8 +53,6 @@ class Ontology:
             raise DataError("an ontology needs at least one class, got none")
         if len(set(ids)) < len(ids):
             raise DataError(f"an ontology has each id once, got {sorted({i for i in ids if ids.count(i) > 1})} twice")
-        if min(ids) < 0 or max(ids) >= _IDS:
-            raise DataError(f"class ids lie within 0..255, got {min(ids)}..{max(ids)}")
         if not all(0 <= channel <= 255 for item in self.items for channel in item.colour):
             raise DataError("colours lie within 0..255, got others")
         object.__setattr__(self, "items", tuple(sorted(self.items, key=lambda item: item.id)))
@@ -73,12 +72,6 @@ class Ontology:
         for item in self.items:
             groups.setdefault(item.colour, []).append(item.id)
         return tuple(tuple(ids) for ids in groups.values() if len(ids) > 1)
-
-    @property
-    def merged_names(self) -> tuple[str, ...]:
-        """One line for each group of `duplicates`, with the names."""
-        names = {item.id: item.name for item in self.items}
-        return tuple(", ".join(f"{names[i]} ({i})" for i in group) for group in self.duplicates)
 
     @cached_property
     def classes(self) -> tuple[SemanticClass, ...]:
@@ -167,10 +160,8 @@ class _File(msgspec.Struct, frozen=True):
 
 def _parsed(path: Path) -> Ontology:
     try:
-        items = [item for item in decode_json(read(path, MOST_TEXT), _File).items if 0 <= item.id < _IDS]
-        colours = [(item.color.r, item.color.g, item.color.b) for item in items]
-        listed = zip(items, colours, strict=True)
-        return Ontology(tuple(OntologyItem(id=item.id, name=item.name, colour=colour) for item, colour in listed))
+        told = [item for item in decode_json(read(path, MOST_TEXT), _File).items if 0 <= item.id < _IDS]
+        return Ontology(tuple(OntologyItem(id=each.id, name=each.name, colour=astuple(each.color)) for each in told))
     except FileError as error:
         raise FileFault(path, f"is no ontology: it {error}") from error
     except FileFault:

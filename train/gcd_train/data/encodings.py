@@ -132,10 +132,10 @@ def float_tiff(values: Floats) -> bytes:
     return _encoded(".tiff", values, _PLAIN_TIFF)
 
 
-def float_npz(values: Floats, name: str) -> bytes:
-    """[H, W] as an npz with an array of this name, not compressed."""
+def float_npz(values: Floats) -> bytes:
+    """[H, W] as an npz with an array `data`, not compressed."""
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **{name: values})
+    np.savez(file, allow_pickle=False, data=values)
     return file.getvalue()
 
 
@@ -217,17 +217,17 @@ def read_colour(path: Path) -> Bytes:
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
-def read_depth(path: Path, key: str = "data") -> Floats:
-    """Metres, f32 [H, W], of a float TIFF, an npz with array `key`, or a PNG of ours (`DepthCode`).
+def read_depth(path: Path) -> Floats:
+    """Metres, f32 [H, W], of a float TIFF, an npz with an array `data`, or a PNG of ours (`DepthCode`).
 
     0 is kept as "nothing known"; beyond 30 000 m is cut there, as published.
     Raises: FileFault if it is damaged, or holds NaN, negative numbers, or nothing that is known or within those.
     """
     match path.suffix:
         case ".npz":
-            stored = read_npz(path).get(key)
+            stored = read_npz(path).get("data")
             if stored is None:
-                raise FileFault(path, f"lacks its array `{key}`")
+                raise FileFault(path, "lacks its array `data`")
         case ".png":
             stored = _from_codes(path)
         case _:

@@ -154,7 +154,11 @@ def read_set(folder: Path) -> tuple[Info, tuple[EpisodePlace, ...]]:
     """What a data set says of itself, and its episodes by number. Raises DataError: it is none, or has none; FileFault:
     what it says is damaged."""
     info = _read_info(folder)
-    return info, _episodes(folder, info)
+    rows = _episodes_v3 if info.codebase_version.startswith("v3") else _episodes_v2
+    episodes = tuple(sorted(rows(folder, info), key=lambda episode: episode.number))
+    if not episodes:
+        raise DataError(f"{folder} has no episodes; record or export some")
+    return info, episodes
 
 
 def _read_info(folder: Path) -> Info:
@@ -173,15 +177,6 @@ def _read_info(folder: Path) -> Info:
     if not info.fps > 0:
         raise FileFault(path, f"must have frames per second above 0, has {info.fps}")
     return info
-
-
-def _episodes(folder: Path, info: Info) -> tuple[EpisodePlace, ...]:
-    """By number. Raises DataError if there are none, FileFault if their list is damaged."""
-    rows = _episodes_v3 if info.codebase_version.startswith("v3") else _episodes_v2
-    episodes = tuple(sorted(rows(folder, info), key=lambda episode: episode.number))
-    if not episodes:
-        raise DataError(f"{folder} has no episodes; record or export some")
-    return episodes
 
 
 def _episodes_v3(folder: Path, info: Info) -> Iterator[EpisodePlace]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from typer import Option
 
 from gcd_model.geometry import Intrinsics
+from gcd_train.data.encodings import Bytes, Doubles
 from gcd_train.data.lerobot import CAMERA_FILE, CHUNK, CameraCalibration, CameraFile, extra
 from gcd_train.data.videos import FileLens
 from gcd_train.errors import DataError, RecipeError, RunError
@@ -28,8 +29,6 @@ from gcd_train.scenes.tabletop.scene import UNITS_A_METRE, Episode, tabletop_epi
 from gcd_train.scenes.tabletop.simulation import FPS
 from gcd_train.scenes.triangles import freeze
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 WRIST = "wrist"
 _IMAGES = "observation.images."
 _POSE_FEATURE = f"observation.camera_pose.{WRIST}"
@@ -81,8 +80,8 @@ def statistics_of(rows: NDArray[Any], *, colours: bool) -> dict[str, list[Any]]:
 class LeRobotWriter:
     """Writes a data set episode by episode into an empty folder; complete when it is closed.
 
-    robot: its name. fps: of rows and videos. names: what the numbers of a feature are called. crf: quality of H.264,
-    lower is better. Raises DataError without the extra `lerobot`, or if an episode does not fit the others.
+    robot: its name. fps: of rows and videos. names: what the numbers of a feature are called. Raises DataError without
+    the extra `lerobot`, or if an episode does not fit the others.
     """
 
     def __init__(
@@ -93,10 +92,9 @@ class LeRobotWriter:
         robot: str,
         fps: int,
         names: Mapping[str, Sequence[str]],
-        crf: int = 18,
     ) -> None:
         self._folder, self._cameras, self._robot, self._fps, self._names = folder, cameras, robot, fps, names
-        self._arrow, self._parquet, self._av = extra("pyarrow"), extra("pyarrow.parquet"), extra("av")
+        self._arrow, self._parquet = extra("pyarrow"), extra("pyarrow.parquet")
         self._frames, self._tasks = 0, dict[str, int]()
         # Rows [N, C] of every feature, and colours [1, pixels, 3] of some pictures.
         self._seen = dict[str, list[NDArray[Any]]]()
@@ -105,7 +103,7 @@ class LeRobotWriter:
         (folder / "meta").mkdir(parents=True, exist_ok=True)
         for name, camera in cameras.items():
             path = self._place(f"videos/{name}", "mp4")
-            self._videos[name] = new_video(path, camera.width, camera.height, fps, crf)
+            self._videos[name] = new_video(path, camera.width, camera.height, fps)
 
     def add(
         self,
@@ -142,11 +140,8 @@ class LeRobotWriter:
             container.mux(stream.encode())
             container.close()
         pa, tasks = self._arrow, self._tasks
-        for table, room in (
-            (pa.concat_tables(self._tables), "data"),
-            (pa.Table.from_pylist(self._episodes), "meta/episodes"),
-        ):
-            self._parquet.write_table(table, self._place(room, "parquet"))
+        self._parquet.write_table(pa.concat_tables(self._tables), self._place("data", "parquet"))
+        self._parquet.write_table(pa.Table.from_pylist(self._episodes), self._place("meta/episodes", "parquet"))
         columns = [  # of a table whose index is the task's words, as pandas writes it
             {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
             for name, kind, stored in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
@@ -306,7 +301,7 @@ def export_tabletop(out: Path, export: TabletopExport) -> Iterator[int]:
             yield done
 
 
-def _base_from_cameras(names: tuple[str, ...]) -> dict[str, Floats]:
+def _base_from_cameras(names: tuple[str, ...]) -> dict[str, Doubles]:
     """base_from_camera [4, 4] of the cameras that stand still, decimetres."""
     there = orbit_cameras(1)
     unknown = [name for name in names if name not in there and name != WRIST]
@@ -318,7 +313,7 @@ def _base_from_cameras(names: tuple[str, ...]) -> dict[str, Floats]:
     return {name: base_from_world @ there[name][0] for name in names if name != WRIST}
 
 
-def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[str, CameraCalibration]:
+def _calibrations(export: TabletopExport, poses: Mapping[str, Doubles]) -> dict[str, CameraCalibration]:
     lens = Intrinsics.from_hfov(HFOV_DEG, export.width, export.height)
     made: dict[str, CameraCalibration] = {}
     for name in export.names:
@@ -332,8 +327,8 @@ def _calibrations(export: TabletopExport, poses: Mapping[str, Floats]) -> dict[s
 
 
 def _pictures(
-    renderer: Renderer, episode: Episode, poses: Mapping[str, Floats], export: TabletopExport
-) -> Iterator[Mapping[str, NDArray[np.uint8]]]:
+    renderer: Renderer, episode: Episode, poses: Mapping[str, Doubles], export: TabletopExport
+) -> Iterator[Mapping[str, Bytes]]:
     """A picture of every camera, frame by frame."""
     cameras = {name: np.tile(episode.world_from_base @ pose, (export.frames, 1, 1)) for name, pose in poses.items()}
     if WRIST in export.names:
@@ -343,7 +338,7 @@ def _pictures(
         yield {_IMAGES + name: rendering.rgb for _, name, rendering in seen}
 
 
-def _in_metres(poses: Floats) -> Floats:
+def _in_metres(poses: Doubles) -> Doubles:
     scaled = poses.copy()
     scaled[..., :3, 3] /= UNITS_A_METRE
     return scaled

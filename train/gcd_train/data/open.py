@@ -85,10 +85,6 @@ class _Opening:
     def _data(self) -> DataRecipe:
         return self.recipe.data
 
-    @property
-    def _gives_depth(self) -> bool:
-        return self.config.splat == "given"
-
     def pairs(self) -> RunData:
         data, valid = self.folder, self._valid_folder("pairs have no split of their own")
         if self._data.task == "image-to-video":  # both sides of all pairs: the folders need not go the same way
@@ -97,7 +93,8 @@ class _Opening:
                 *({name: world for each in part for name, world in each.scenes.items()} for part in (learned, held))
             )
             return RunData(clips=video_clips(learned), valid=video_clips(held))
-        clips, held_out = (replace(PairedClips.open(place), depth=self._gives_depth) for place in (data, valid))
+        with_depth = self.config.splat == "given"
+        clips, held_out = (replace(PairedClips.open(place), depth=with_depth) for place in (data, valid))
         require_apart(clips.scenes, held_out.scenes)
         for each, folder in ((clips, data), (held_out, valid)):
             goal, reached = self._data.goal_frame(each.frames), each.trajectory(0).at_goal.index(True)
@@ -205,7 +202,7 @@ class _Opening:
             size=(self.config.width, self.config.height),
             modality="classes" if recipe.modality == "semantic" else "rgb",
             class_ids=class_ids,
-            depth=self._gives_depth,
+            depth=self.config.splat == "given",
             exact=recipe.exact,
             published=recipe.published,
             device=_splat_device(recipe),
@@ -317,8 +314,7 @@ def _worlds_of(data: Dataset4D) -> dict[str, str]:
     """Scenes by name, with their world where they are ours."""
     folders = {scene: data.folder(scene) for scene in data.scenes}
     return {
-        scene: str(read_manifest(folder).world) if (folder / MANIFEST).exists() else ""
-        for scene, folder in folders.items()
+        scene: read_manifest(folder).world if (folder / MANIFEST).exists() else "" for scene, folder in folders.items()
     }
 
 

@@ -102,13 +102,9 @@ class PairedClips(Clips):
         """What the first folder says about itself; the others are alike in all but name, seeds and options."""
         return self.worlds[0]
 
-    def world_of(self, index: int) -> World:
-        """The world a clip was taken in."""
-        return self.worlds[self._folder(index)]
-
     def scene(self, index: int) -> tuple[str, int]:
         """World and seed of the scene that a clip was cut from."""
-        world = self.world_of(index)
+        world = self.worlds[self._folder(index)]
         return world.name, world.scene_of(int(self.places[index][1]))
 
     @property

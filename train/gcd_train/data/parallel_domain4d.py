@@ -61,8 +61,6 @@ CAMERAS = (*sorted(f"camera{number}" for number in range(16)), "yaw-0", "yaw-60"
 """The 19 cameras in the published order: 16 around the scene by name, then the vehicle's own."""
 FORWARD = "yaw-0"
 """The camera that looks ahead: the source of every clip."""
-DEPTH_KEY = "data"
-"""Name of the array in a depth npz."""
 _SUFFIXES = {"rgb": "png", "depth": "npz"}
 _COMPACT_SUFFIXES = {"rgb": "webp", "depth": "png"}
 WEBP_QUALITY = 80
@@ -80,9 +78,7 @@ def frame_stem(time: int) -> str:
 
 def frame_time(stem: str) -> int | None:
     """Inverse of `frame_stem`; None if the file is no frame of this layout."""
-    if not re.fullmatch(r"\d{18}", stem) or int(stem) % 10 != 5:
-        return None
-    return int(stem) // 10
+    return int(stem) // 10 if re.fullmatch(r"\d{17}5", stem) else None
 
 
 def frame_path(scene: Path, camera: str, layer: Layer, time: int, *, compact: bool = False) -> Path:
@@ -140,7 +136,8 @@ class ParallelDomain4D(Dataset4D):
         if scenes is None and classes:
             ontology = _first_ontology(root, found)
             if ontology.duplicates:
-                merged = "; ".join(ontology.merged_names)
+                names = {item.id: item.name for item in ontology.items}
+                merged = "; ".join(", ".join(f"{names[i]} ({i})" for i in group) for group in ontology.duplicates)
                 _LOG.warning("%s: classes of one colour are merged in decoding: %s", root, merged)
         self._classes, self._instances, self.ontology = classes, instances, ontology
         self._scene = Recent(self._read_scene, KEPT_SCENES)
@@ -165,7 +162,7 @@ class ParallelDomain4D(Dataset4D):
             for layer in ("rgb", "depth")
         )
         size = (lens.height, lens.width, f"{self.source_camera}'s first picture")
-        rgb, metres = sized(colour, read_colour(colour), *size), sized(depth, read_depth(depth, DEPTH_KEY), *size)
+        rgb, metres = sized(colour, read_colour(colour), *size), sized(depth, read_depth(depth), *size)
         classes = instances = None
         if self._classes:
             classes = self._ids(folder, camera, "semantic_segmentation_2d", time, np.uint8)
@@ -326,7 +323,7 @@ class ParallelDomain4DWriter:
             self._write(camera, "depth", time, encodings.street_depth_png(depth))
         else:
             self._write(camera, "rgb", time, encodings.colour_png(drawn.rgb))
-            self._write(camera, "depth", time, encodings.float_npz(depth, DEPTH_KEY))
+            self._write(camera, "depth", time, encodings.float_npz(depth))
         self._write(camera, "semantic_segmentation_2d", time, id_png(self._class_ids[drawn.classes]))
         self._write(camera, "instance_segmentation_2d", time, id_png(drawn.instances))
 

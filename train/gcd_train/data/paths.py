@@ -72,14 +72,6 @@ class FrameSampling:
     reach_last: bool = False
     reverse: float = 0.0
 
-    def __post_init__(self) -> None:
-        if self.clip < 1 or not self.strides or min(self.strides) < 1:
-            raise RecipeError(f"a clip needs frames and strides from 1 up, got {self.clip} and {self.strides}")
-        if not 0.0 <= self.reverse <= 1.0 or (self.latest_start is not None and self.latest_start < 0):
-            raise RecipeError(
-                f"a probability lies within 0..1 and a start from 0 up, got {self.reverse} and {self.latest_start}"
-            )
-
     def last_start(self, frames: int, stride: int) -> int:
         """Largest first frame number, below 0 if no clip fits: min(frames - ((T - 1) stride + 1) - 1, latest)."""
         last = frames - ((self.clip - 1) * stride + 1) - (0 if self.reach_last else 1)
@@ -170,8 +162,6 @@ class OrbitSampling:
             raise RecipeError(
                 f"elevations lie within -90..90 degrees and radii above 0 m, got {self.elevation_deg}, {self.radius_m}"
             )
-        if min(self.max_azimuth_deg, self.max_elevation_deg, self.max_radius_m) < 0.0:
-            raise RecipeError("largest changes of azimuth, elevation and radius are 0 or more")
 
     def draw(self, rng: np.random.Generator, frames: int, fps: float) -> Draw:
         """A sample. Raises DataError if the scene is too short."""

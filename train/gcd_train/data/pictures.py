@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose
 from gcd_train.data.dataset4d import VOID, Dataset4D
+from gcd_train.data.encodings import Doubles, Number
 from gcd_train.data.files import GEOMETRY, MANIFEST, FileFault, Recent, read_manifest
 from gcd_train.data.paths import Control, Draw, Sampling
 from gcd_train.data.sample import Bytes, DrawnSamples, Sample, SceneView
-from gcd_train.data.splat import Number, splat
+from gcd_train.data.splat import splat
 from gcd_train.data.visibility import depth_visibility, published_tensor, quantised, render_lens, visibility
 from gcd_train.errors import DataError, RenderError
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from gcd_train.scenes.renderer import Renderer, Rendering
     from gcd_train.scenes.triangles import FrozenScene
 
-Doubles = NDArray[np.float64]
 Modality = Literal["rgb", "classes"]
 
 SAME_POSE = 5e-3
@@ -277,8 +277,6 @@ def trained_picture(rgb: Bytes, width: int, height: int) -> Bytes:
     """A camera's picture at the trained size: centre crop to its shape, then bilinear resize, as published."""
     left, top, across, along = center_crop_box(rgb.shape[1], rgb.shape[0], width / height)
     cropped = rgb[top : top + along, left : left + across]
-    if (across, along) == (width, height):
-        return np.ascontiguousarray(cropped)
     return cv2.resize(cropped, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
 
 

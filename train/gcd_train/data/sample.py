@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,11 +17,11 @@ from gcd_model.config import CameraControl, SemanticClass, SplatDepth
 from gcd_model.errors import ModelError
 from gcd_model.geometry import Intrinsics, Spherical, Trajectory, pose_trajectory
 from gcd_model.live.eyes import estimated_depth
+from gcd_train.data.encodings import Bytes
 from gcd_train.data.files import FileFault, Skipped, Skips
 from gcd_train.data.paths import generator
 from gcd_train.errors import DataError, RecipeError, RenderError, TrainError
 
-Bytes: TypeAlias = NDArray[np.uint8]
 _TRIES, _NAMED = 100, 5
 
 

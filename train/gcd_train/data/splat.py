@@ -12,7 +12,7 @@ from pictures: the cost does not depend on how many points there are.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self, TypeVar
+from typing import Self
 
 import numpy as np
 import torch
@@ -21,12 +21,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.data.sample import Bytes, SceneView
+from gcd_train.data.encodings import Bytes, Doubles, Floats, Number
+from gcd_train.data.sample import SceneView
 
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 Labels = NDArray[np.uint8] | NDArray[np.uint16]
-Number = TypeVar("Number", bound=np.generic)
 
 NEAREST_M, FARTHEST_M = 0.1, 30_000.0
 """What is not beyond the one in front of the target camera is left out; a source depth beyond the other is unknown."""

@@ -174,7 +174,7 @@ def public_split(name: str) -> PublicSplit:
     return every[name]
 
 
-class _Entry(msgspec.Struct, frozen=True):
+class _Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     """Others' file: what else stands in it only informs."""
 
     frame_start: Annotated[int, msgspec.Meta(ge=0)]
@@ -222,6 +222,8 @@ def _camera(numbers: tuple[float, float, float] | None) -> Spherical | None:
 
 
 _SWEPT_ELEVATION_DEG, _SWEPT_RADIUS_M = 10.0, 15.0
+SWEPT_FRAMES = 27
+"""Frames that a scene of a sweep has at least: 14, every second one."""
 
 
 def write_sweep(path: Path, scenes: Sequence[str], *, step_deg: float, seed: int = 0) -> int:
@@ -232,20 +234,36 @@ def write_sweep(path: Path, scenes: Sequence[str], *, step_deg: float, seed: int
     Source: Van Hoorick et al. 2024 (GCD), appendix B.2.
     """
     turns = np.append(np.arange(0.0, 180.0, step_deg), 180.0)
-    listed: dict[str, dict[str, _Entry]] = {}
+    listed: dict[str, tuple[Control, ...]] = {}
     for scene in scenes:
         azimuth_deg = float(generator(seed, scene_number(scene)).uniform(0.0, 360.0))
-        listed[scene] = {
-            f"sample_{place:02d}": _Entry(
+        start = Spherical(azimuth_deg=azimuth_deg, elevation_deg=_SWEPT_ELEVATION_DEG, radius_m=_SWEPT_RADIUS_M)
+        listed[scene] = tuple(
+            Control(
+                name=f"sample_{place:02d}",
                 frame_start=_RELEASED_START,
                 frame_skip=_RELEASED_SKIP,
-                spherical_start=(azimuth_deg, _SWEPT_ELEVATION_DEG, _SWEPT_RADIUS_M),
-                spherical_end=(azimuth_deg + turn, _SWEPT_ELEVATION_DEG, _SWEPT_RADIUS_M),
+                start=start,
+                goal=replace(start, azimuth_deg=azimuth_deg + turn),
             )
             for place, turn in enumerate(turns.tolist())
-        }
-    write_whole(path, msgspec.json.format(msgspec.json.encode(listed)))
+        )
+    write_controls(path, listed)
     return len(turns)
+
+
+def write_controls(path: Path, controls: Controls) -> None:
+    """What `read_controls` reads. Raises OSError."""
+
+    def numbers(camera: Spherical | None) -> tuple[float, float, float] | None:
+        return None if camera is None else (camera.azimuth_deg, camera.elevation_deg, camera.radius_m)
+
+    def entry(each: Control) -> _Entry:
+        where = numbers(each.start), numbers(each.goal)
+        return _Entry(each.frame_start, each.frame_skip, spherical_start=where[0], spherical_end=where[1])
+
+    listed = {scene: {each.name: entry(each) for each in samples} for scene, samples in controls.items()}
+    write_whole(path, msgspec.json.format(msgspec.json.encode(listed)))
 
 
 PAPER_ELEVATION_DEG = 5.0

@@ -20,20 +20,19 @@ import msgspec
 import numpy as np
 import torch
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from gcd_model.errors import FileError, ModelError
 from gcd_model.geometry import Intrinsics, center_crop_box, relative_pose, require_rigid
 from gcd_model.small_files import read_json
+from gcd_train.data.encodings import Bytes, Doubles
 from gcd_train.data.files import MOST_PICTURE, FileFault
 from gcd_train.data.pictures import trained_lens
-from gcd_train.data.sample import Bytes, DrawnSamples, Sample
+from gcd_train.data.sample import DrawnSamples, Sample
 from gcd_train.errors import DataError, RecipeError
 
 CAMERA_FILE = "cameras.json"
 _RATE_TOLERANCE = 0.01
 _EARLY_S = 0.5
-Doubles = NDArray[np.float64]
 
 
 class FileLens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gcd_model.geometry import Intrinsics
-from gcd_train.data.sample import Bytes, SceneView
-from gcd_train.data.splat import Doubles, Floats, PixelMap, splat
+from gcd_train.data.encodings import Bytes, Doubles, Floats
+from gcd_train.data.sample import SceneView
+from gcd_train.data.splat import NEAREST_M, PixelMap, splat
 
 OVERSIZE = 1.09375
 """Drawn at 420 x 280 for 384 x 256."""
@@ -21,7 +22,6 @@ _BLACK = 1e-7
 WIDE, NARROW = (21, 5.25), (3, 0.75)
 """How holes are filled in pictures to train on, and in those that tell what is visible: pixels, odd, and sigma."""
 _BLUR_SIGMA = 0.6
-_NEAREST_M = 0.1  # in front of the source camera
 _TOLERANCE = 0.02  # share of the depth by which two surfaces that are the same may differ
 
 
@@ -147,7 +147,7 @@ def depth_visibility(
     pixels = PixelMap.between(world_from_camera, lens, source.world_from_camera, source.lens, 0.5)
     rays = pixels.across[None] + pixels.along[:, None]  # [H, W, 3]
     x, y, ahead = np.moveaxis(target_depth[..., None] * rays + pixels.offset, -1, 0)
-    met = (target_depth > 0.0) & (ahead > _NEAREST_M)
+    met = (target_depth > 0.0) & (ahead > NEAREST_M)
     column = x / np.where(met, ahead, 1.0) + source.lens.cx
     row = y / np.where(met, ahead, 1.0) + source.lens.cy
     met &= (column >= 0) & (column < source.lens.width) & (row >= 0) & (row < source.lens.height)

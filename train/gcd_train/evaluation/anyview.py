@@ -25,7 +25,7 @@ from gcd_train.evaluation.paper import PICTURE_COLUMNS
 from gcd_train.evaluation.predictors import CameraPair, SourceClip
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords
 from gcd_train.evaluation.statistics import Interval
-from gcd_train.evaluation.tables import NO_WEIGHTS, NOTHING, Cell, Row, Table
+from gcd_train.evaluation.tables import NO_WEIGHTS, NOTHING, Cell, Row, Table, counted
 
 LONGEST, STEP = 41, 4
 """Frames of the longest clip of the benchmark; all have 1 + 4 k."""
@@ -55,12 +55,13 @@ class EpisodeSet(EvaluationSet):
     """Episodes by name: `droid_OOD_LR.EPISODE`, the split and the folder.
 
     episodes: and of each how many frames are measured, the first ones. frames, height, width: of the longest and the
-    largest; they differ. groups: names of the clips of each split by group; none of a split that was left out. pair:
-    input and target camera.
+    largest; they differ. groups: names of the clips of each split by group; none of a split that was left out.
+    splits: how many episodes each has. pair: input and target camera.
     """
 
     episodes: Mapping[str, tuple[Episode, int]]
     groups: dict[str, dict[str, tuple[str, ...]]]
+    splits: dict[str, int]
     pair: tuple[str, str]
 
     @classmethod
@@ -113,6 +114,7 @@ class EpisodeSet(EvaluationSet):
         made = cls(
             episodes=episodes,
             groups=kept,
+            splits={name: len(each) for name, each in found.items()},
             pair=pair or (SOURCE, TARGET),
             frames=max(length for _, length in episodes.values()),
             height=max(height for height, _ in sizes),
@@ -191,13 +193,16 @@ def benchmark_table(of: EvaluatedSet) -> Table:
     for group, splits in groups.items():
         places += [(group, {group: splits}), *((f"{group}: {s}", {group: {s: keys}}) for s, keys in splits.items())]
     rows = [_row(method, label, part) for label, part in places for method in of.methods]
-    out = [split for splits in of.note.groups.values() for split, keys in splits.items() if not keys]
+    kept = {name: len(keys) for splits in of.note.groups.values() for name, keys in splits.items()}
+    every = {name: of.note.splits.get(name, count) for name, count in kept.items()}
+    lacking = [name for name, count in kept.items() if count < max(1, every[name])]
+    out = [f"{name} ({every[name] - kept[name]} of {every[name]})" for name in lacking]
     lengths = ", ".join(map(str, sorted({record.frames for each in of.methods for record in each.records})))
-    means = f"Unweighted means over frames, episodes, splits, {len(groups)} groups"
+    means = f"Unweighted means over frames, episodes, splits, {counted(len(groups), 'group')}"
     notes = [f"{means}: of all, or not known; black targets do not count. Clips of {lengths} frames."]
     parts = [each.name for each in of.methods if any(record.crop is not None for record in each.records)]
     notes += [f"†, a part of each frame alone, which is not the protocol's: {', '.join(parts)}."] if parts else []
-    notes += [f"Left out, without pixels or not there: {', '.join(out)}."] if out else []
+    notes += [f"Episodes left out, without pixels, not there or beyond --limit: {', '.join(out)}."] if out else []
     title = "Means over groups, of a group and of a split"
     return Table(name="anyviewbench", title=title, headings=_HEADINGS, rows=tuple(rows), notes=tuple(notes))
 

@@ -5,6 +5,7 @@ import zipfile
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from gcd_model.geometry import CameraMount, pose_trajectory, sphere_poses, to_po
 from gcd_train.data.dataset4d import Dataset4D, Ontology
 from gcd_train.data.files import ZIP_FAULTS
 from gcd_train.data.pairs import PairedClip, PairedClips
+from gcd_train.data.paths import Control, Controls
 from gcd_train.data.pictures import SAME_POSE, ViewPairs, nearest_resized, trained_lens, trained_picture
 from gcd_train.data.sample import Bytes, Sample, SceneView
 from gcd_train.data.splat import Number, splat
@@ -249,6 +251,15 @@ class SceneSet(EvaluationSet):
     def keys(self) -> tuple[str, ...]:
         """See EvaluationSet; scene by scene."""
         return tuple(self._places)
+
+    def listed(self) -> Controls:
+        """Frames and cameras of all clips, but for those of scenes that cannot be read."""
+        found = dict[str, tuple[Control, ...]]()
+        for scene, name in self._places.values():
+            with suppress(DataError):
+                control = self.controls.control(scene, name, self.dataset.frames(scene))
+                found[scene] = (*found.get(scene, ()), control)
+        return found
 
     def clip(self, key: str, /) -> HeldOutClip:
         """See EvaluationSet. Every picture is made anew from the scene's files."""

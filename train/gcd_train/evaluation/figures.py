@@ -12,10 +12,12 @@ import numpy as np
 
 from gcd_train.errors import RunError
 from gcd_train.evaluation.galleries import Pictures, Strip, beside, shown_clips, stacked_sheet, strips
+from gcd_train.evaluation.metrics import EQUAL_DB
 from gcd_train.evaluation.paper import is_model
 from gcd_train.evaluation.runs import EvaluatedSet, MethodRecords, gather, on_the_same_goals
 from gcd_train.evaluation.statistics import Interval
 from gcd_train.evaluation.store import Region, Run
+from gcd_train.evaluation.tables import counted
 from gcd_train.files import write_whole
 from gcd_train.pictures import new_figure, png, require_matplotlib, save
 
@@ -53,10 +55,10 @@ def make_figure(
         return
     shown = [of for of in each if of.methods]
     if len(shown) != 1 or (kind == "failures" and len(shown[0].methods) != 1):
-        wanted = "models" if kind == "ablation" else "one model, named with --method,"
+        wanted = "models, or named with --method," if kind == "ablation" else "one model, or named with --method,"
         raise RunError(
-            f"a figure of {kind} is of {wanted} on one set of clips; these runs hold {len(sets)} sets, and "
-            f"{', '.join(known)}"
+            f"a figure of {kind} is of {wanted} on one set of clips; these runs hold "
+            f"{counted(len(sets), 'set')}, and {', '.join(known)}"
         )
     (of,) = shown
     keys = _worst(of.methods[0])[:clips] if kind == "failures" else _shown_by_all(of, clips)
@@ -117,7 +119,6 @@ def _told(of: EvaluatedSet, key: str) -> list[Strip]:
 
 
 ANGLE_STEP_DEG = 15.0
-_MOST_ANGLES = 20  # so many different ones are shown as they are
 _BY_VIEWS = re.compile(r"(hexplane|4dgs)[ _-]?(\d+)", re.IGNORECASE)
 _LABELS = {"hexplane": "HexPlane", "4dgs": "4D-GS"}
 
@@ -158,10 +159,10 @@ def error_by_angle(of: EvaluatedSet) -> Plot:
     for method in methods:
         records = [each for each in method.records if each.key in common]
         turned = {each.key: abs(each.change[0]) for each in records if each.change is not None}
-        many, groups = len({round(angle, 1) for angle in turned.values()}) > _MOST_ANGLES, dict[float, list[str]]()
-        for key, angle in turned.items():  # as it is or, where many differ, in the middle of its step
+        drawn, groups = any(abs(angle - round(angle)) > 0.01 for angle in turned.values()), dict[float, list[str]]()
+        for key, angle in turned.items():  # as it is listed or, where it was drawn, in the middle of its step
             middle = (min(angle, 179.999) // ANGLE_STEP_DEG + 0.5) * ANGLE_STEP_DEG
-            groups.setdefault(middle if many else round(angle, 1), []).append(key)
+            groups.setdefault(middle if drawn else float(round(angle)), []).append(key)
         points = [
             Point(x=x, y=method.sums("last", keys=keys).interval("psnr_db"), clips=len(keys))
             for x, keys in sorted(groups.items())
@@ -224,7 +225,12 @@ def draw(plot: Plot, out: Path) -> None:
         yerr, mark = np.nan_to_num(bounds).clip(0.0).T, _MARKS[number % len(_MARKS)]
         style: dict[str, Any] = {"marker": mark, "color": colour, "markersize": 4, "linewidth": 1.2}
         axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=name, **style)
-    axes.set_title(plot.title, fontsize=10, loc="left")
+    heights, title = [point.y.value for curve in plot.curves.values() for point in curve], plot.title
+    shown = [height for height in heights if height < EQUAL_DB - 1e-3]
+    if 0 < len(shown) < len(heights):  # beside 100 dB all others would lie on one line
+        axes.set_ylim(min(shown) - 2.0, max(shown) + 2.0)
+        title = f"{title} (equal frames, {EQUAL_DB:g} dB, lie above)"
+    axes.set_title(title, fontsize=10, loc="left")
     places = sorted({point.x for curve in plot.curves.values() for point in curve if not isnan(point.x)})
     axes.set(xlabel=plot.across, ylabel=plot.up, xticks=places, xlim=(places[0] - 1, places[-1] + 1))
     axes.grid(alpha=0.25)

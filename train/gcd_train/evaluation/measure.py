@@ -7,14 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 import torch
 from torch import Tensor
 
 from gcd_model.config import SemanticClass
-from gcd_model.errors import ModelError, NonFiniteError, ShapeError
+from gcd_model.errors import ModelError, NonFiniteError, ShapeError, ViewRangeError
 from gcd_train.errors import DataError, RunError, TrainError
 from gcd_train.evaluation import metrics
 from gcd_train.evaluation.clips import EvaluationSet, HeldOutClip
@@ -178,6 +178,13 @@ ClipItem: TypeAlias = tuple[str, tuple[str, ...]]
 """A clip's key, and the methods that have no record of it yet, or not the frames that are to be kept."""
 
 
+class Fault(NamedTuple):
+    """Why a method has no record of a clip. is_refusal: the model takes other views, but not this one."""
+
+    why: str
+    is_refusal: bool
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClipWork:
     """Measures methods on one clip, keeps the records, and says which failed and why; goes to other processes whole.
@@ -191,11 +198,11 @@ class ClipWork:
     lpips: Path | None = None
     views: KeptViews = "none"
 
-    def __call__(self, item: ClipItem) -> dict[str, str]:
+    def __call__(self, item: ClipItem) -> dict[str, Fault]:
         """Raises: DataError where the clip cannot be read, RunError where nothing can be written."""
         key, methods = item
         clip, keeper, views = self.clips.clip(key), RunKeeper(self.folder), self._views(key)
-        classes, painted, failed = self.clips.classes, self.clips.painted, dict[str, str]()
+        classes, painted, failed = self.clips.classes, self.clips.painted, dict[str, Fault]()
         lpips = None if self.lpips is None else _opened_lpips(self.lpips)
         for name in methods:
             try:
@@ -207,7 +214,7 @@ class ClipWork:
             except RunError:
                 raise
             except (TrainError, ModelError) as error:
-                failed[name] = str(error)
+                failed[name] = Fault(str(error), isinstance(error, ViewRangeError))
         return failed
 
     def missing(self) -> list[ClipItem]:
@@ -258,7 +265,7 @@ class Account:
         """Whether too many clips in a row had no record."""
         return self._in_a_row >= GIVE_UP_AFTER
 
-    def add(self, outcome: Outcome[ClipItem, dict[str, str]]) -> None:
+    def add(self, outcome: Outcome[ClipItem, dict[str, Fault]]) -> None:
         """Count one clip. Raises RunError where nothing can be written."""
         self._tried += 1
         key, methods = outcome.item
@@ -267,12 +274,15 @@ class Account:
         except TrainError as error:
             if type(error) is RunError:  # and not an item's own
                 raise
-            faults, useful = {key: str(error)}, False
+            self.failures[key] = str(error)
+            self._in_a_row += 1
+            return
+        self.failures |= {f"{key}, {name}": each.why for name, each in failed.items()}
+        if len(failed) < len(methods):
+            self.measured += 1
+            self._in_a_row = 0
         else:
-            faults, useful = {f"{key}, {name}": why for name, why in failed.items()}, len(failed) < len(methods)
-        self.measured += useful
-        self.failures |= faults
-        self._in_a_row = self._in_a_row + 1 if faults and not useful else 0
+            self._in_a_row += not all(each.is_refusal for each in failed.values())
 
     def lines(self) -> list[str]:
         """What to tell at the end: a summary, and one line for each failure."""

@@ -42,7 +42,6 @@ from gcd_train.evaluation.predictors import (
 )
 from gcd_train.evaluation.store import LPIPS, RunNote
 from gcd_train.evaluation.synthesized import VANILLA_SVD, SynthesizedViews, VanillaSVD
-from gcd_train.evaluation.tables import counted
 from gcd_train.evaluation.zeronvs import ETA, GUIDANCE, STEPS, ZERONVS, ZeroNVS, best_scale, open_zeronvs
 
 
@@ -51,20 +50,12 @@ class EvaluateOptions(ClipOptions):
     """What is asked of `gcd-train evaluate`: one field for each of its options. None: left out."""
 
     weights: Annotated[list[str] | None, Option(help="package:NAME or a path; without, baselines alone.")] = None
-    steps: Annotated[
-        list[int] | None, Option(min=1, help="Also with so many steps of the sampler; may be repeated.")
-    ] = None
-    samples: Annotated[
-        int | None, Option(min=1, help="Draws of each view; by default 1 of pairs, else by the protocol.")
-    ] = None
-    guidance: Annotated[
-        tuple[float, float] | None, Option(help="Of the first and the last frame; by default as shipped.")
-    ] = None
+    steps: Annotated[list[int] | None, Option(min=1, help="Also with so many steps; may be repeated.")] = None
+    samples: Annotated[int | None, Option(min=1, help="Draws of each view; as the protocol, of pairs 1.")] = None
+    guidance: Annotated[tuple[float, float] | None, Option(help="Of first and last frame; as shipped.")] = None
     solver: Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")] = None
     baselines: Annotated[bool, Option(help="Also measure what has to be beaten.")] = True
-    methods: Annotated[
-        list[str] | None, Option(help="These baselines, with commas between; by default the usual ones.")
-    ] = None
+    methods: Annotated[list[str] | None, Option(help="These baselines, with commas between.")] = None
     svd: Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")] = None
     zeronvs: Annotated[str | None, Option(help="Weights for zeronvs: zeronvs.ckpt.")] = None
     zeronvs_scale: Annotated[
@@ -135,12 +126,8 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
             raise RecipeError(
                 f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
             )
-    beside = ((each, each.beside(clips.keys)) for each in methods if isinstance(each, SavedFrames))
-    notes += tuple(
-        f"{each.folder} holds frames of {counted(len(names), 'clip')} outside the set, not measured, first {names[0]}"
-        for each, names in beside
-        if names
-    )
+    saved = (each for each in methods if isinstance(each, SavedFrames))
+    notes += tuple(line for each in saved for line in each.oddities(clips.keys))
     return clips, tuple(methods), notes
 
 
@@ -195,8 +182,10 @@ def run_note(clips: EvaluationSet, methods: Sequence[Predictor], options: Evalua
         height=clips.height,
         width=clips.width,
         seed=options.seed,
+        clips=len(clips.keys),
         classes=tuple(each.name for each in clips.classes),
         groups=clips.groups if isinstance(clips, EpisodeSet) else {},
+        splits=clips.splits if isinstance(clips, EpisodeSet) else {},
         methods={method.name: {**method.details, **lpips} for method in methods},
     )
 

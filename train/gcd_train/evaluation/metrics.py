@@ -21,7 +21,9 @@ NO_CLASS = 255
 """Id of pixels that belong to no class, unless an ontology has 256: not counted in targets, wrong in predictions."""
 
 _VOID_NAMES = frozenset({"void", "unlabelled", "unlabeled"})
-_SMALLEST_ERROR = 1e-10  # equal pictures score 100 dB, so that means stay finite
+EQUAL_DB = 100.0
+"""What equal pictures score, so that means stay finite."""
+_SMALLEST_ERROR = 10 ** (-EQUAL_DB / 10)
 _WINDOW, _BORDER = 7, 3  # pixels
 _SAMPLE = _WINDOW**2 / (_WINDOW**2 - 1)
 _C1, _C2 = 0.01**2, 0.03**2

@@ -11,6 +11,7 @@ AnyViewBench: the first frames of each episode, at its own grid; see `anyview`.
 import hashlib
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias, get_args
@@ -73,33 +74,21 @@ class ClipOptions:
     data: Annotated[
         list[Path], Option(help="Folder of pairs (several may be given), one of whole scenes, or AnyViewBench.")
     ]
-    protocol: Annotated[ProtocolName, Option(help="How clips are cut from whole scenes, or from AnyViewBench.")] = (
-        "paper"
-    )
+    protocol: Annotated[ProtocolName, Option(help="How clips are cut from scenes, or from AnyViewBench.")] = "paper"
     frames: Annotated[
         int | None, Option(min=3, help="AnyViewBench: of each clip; by default as the weights, else 1 + 4 k up to 41.")
     ] = None
     controls: Annotated[Path | None, Option(help="Scenes: control list, JSON.")] = None
     split: Annotated[str | None, Option(help="Only scenes of a split: a name as driving-test, or FILE:test.")] = None
     listed: Annotated[Path | None, Option("--list", help="Scenes: only those of a list, one a line.")] = None
-    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes; of AnyViewBench of a split.")] = (
-        None
-    )
-    trajectories: Annotated[
-        int | None, Option(min=1, help="Scenes: clips of each; by default 4 (paper, Kubric-4D) or 1.")
-    ] = None
+    limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes, or episodes of a split.")] = None
+    trajectories: Annotated[int | None, Option(min=1, help="Scenes: clips of each; as the protocol by default.")] = None
     frame_start: Annotated[int | None, Option(min=0, help="Scenes: first frame of every clip.")] = None
     frame_skip: Annotated[int | None, Option(min=1, help="Scenes: frames from one of the clip to the next.")] = None
-    angles: Annotated[
-        Literal["max90", "max180"] | None, Option(help="Scenes: how far goals are drawn; by default max90.")
-    ] = None
+    angles: Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: reach of drawn goals; max90.")] = None
     path: Annotated[Literal["gradual", "direct"] | None, Option(help="Scenes: as the weights by default.")] = None
-    modality: Annotated[
-        Literal["rgb", "semantic"] | None, Option(help="Scenes: targets; as the weights by default.")
-    ] = None
-    exact: Annotated[
-        bool, Option("--exact", help="Our scenes: targets from their geometry instead of from points.")
-    ] = False
+    modality: Annotated[Literal["rgb", "semantic"] | None, Option(help="Scenes: as the weights by default.")] = None
+    exact: Annotated[bool, Option("--exact", help="Our scenes: targets from geometry instead of points.")] = False
     camera: Annotated[
         list[str] | None,
         Option(help="Scenes: a camera to read; may be repeated. By default all. Episodes: the input, then the target."),
@@ -272,7 +261,12 @@ def _open_scenes(
         painted=painted,
         cameras=len(data.cameras) + (FURTHER_CAMERAS if orbits and options.exact else 0),
     )
-    return clips, tuple(notes.lines())
+    told = notes.lines()
+    with suppress(DataError):  # told when it is measured
+        if (own := data.lens(scenes[0])).width < size[2] and not options.exact:
+            of = f"{folder} has pictures of {own.width} x {own.height}, measured at {size[2]} x {size[1]}"
+            told.append(f"{of}: targets made of so few points have holes; give larger ones, or --exact for our scenes")
+    return clips, tuple(told)
 
 
 def _controls(options: ClipOptions, scenes: Sequence[str], sampling: Sampling) -> SceneControls:

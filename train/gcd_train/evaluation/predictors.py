@@ -2,7 +2,9 @@
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -253,33 +255,41 @@ def find_draws(folder: Path, key: str) -> list[Path]:
 
 
 def _released(folder: Path, key: str) -> list[Path]:
-    """Outputs of the paper's script for the clip of this name; without a number they are the first trajectory's."""
-    scene, _, sample = key.partition(".")
-    wanted = re.search(r"\d+$", sample)
+    """Outputs of the paper's script for the clip of this name."""
     by_prefix: dict[str, dict[int, Path]] = {}
     for path, named in _draws_in(folder, _RELEASED):
-        of = re.search(rf"(?:_c(\d+))?_{re.escape(scene)}_fs", named[1])
-        if of is not None and int(of[1] or 0) == (int(wanted[0]) if wanted else 0):
+        if _shows(named[1], key):
             by_prefix.setdefault(named[1], {})[int(named[2])] = path
     if len(by_prefix) > 1:
         raise DataError(f"{folder} holds clip {key} several times: {', '.join(sorted(by_prefix))}; keep one")
     return [draw for draws in by_prefix.values() for draw in _numbered(draws, folder)]
 
 
+def _shows(prefix: str, key: str) -> bool:
+    """Whether the paper's script names this clip so; without a number it is the scene's first trajectory."""
+    scene, _, sample = key.partition(".")
+    head, of_scene, _ = prefix.partition(f"_{scene}_fs")
+    number, wanted = re.search(r"_c(\d+)$", head), re.search(r"\d+$", sample)
+    return bool(of_scene) and int(number[1] if number else 0) == int(wanted[0] if wanted else 0)
+
+
 def _numbered(draws: Mapping[int, Path], place: Path) -> list[Path]:
-    """In order. Raises DataError unless all are there."""
+    """In order. Raises DataError unless all are there and hold something."""
     numbers = sorted(draws)
     if numbers and (numbers[0] > 1 or numbers[-1] - numbers[0] >= len(numbers)):
         raise DataError(f"{place} holds draws {numbers}, one is missing; number them from 0")
+    for path in draws.values():
+        if not _is_draw(path):
+            raise DataError(f"{path} holds no frames; make them anew, or take the folder away")
     return [draws[number] for number in numbers]
 
 
 def _draws_in(folder: Path, names: re.Pattern[str]) -> Iterator[tuple[Path, re.Match[str]]]:
-    """What a folder holds under such names, folders after videos, so that of one name they count; none without it."""
+    """What a folder holds under such names, folders after videos, so that of one name they count, empty ones too."""
     each = sorted(folder.iterdir(), key=lambda path: (path.is_dir(), path.name)) if folder.is_dir() else []
     for path in each:
         named = names.fullmatch(path.stem if path.suffix == _VIDEO else path.name)
-        if named and _is_draw(path):
+        if named and (path.is_dir() or _is_draw(path)):
             yield path, named
 
 
@@ -288,7 +298,7 @@ def _is_draw(path: Path) -> bool:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if path.suffix in _PICTURES and path.stem.isdecimal()]
+    return [path for path in folder.iterdir() if path.suffix.lower() in _PICTURES and path.stem.isdecimal()]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -307,13 +317,13 @@ class SavedFrames:
 
     @property
     def details(self) -> dict[str, str]:
-        """See Predictor; with a digest of all names and contents, as frames that are made anew are another method.
+        """See Predictor; with a digest of all pictures and videos, as frames that are made anew are another method.
 
         Raises: DataError where they cannot be read.
         """
         digest = hashlib.sha256()
         try:
-            for path in sorted(each for each in self.folder.rglob("*") if each.is_file()):
+            for path in sorted(each for each in self.folder.rglob("*") if each.suffix.lower() in (*_PICTURES, _VIDEO)):
                 with path.open("rb") as file:
                     content = hashlib.file_digest(file, "sha256").hexdigest()
                 digest.update(f"{path.relative_to(self.folder)} {content}\n".encode())
@@ -322,14 +332,23 @@ class SavedFrames:
         more = {"privileged": "yes"} if self.privileged else {}
         return {FRAMES_IN: str(self.folder), "digest": digest.hexdigest()[:12], **more}
 
-    def beside(self, keys: Collection[str]) -> list[str]:
-        """Names of clips that lie in the folder and are not among these; outputs of the paper's script aside."""
-        named = {path.stem if path.suffix == _VIDEO else path.name: path for path in self.folder.iterdir()}
-        return sorted(
-            name
-            for name, path in named.items()
-            if name not in keys and not _RELEASED.fullmatch(name) and (_is_draw(path) or any(_draws_in(path, _SAMPLE)))
-        )
+    def oddities(self, keys: Collection[str]) -> Iterator[str]:
+        """What a person may not know of the folder, line by line, given the clips of the set."""
+        outside, draws, extra = set[str](), Counter[int](), self.folder / "extra"
+        for path in (*self.folder.iterdir(), *(extra.iterdir() if extra.is_dir() else ())):
+            name = path.stem if path.suffix == _VIDEO else path.name
+            if (released := _RELEASED.fullmatch(name)) is not None:
+                outside |= set() if any(_shows(released[1], key) for key in keys) else {name}
+            elif name not in keys and (any(map(_is_draw, (path, path / "frames"))) or any(_draws_in(path, _SAMPLE))):
+                outside.add(name)
+        if outside:
+            yield f"{self.folder} holds frames that are of no clip of the set: {len(outside)}, first {min(outside)}"
+        for key in keys:
+            with suppress(DataError):  # told when it is measured
+                draws[len(find_draws(self.folder, key))] += 1
+        if len(draws) > 1:
+            told = ", ".join(f"{number} of {clips} clips" for number, clips in sorted(draws.items()))
+            yield f"{self.folder} does not hold as many draws of every clip: {told}"
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor; each sample that was saved is a draw.

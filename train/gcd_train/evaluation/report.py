@@ -13,7 +13,7 @@ from gcd_train.evaluation.galleries import shown_clips, strips, write_sheet, wri
 from gcd_train.evaluation.paper import is_model
 from gcd_train.evaluation.runs import EvaluatedSet, gather, on_the_same_goals
 from gcd_train.evaluation.statistics import FEW_SCENES, SEED, Span
-from gcd_train.evaluation.store import Run, folder_name
+from gcd_train.evaluation.store import FRAMES_IN, Run, folder_name
 from gcd_train.evaluation.tables import (
     NOTHING,
     Difference,
@@ -149,15 +149,17 @@ class _Writer:
 
     def benchmark(self) -> Iterator[str]:
         """Of AnyViewBench: its own means, and what is published."""
-        yield from map(self.table, (benchmark_table(self.of), published_table()))
+        yield from map(self.table, (benchmark_table(self.of), published_table(), region_table(self.of, "all")))
         yield f"Clip by clip: {self._written('tables/clips.csv', clips_csv(self.of, 'all'))}."
 
     def differences(self, spans: Sequence[Span]) -> Iterator[str]:
-        """Of the chosen methods that the set has, else of its models, else of its first, from all others."""
+        """Of the chosen methods that the set has, else of its models, else of saved frames, else of its first, from all
+        others."""
         methods, every = self.of.methods, list[Difference]()
         leads = tuple(method for name in self.chosen for method in methods if method.name == name)
         if not self.chosen:
-            leads = tuple(method for method in methods if is_model(method.name, method.details)) or methods[:1]
+            models = tuple(method for method in methods if is_model(method.name, method.details))
+            leads = models or tuple(method for method in methods if FRAMES_IN in method.details) or methods[:1]
         for frames in spans:
             for lead in leads:
                 others = (other for other in methods if other.name != lead.name)
@@ -180,11 +182,11 @@ class _Writer:
             lines = [[name, "" if isnan(p.x) else f"{p.x:g}", *numbers(p.y), str(p.clips)] for name, p in points]
             heads = ["method", plot.across, plot.up, "low", "high", "clips"]  # levels have no x
             by_point = self._written(f"plots/{plot.name}.csv", csv_text(heads, lines))
+            shown, picture = f"{plot.up} by {plot.across}", self.place / f"plots/{plot.name}.png"
+            yield f"### {plot.title}: {shown}\n\nThe numbers: {by_point}"
             if drawn:
-                shown, picture = f"{plot.up} by {plot.across}", self.place / f"plots/{plot.name}.png"
                 draw(plot, self.out / picture)
-                yield f"### {plot.title}: {shown}\n\n![{shown}]({picture})"
-            yield f"The numbers: {by_point}"
+                yield f"![{shown}]({picture})"
 
     def gallery(self, count: int) -> Iterator[str]:
         """A sheet of so many clips, and a video of each."""

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from gcd_train.errors import RunError
+from gcd_train.evaluation.metrics import EQUAL_DB
 from gcd_train.evaluation.statistics import FRAMES_OF, ClipTable, Span, Sums
 from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, Box, ClipRecord, Region, Run, RunNote
 
@@ -41,6 +42,11 @@ class MethodRecords:
     def makes_pictures(self) -> bool:
         """Whether it has PSNR, and not class maps alone."""
         return any(record.regions["all"].psnr_db is not None for record in self.records)
+
+    def repeats(self, frames: Span) -> bool:
+        """Whether some of these frames equal the target."""
+        each = (draw[FRAMES_OF[frames]] for record in self.records for draw in record.regions["all"].psnr_db or ())
+        return any(value is not None and value > EQUAL_DB - 1e-3 for draw in each for value in draw)
 
     @property
     def makes_classes(self) -> bool:
@@ -93,6 +99,11 @@ class EvaluatedSet:
         return found
 
     @property
+    def wanted(self) -> int:
+        """How many clips were to be measured; more than `clips` where some have no record of any method."""
+        return max(self.note.clips, len(self.clips))
+
+    @property
     def scenes(self) -> int:
         """How many scenes these clips are of."""
         return len({record.scene for record in self.clips.values()})
@@ -138,7 +149,8 @@ def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
                 records=tuple(record for record in run.records if record.method == name),
                 classes=len(run.note.classes),
             )
-            other = found.setdefault(name, method)
+            other = found.get(name, method)
+            found[name] = max(other, method, key=lambda each: len(each.records))
             # frames from elsewhere are known by their content, and LPIPS may have been left out of one of the two
             left_out = {FRAMES_IN} if LPIPS in other.details and LPIPS in method.details else {FRAMES_IN, LPIPS}
             keys = (other.details.keys() | method.details.keys()) - left_out

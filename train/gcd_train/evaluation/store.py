@@ -92,8 +92,9 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     command: the line that began it. made: UTC, ISO 8601. versions: of gcd-node, torch, python. data: folders.
     data_identity: digest of the clips. kind: "kubric", "driving", "orbit" or "anyview": which tables they belong to.
     modality: of the target pictures. protocol: "paper", "release", "pairs" or "anyviewbench". frames, height, width: of
-    the longest clip and the largest, where they differ. classes: names, empty for none. groups: of a benchmark: names
-    of the clips of each split, by group.
+    the longest clip and the largest, where they differ. clips: how many were to be measured. classes: names, empty for
+    none. groups: of a benchmark: names of the clips of each split, by group. splits: of a benchmark: how many
+    episodes each has.
     methods: name to what it is: a weight file's digest, steps, guidance, draws, seed, views; all as text.
     """
 
@@ -109,8 +110,10 @@ class RunNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     height: int
     width: int
     seed: int
+    clips: int = 0
     classes: tuple[str, ...] = ()
     groups: dict[str, dict[str, tuple[str, ...]]] = {}
+    splits: dict[str, int] = {}
     methods: dict[str, dict[str, str]] = {}
 
 
@@ -229,7 +232,8 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
     told = [f"{name} was {_short(was)}, is {_short(now)}" for name, (was, now) in differ.items() if was != now]
     if told:
         raise RunError(
-            f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete it"
+            f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete what is "
+            f"to be measured anew: {folder / 'records'}/METHOD, or all"
         )
     return msgspec.structs.replace(found, methods={**found.methods, **new.methods})
 

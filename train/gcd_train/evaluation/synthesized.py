@@ -217,7 +217,7 @@ class VanillaSVD:
         if frames > traits.config.frames:
             raise DataError(
                 f"{traits.name} makes {traits.config.frames} frames, {clip.key or 'a clip'} has {frames}; evaluate on "
-                "shorter clips"
+                "shorter clips (--frames 13 on AnyViewBench)"
             )
         height, width = self.size or (traits.config.height, traits.config.width)
         key = "" if self.shared_noise else clip.key

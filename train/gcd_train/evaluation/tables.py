@@ -220,7 +220,7 @@ def _row(
                 note=NO_WEIGHTS if column.figure == "lpips" and method.makes_pictures else why_not,
             )
         )
-    clips = f"{len(method.records)} of {len(of.clips)}"
+    clips = f"{len(method.records)} of {of.wanted}"
     return Row(label=label, method=method.starred, clips=clips, cells=tuple(cells), printed=printed)
 
 
@@ -239,6 +239,8 @@ def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[s
     """What stands below a table: its frames and clips, what brackets and stars mean, what is not known."""
     span = frames_told(of, frames)
     notes = [f"{span[0].upper()}{span[1:]} of {len(of.clips)} clips of {of.scenes} scenes. {_BRACKETS}"]
+    if equal := [each.name for each in of.methods if each.repeats(frames)]:
+        notes.append(f"Frames that equal the target count as 100 dB: some of {', '.join(equal)} do.")
     for crop in dict.fromkeys(each.crop for each in of.methods if each.crop is not None):
         daggers = " and ".join(each.name for each in of.methods if each.crop == crop)
         notes.append(_CROPPED.format(crop[2], crop[3], of.note.width, of.note.height, daggers))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from gcd_model.config import SemanticClass
 from gcd_model.geometry import Intrinsics
 from gcd_model.live.config import SKY_M, DepthConfig, LiveConfig
 from gcd_model.live.depth_net import plane_depth, plane_sweep
@@ -249,10 +250,10 @@ def class_weights(paths: Sequence[Path], config: LiveConfig, power: float) -> Te
     return weights / (weights * shares).sum()
 
 
-def class_figures(confusion: Tensor, names: Sequence[str], shown: Sequence[int]) -> dict[str, float]:
+def class_figures(confusion: Tensor, classes: Sequence[SemanticClass], shown: Sequence[int]) -> dict[str, float]:
     """Mean IoU of the classes that occur in the truth, and that of some of them."""
     iou, occurs = class_iou(confusion), confusion.sum(1) > 0
-    return {"miou": float(iou[occurs].mean()), **{f"iou_{names[k]}": float(iou[k]) for k in shown if occurs[k]}}
+    return {"miou": float(iou[occurs].mean()), **{f"iou_{classes[k].name}": float(iou[k]) for k in shown if occurs[k]}}
 
 
 def autocast(device: torch.device) -> torch.autocast:
@@ -301,6 +302,6 @@ def joined(parts: Sequence[Record]) -> Record:
     return _mapped(together, *parts)
 
 
-def some_of(batch: Record, cut: slice) -> Record:
-    """Some pictures of a record of them."""
-    return _mapped(itemgetter(cut), batch)
+def frame_of(path: Path, t: int) -> Pictures:
+    """Frame t of a clip's source alone, with its earlier one as `with_true_references` chooses it."""
+    return _mapped(itemgetter(slice(-1, None)), with_true_references(read_clip(path, slice(t + 1))))

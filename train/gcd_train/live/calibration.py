@@ -19,7 +19,7 @@ from gcd_model.live.synthesizer import Painter, ViewFrame
 from gcd_model.networks import LiveNetworks
 from gcd_train.data.sample import to_network
 from gcd_train.evaluation.metrics import class_iou, confusion_matrix
-from gcd_train.live.batches import Pictures, pictures_of, some_of, with_true_references
+from gcd_train.live.batches import Pictures, frame_of, pictures_of, with_true_references
 from gcd_train.live.clips import STATES, LiveClip, read_clip
 from gcd_train.live.paint_training import HeldOutViews
 
@@ -54,7 +54,11 @@ def calibrate(
     networks.eval()
     config = networks.config
     depth_head, paint_head = networks.depth.head.out, networks.paint.head.out
-    _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, _source_classes(networks, paths))
+    sources = (with_true_references(read_clip(path)) for path in paths)
+    outputs = ((networks.depth(depth_inputs(each.video, each.rays, each.ground()), each.sweeps(config.depth)), each)
+               for each in sources)  # fmt: skip
+    classes = ((output.classes[_FRAMES], each.labels[_FRAMES]) for output, each in outputs)
+    _take_back(depth_head, 2 * config.depth.bins - 1, depth_weights, classes)
     made = ((networks.paint.first_step(each.seen, filled(each.seen), config.sigma_max, detail=False), each)
             for each in views.views)  # fmt: skip
     _take_back(paint_head, 3, paint_weights, ((painted.classes, each.labels) for painted, each in made))
@@ -102,17 +106,9 @@ def _take_back(head: nn.Conv2d, first: int, weights: Tensor, classes: Iterator[t
     head.bias[first : first + count] -= (best * excess).to(head.bias)
 
 
-def _source_classes(networks: LiveNetworks, paths: Sequence[Path]) -> Iterator[tuple[Tensor, Tensor]]:
-    for path in paths:
-        source = with_true_references(read_clip(path))
-        inputs = depth_inputs(source.video, source.rays, source.ground())
-        output = networks.depth(inputs, source.sweeps(networks.config.depth))
-        yield output.classes[_FRAMES], source.labels[_FRAMES]
-
-
 def _outputs(networks: LiveNetworks, path: Path, t: int) -> Iterator[DepthOutput]:
     """Of a frame of a clip's source: with its mount and an earlier frame, and without."""
-    frame = some_of(with_true_references(read_clip(path, slice(t + 1))), slice(-1, None))
+    frame = frame_of(path, t)
     ground = frame.ground()
     yield networks.depth(depth_inputs(frame.video, frame.rays, ground), frame.sweeps(networks.config.depth))
     yield networks.depth(depth_inputs(frame.video, frame.rays, torch.zeros_like(ground)))

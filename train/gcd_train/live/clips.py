@@ -201,11 +201,8 @@ class TrainingClips:
         """Raises DataError if there are none."""
         self._folder, self.device, self._full = folder, device, False
         names = [f"{camera}.{name}" for camera in CAMERAS for name in ("rgb", "depth", "labels", "moves")]
-
-        def read(path: Path, frames: slice, names: Sequence[str]) -> dict[str, Array]:
-            return read_clip(path, frames, names).arrays
-
-        self._shelf = Shelf(read, [*names, "target.visibility"], device, room_on(device))
+        names.append("target.visibility")
+        self._shelf = Shelf(lambda path, t, some: read_clip(path, t, some).arrays, names, device, room_on(device))
         self.take = self._shelf.take
         self.paths: list[Path] = []
         self._cameras: list[dict[str, Cameras]] = []

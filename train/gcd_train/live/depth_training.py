@@ -19,13 +19,12 @@ from gcd_train.live.batches import (
     autocast,
     class_figures,
     class_weights,
+    frame_of,
     generator_on,
     halved,
     on,
-    some_of,
-    with_true_references,
 )
-from gcd_train.live.clips import TrainingClips, evenly, read_clip
+from gcd_train.live.clips import TrainingClips, evenly
 from gcd_train.recipe import LiveStage
 from gcd_train.training.loop import Progress, StepLoss, Task
 from gcd_train.training.monitor import write_sheet
@@ -57,8 +56,7 @@ class DepthTask(Task):
         self._net, self._held_out, self._small_share = net, held_out, stage.small_share
         self._batches = [FrameBatches(clips, stage.batch, seed + part * PART_SEED) for part in range(stage.parts)]
         self._class_weights = class_weights(clips.paths, config, _CLASS_POWER).to(self._device)
-        names = [entry.name for entry in config.classes]
-        self._thin = torch.tensor([name in THIN for name in names], device=self._device)
+        self._thin = torch.tensor([entry.name in THIN for entry in config.classes], device=self._device)
 
     @property
     def class_weights(self) -> Tensor:
@@ -125,11 +123,10 @@ def measure_depth(
     errors, thin, rows = list[Tensor](), list[Tensor](), list[list[Tensor]]()
     edges, count = torch.zeros(3), len(config.classes)
     confusion = torch.zeros(count, count, dtype=torch.int64)
-    names = [entry.name for entry in config.classes]
-    is_thin = torch.tensor([name in ("person", "pole") for name in names])
+    is_thin = torch.tensor([entry.name in ("person", "pole") for entry in config.classes])
     cpu, device = torch.device("cpu"), next(net.parameters()).device
     for path, frame in product(paths, _MEASURED_FRAMES):
-        truth = some_of(with_true_references(read_clip(path, slice(frame + 1))), slice(-1, None))
+        truth = frame_of(path, frame)
         inputs = depth_inputs(truth.video, truth.rays, truth.ground())
         output = on(cpu, net(inputs.to(device), truth.sweeps(config.depth).to(device)))
         metres, true = read_depth(output, config.depth).metres, truth.metres
@@ -151,7 +148,7 @@ def measure_depth(
         "median_relative": float(together.median()),
         "thin_within_10": float((small < 0.1).float().mean()) if len(small) else float("nan"),
         "edge_f1": float(2 * edges[0] / (edges[1] + edges[2]).clamp(min=1)),
-        **class_figures(confusion, names, (8, 10, 11, 7, 16)),
+        **class_figures(confusion, config.classes, (8, 10, 11, 7, 16)),
     }
 
 

@@ -29,7 +29,7 @@ from gcd_train.scenes.driving.world import driving_scene, looking
 from gcd_train.scenes.drop.world import HFOV_DEG as _STAGE_HFOV_DEG
 from gcd_train.scenes.renderer import Renderer, Rendering
 from gcd_train.scenes.triangles import freeze
-from gcd_train.scenes.worlds import scene_world
+from gcd_train.scenes.worlds import SCENE_WORLDS
 
 Random = np.random.Generator
 LiveWorld = Literal["driving", "drop", "tabletop"]
@@ -202,7 +202,7 @@ def live_scene(world: LiveWorld, seed: int, path: TargetPath) -> tuple[Scene, li
     salt = zlib.crc32(f"live {world} {path}".encode())
     if world == "driving":
         return _drive(seed, path, np.random.default_rng([seed, salt]))
-    published = scene_world(world)
+    published = SCENE_WORLDS[world]
     scene = published.make(seed, published.frames)
     draws = [
         _stage_draw(scene, world, path, seed, np.random.default_rng([seed, clip, salt]))
@@ -216,8 +216,7 @@ def _drive(seed: int, path: TargetPath, random: Random) -> tuple[Scene, list[Liv
     if not paper:  # a forward camera behind the windscreen of a car, a van or a small lorry; half of them the paper's
         mount = CameraMount(hfov_deg=_lens(random, _DRIVING_HFOV_DEG, 0.4))
         if random.random() >= 0.5:
-            height_m, tilt_deg = random.uniform(1.2, 2.1), random.uniform(-3.0, 9.0)
-            mount = CameraMount(height_m=height_m, tilt_deg=tilt_deg, hfov_deg=mount.hfov_deg)
+            mount = replace(mount, height_m=random.uniform(1.2, 2.1), tilt_deg=random.uniform(-3.0, 9.0))
     # the paper's path is gradual where it is measured; in training it also stands at its goal, which is the live view
     move_time = FRAMES - 1 if path == "paper" else int(random.choice([0, FRAMES - 1], p=[0.6, 0.4]))
     scene = driving_scene(seed, frames=FRAMES, mount=mount, move_time=move_time)

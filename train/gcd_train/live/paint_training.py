@@ -67,6 +67,10 @@ class _ViewTask(Task):
         self._net.train()
         return mirrored(now) if random.random() < 0.5 else now, random
 
+    def _first_step(self, seen: Seen, network: nn.Module, *, detail: bool = False) -> Painted:
+        with autocast(self._device):
+            return network(seen, filled(seen), self._config.sigma_max, detail=detail)
+
     def measure(self, picture: Path) -> dict[str, float]:
         """See `HeldOutViews.measure`."""
         self._net.eval()
@@ -110,10 +114,6 @@ class PaintTask(_ViewTask):
             )
         total = torch.stack(list(parts.values())).sum()
         return StepLoss(total=total, parts=parts, frames=len(now.poses))
-
-    def _first_step(self, seen: Seen, network: nn.Module) -> Painted:
-        with autocast(self._device):
-            return network(seen, filled(seen), self._config.sigma_max, detail=False)
 
     def _denoising(self, views: Views, random: Random) -> Tensor:
         """Weighted as in Karras et al. 2022, Table 1, from the levels that the sampler visits."""
@@ -203,14 +203,11 @@ class DetailTask(_ViewTask):
 
     def step_loss(self, progress: Progress) -> StepLoss:
         """Of the detail against the critic, and of the critic: their gradients do not meet."""
-        now, _ = self._views(self._batches, progress.updates, self._first_step)
-        made = self._first_step(now.seen)
+        first_step = partial(self._first_step, network=self._net, detail=True)
+        now, _ = self._views(self._batches, progress.updates, first_step)
+        made = first_step(now.seen)
         parts = self._losses(made, now)
         return StepLoss(total=torch.stack(list(parts.values())).sum(), parts=parts, frames=len(now.poses))
-
-    def _first_step(self, seen: Seen) -> Painted:
-        with autocast(self._device):
-            return self._net.first_step(seen, filled(seen), self._config.sigma_max)
 
     def _losses(self, made: Painted, views: Views) -> dict[str, Tensor]:
         never = (1 - views.seen.coverage)[:, None]  # share of a pixel that nothing covers
@@ -259,9 +256,9 @@ def _energy(x: Tensor) -> Tensor:
 class HeldOutViews:
     """Some frames of held-out clips, opened once."""
 
-    def __init__(self, paths: Sequence[Path], inputs: Path, frames: Sequence[int] = (5, 9, 13)) -> None:
+    def __init__(self, paths: Sequence[Path], inputs: Path) -> None:
         places = [(path, inputs / path.parent.name / path.name) for path in paths]
-        self.views = [views_of(*place, slice(t, t + 1)) for place in places for t in frames]
+        self.views = [views_of(*place, slice(t, t + 1)) for place in places for t in (5, 9, 13)]
 
     def measure(self, net: PaintNet, config: LiveConfig, sheet: Path) -> dict[str, float]:
         """PSNR of base and mean, of seen and never-seen pixels, mIoU, and IoU of the three states."""
@@ -284,10 +281,9 @@ class HeldOutViews:
             if i % max(len(self.views) // 10, 1) == 0:
                 rows.append([x[0] for x in (views.seen.colour, base, made.mean, made.picture, views.target)])
         write_sheet(sheet, rows)
-        names = [entry.name for entry in config.classes]
         return {
             **{name: _psnr(torch.cat(each)) for name, each in errors.items()},
-            **class_figures(confusion, names, (7, 8, 10, 11)),
+            **class_figures(confusion, config.classes, (7, 8, 10, 11)),
             **{f"iou_{name}": float(iou) for name, iou in zip(STATES, class_iou(states), strict=True)},
         }
 

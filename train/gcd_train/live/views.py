@@ -74,18 +74,17 @@ def splats_of(clip: LiveClip, source: Pictures, config: LiveConfig) -> list[Spla
 
 def write_inputs(path: Path, splats: Sequence[Splat]) -> None:
     """Store what the paint network sees; the file appears whole."""
-    stacked = {
-        name: torch.stack([getattr(splat, name) for splat in splats])
-        for name in ("colour", "coverage", "now_share", "age", "inverse_depth", "votes")
-    }
-    share, label = stacked["votes"].max(dim=1)
-    inverse = stacked["inverse_depth"]
+
+    def stacked(name: str) -> Tensor:
+        return torch.stack([getattr(splat, name) for splat in splats])
+
+    (share, label), inverse = stacked("votes").max(dim=1), stacked("inverse_depth")
     metres = torch.where(inverse > 0, 1 / inverse.clamp(min=1e-6), 0.0)
     arrays: dict[str, Array] = {
-        "colour": _byte((stacked["colour"] + 1) / 2).transpose(0, 2, 3, 1).copy(),
-        "coverage": _byte(stacked["coverage"]),
-        "now_share": _byte(stacked["now_share"]),
-        "age": _byte(stacked["age"] / 25.5),
+        "colour": _byte((stacked("colour") + 1) / 2).transpose(0, 2, 3, 1).copy(),
+        "coverage": _byte(stacked("coverage")),
+        "now_share": _byte(stacked("now_share")),
+        "age": _byte(stacked("age") / 25.5),
         "log_depth": encode_depth(metres.numpy()),
         "label": label.to(torch.uint8).numpy(),
         "label_share": _byte(share),
@@ -203,14 +202,14 @@ class InputShelf(Shelf):
 
     def __init__(self, clips: TrainingClips, folders: Sequence[Path]) -> None:
         super().__init__(read_inputs, INPUTS, clips.device, room_on(clips.device))
-        self._of: list[tuple[int, list[int]]] = []
-        count = 0
+        self._of: list[tuple[int, range]] = []
         for i, path in enumerate(clips.paths):
-            files = [file for folder in folders if (file := folder / path.parent.name / path.name).exists()]
-            taken = [file for file in files if self.add(file)]
-            if taken:
-                self._of.append((i, list(range(count, count + len(taken)))))
-            count += len(taken)
+            first = len(self._paths)
+            for file in (folder / path.parent.name / path.name for folder in folders):
+                if file.exists():
+                    self.add(file)
+            if taken := range(first, len(self._paths)):
+                self._of.append((i, taken))
 
     def drawn(self, random: Random, n: int) -> tuple[Numbers, Numbers]:
         """Numbers of N clips and of a file of each."""

@@ -62,20 +62,15 @@ class Footage:
     look_at: tuple[float, float, float]
     world: str
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height."""
-        return self.lens.width, self.lens.height
-
     @cached_property
     def source(self) -> Bytes:
         """u8 [T, H, W, 3]."""
-        return np.stack([trained_picture(view.rgb, *self.size) for view in self.views])
+        return np.stack([trained_picture(view.rgb, self.lens.width, self.lens.height) for view in self.views])
 
     @cached_property
     def depth(self) -> NDArray[np.float32]:
         """f32 [T, H, W] metres along the optical axis of the source, 0 where nothing is known."""
-        return np.stack([nearest_resized(view.depth, *self.size) for view in self.views])
+        return np.stack([nearest_resized(view.depth, self.lens.width, self.lens.height) for view in self.views])
 
     @cached_property
     def splat(self) -> Bytes:
@@ -86,7 +81,7 @@ class Footage:
     def labels(self) -> NDArray[np.int32] | None:
         """Ids in the source picture, i32 [T, H, W]; None without any."""
         ids = [view.instances if self.ontology is None else view.classes for view in self.views]
-        known = [nearest_resized(each, *self.size) for each in ids if each is not None]
+        known = [nearest_resized(each, self.lens.width, self.lens.height) for each in ids if each is not None]
         return np.stack(known).astype(np.int32) if len(known) == len(ids) else None
 
     @property
@@ -120,9 +115,8 @@ class Footage:
             return None
         if self.ontology is not None:
             return self.ontology.palette[self.labels]
-        return np.array([_instance_colour(number) for number in range(int(self.labels.max()) + 1)], np.uint8)[
-            self.labels
-        ]
+        colours = [_instance_colour(number) for number in range(int(self.labels.max()) + 1)]
+        return np.array(colours, np.uint8)[self.labels]
 
     def seen(self) -> Bytes:
         """The target with what the source never saw in orange, u8 [T, H, W, 3]."""

@@ -166,9 +166,9 @@ class Thing:
     middle: Point = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class Tracks:
-    """The motion of N things in T time steps.
+    """The motion of N things in T time steps; of one thing without the N.
 
     positions: of their origins, [T, N, 3], metres. quaternions: [T, N, 4], w, x, y, z, world_from_thing. velocities:
     [T, N, 3], metres a second. angular_velocities: [T, N, 3] about the world's axes, radians a second.
@@ -181,20 +181,15 @@ class Tracks:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class SceneObject(Thing):
+class SceneObject(Thing, Tracks):
     """What is known of a thing in a scene beyond its picture: as the metadata of Kubric-4D tells it.
 
-    instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id. positions, quaternions,
-    velocities, angular_velocities: [T, 3 or 4], as in `Tracks`.
+    instance: 1..255, as its parts have it. body: index into `Scene.poses`. label: class id.
     """
 
     instance: int
     body: int
     label: int
-    positions: Doubles
-    quaternions: Doubles
-    velocities: Doubles
-    angular_velocities: Doubles
 
     @classmethod
     def of(cls, thing: Thing, tracks: Tracks, number: int, *, instance: int, body: int, label: int) -> Self:
@@ -259,6 +254,13 @@ def upright(rows: NDArray[Any]) -> NDArray[Any]:
     poses[..., 0, 0], poses[..., 0, 1], poses[..., 1, 0], poses[..., 1, 1] = cos, -sin, sin, cos
     poses[..., 2, 2] = 1
     poses[..., 3] = rows[..., :3]
+    return poses
+
+
+def rigid(rows: NDArray[Any]) -> Doubles:
+    """The same of rows [T, 4] as rigid transforms [T, 4, 4]."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = upright(rows)
     return poses
 
 

@@ -7,7 +7,6 @@ the world has an ontology, classes as 8 bit.
 """
 
 import json
-import os
 import re
 import time
 import zipfile
@@ -28,12 +27,13 @@ from numpy.typing import NDArray
 from gcd_model.geometry import CameraMount
 from gcd_train.data.paths import Draw, FrameSampling, OrbitSampling
 from gcd_train.errors import DataError, RenderError
+from gcd_train.files import whole
 from gcd_train.parallel import map_items, one_thread_each
 from gcd_train.scenes.description import Scene
 from gcd_train.scenes.driving.world import driving_scene
 from gcd_train.scenes.renderer import Renderer, Rendering, stacked
 from gcd_train.scenes.triangles import freeze
-from gcd_train.scenes.worlds import DEPTH_UNIT_M, Orbit, World, agree, scene_world
+from gcd_train.scenes.worlds import DEPTH_UNIT_M, SCENE_WORLDS, Orbit, World, agree
 
 _ABANDONED_S = 3600.0  # no shard takes so long
 _ATTEMPTS = 100
@@ -69,13 +69,11 @@ def _missing_shards(out: Path, seeds: range, size: int) -> list[range]:
             raise DataError(f"{path} is no shard of this program; take it out of the folder")
         first, count = (int(number) for number in named.groups())
         there.update(range(first, first + count))
-    for leftover in out.glob("shard-*.partial"):
+    for leftover in out.glob("*.partial"):
         if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
             leftover.unlink()
     shards: list[range] = []
-    for seed in seeds:
-        if seed in there:
-            continue
+    for seed in sorted(set(seeds) - there):
         if shards and shards[-1].stop == seed and len(shards[-1]) < size:
             shards[-1] = range(shards[-1].start, seed + 1)
         else:
@@ -90,22 +88,17 @@ def shard_path(out: Path, seeds: range) -> Path:
 
 def write_shard(out: Path, world: World, seeds: range) -> None:
     """Render and store a run of clips; the file appears under its name once it is complete."""
-    path = shard_path(out, seeds)
-    unfinished = path.with_suffix(f".{os.getpid()}.partial")
-    try:
-        with (
-            Renderer(world.width, world.height, oversample=world.oversample) as renderer,
-            zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as archive,
-        ):
-            for scene_seed, group in groupby(seeds, key=world.scene_of):
-                for seed, facts, views in _drawn_clips(renderer, world, scene_seed, list(group)):
-                    archive.writestr(f"{seed:08d}/scene.json", json.dumps(facts))
-                    for name, strip in _strips(views, classes=world.camera == "fixed"):
-                        _, data = cv2.imencode(".png", strip, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-                        archive.writestr(f"{seed:08d}/{name}.png", data.tobytes())
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with (
+        whole(shard_path(out, seeds)) as unfinished,
+        Renderer(world.width, world.height, oversample=world.oversample) as renderer,
+        zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as archive,
+    ):
+        for scene_seed, group in groupby(seeds, key=world.scene_of):
+            for seed, facts, views in _drawn_clips(renderer, world, scene_seed, list(group)):
+                archive.writestr(f"{seed:08d}/scene.json", json.dumps(facts))
+                for name, strip in _strips(views, classes=world.camera == "fixed"):
+                    _, data = cv2.imencode(".png", strip, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                    archive.writestr(f"{seed:08d}/{name}.png", data.tobytes())
 
 
 def _strips(views: dict[str, Rendering], *, classes: bool) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -131,7 +124,7 @@ def _drawn_clips(
         scene = driving_scene(scene_seed, frames=world.frames, mount=mount, move_time=world.move_time)
         cut, cameras = freeze(scene), scene.cameras
     else:
-        published = scene_world(world.name)
+        published = SCENE_WORLDS[world.name]
         scene = published.make(scene_seed, published.frames)
         draws = [orbit_draw(scene, world, seed) for seed in seeds]
         numbers = np.concatenate([draw.frame_numbers for draw in draws])

@@ -27,8 +27,6 @@ from gcd_train.scenes.drop.world import HFOV_DEG as STAGE_HFOV_DEG
 from gcd_train.scenes.drop.world import drop_scene
 from gcd_train.scenes.tabletop.scene import tabletop_scene
 
-Layout = Literal["kubric4d", "parallel_domain4d"]
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneWorld:
@@ -42,7 +40,7 @@ class SceneWorld:
     name: str
     make: Callable[[int, int], Scene]
     edition: int = 1
-    layout: Layout = "kubric4d"
+    layout: Literal["kubric4d", "parallel_domain4d"] = "kubric4d"
     frames: int = kubric4d.FRAMES
     fps: float = kubric4d.FPS
     width: int = kubric4d.WIDTH
@@ -69,13 +67,6 @@ SCENE_WORLDS: dict[str, SceneWorld] = {
 }
 
 
-def scene_world(name: str) -> SceneWorld:
-    """A world by its name. Raises RecipeError: no such world."""
-    if name not in SCENE_WORLDS:
-        raise RecipeError(f"there is no world {name!r}; choose one of {', '.join(SCENE_WORLDS)}")
-    return SCENE_WORLDS[name]
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SceneFormat:
     """How scenes and pairs are drawn and stored; by default as pairs are.
@@ -95,7 +86,6 @@ class SceneFormat:
 DEPTH_UNIT_M = 1 / 256
 """Depth is stored in these, as 16 bit."""
 
-Numbers: TypeAlias = tuple[float, float, float]
 CameraWay: TypeAlias = Literal["gradual", "direct"]
 """How the target camera reaches its goal: over the whole clip, or it stands there from the first frame on."""
 
@@ -118,8 +108,8 @@ class Orbit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     at the end of the way. frame_numbers: the scene's time steps.
     """
 
-    start: Numbers
-    change: Numbers
+    start: tuple[float, float, float]
+    change: tuple[float, float, float]
     frame_numbers: tuple[int, ...]
 
 

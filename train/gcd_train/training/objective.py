@@ -81,7 +81,7 @@ class Batch:
 
 
 class BatchSource(Protocol):
-    """Where batches come from, see `data.batches`."""
+    """Where batches come from, see `data.batches`. A batch follows from its draws alone."""
 
     def batch(self, draws: Draws, count: int, *, single: bool = False) -> Batch:
         """`count` random clips; or single frames of as many, which encoded clips alone offer."""

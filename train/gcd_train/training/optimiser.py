@@ -5,7 +5,6 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from types import ModuleType
 from typing import Any, Literal
 
 import torch
@@ -50,14 +49,18 @@ def build_optimiser(
     listed: list[dict[str, Any]] = [
         {"params": list(group.parameters), "factor": group.factor} for group in groups if group.parameters
     ]
-    if recipe.kind in ("adam8bit", "adamw8bit") or weights == "bfloat16":
-        return _from_torchao(listed, recipe, weights)
-    kind = torch.optim.Adam if recipe.kind == "adam" else torch.optim.AdamW
-    return kind(listed, lr=recipe.rate, betas=recipe.betas, weight_decay=recipe.weight_decay, fused=True)
-
-
-def _from_torchao(listed: list[dict[str, Any]], recipe: OptimiserRecipe, weights: Weights) -> torch.optim.Optimizer:
-    library = torchao_optimisers(f'optimiser.kind "{recipe.kind}" with compute.weights "{weights}"')
+    common: dict[str, Any] = {"lr": recipe.rate, "betas": recipe.betas, "weight_decay": recipe.weight_decay}
+    if recipe.kind not in ("adam8bit", "adamw8bit") and weights == "float32":
+        kind = torch.optim.Adam if recipe.kind == "adam" else torch.optim.AdamW
+        return kind(listed, **common, fused=True)
+    try:
+        library = import_module("torchao.optim")
+    except ImportError as error:
+        raise RecipeError(
+            f'optimiser.kind "{recipe.kind}" with compute.weights "{weights}" needs torchao, which is not installed; '
+            "`pip install 'gcd-node[train]'`, or choose "
+            '"adam" or "adamw" with float32 weights'
+        ) from error
     if recipe.kind == "adam" and recipe.weight_decay:
         raise RecipeError(
             'optimiser.kind "adam" with weight_decay is not offered for bfloat16 weights; '
@@ -65,35 +68,17 @@ def _from_torchao(listed: list[dict[str, Any]], recipe: OptimiserRecipe, weights
         )
     # without weight decay, Adam and AdamW are the same
     names = {"adam": "_AdamW", "adamw": "_AdamW", "adam8bit": "Adam8bit", "adamw8bit": "AdamW8bit"}
-    return getattr(library, names[recipe.kind])(
-        listed,
-        lr=recipe.rate,
-        betas=recipe.betas,
-        weight_decay=recipe.weight_decay,
-        bf16_stochastic_round=weights == "bfloat16",
-    )
+    return getattr(library, names[recipe.kind])(listed, **common, bf16_stochastic_round=weights == "bfloat16")
 
 
-def torchao_optimisers(wanted_for: str) -> ModuleType:
-    """torchao's optimisers; importing them also lets their states be read. Raises RecipeError without torchao."""
-    try:
-        return import_module("torchao.optim")
-    except ImportError as error:
-        raise RecipeError(
-            f"{wanted_for} needs torchao, which is not installed; `pip install 'gcd-node[train]'`, or choose "
-            '"adam" or "adamw" with float32 weights'
-        ) from error
-
-
-def set_rate(optimiser: torch.optim.Optimizer, update: int, share: float, recipe: OptimiserRecipe) -> float:
-    """Set every group's learning rate for the next update; returns the rate without the groups' factors."""
+def set_rate(optimiser: torch.optim.Optimizer, update: int, share: float, recipe: OptimiserRecipe) -> None:
+    """Set every group's learning rate for the next update."""
     rate = recipe.rate * rate_factor(update, share, recipe)
     for group in optimiser.param_groups:
         if isinstance(group["lr"], Tensor):  # torchao compiles its step once, for a rate that is a tensor
             group["lr"].fill_(rate * group["factor"])
         else:
             group["lr"] = rate * group["factor"]
-    return rate
 
 
 def ema_decay(update: int, recipe: EmaRecipe) -> float:
@@ -149,12 +134,6 @@ class Ema:
     def state_dict(self) -> dict[str, Tensor]:
         """The averaged weights by name."""
         return dict(self._average)
-
-    @torch.no_grad()
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Inverse of `state_dict`. Raises KeyError for a missing weight."""
-        for name, value in self._average.items():
-            value.copy_(state[name])
 
 
 def _precise(value: Tensor) -> Tensor:

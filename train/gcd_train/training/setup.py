@@ -205,8 +205,7 @@ class Draws:
         mixed = int.from_bytes(digest[:8], "little") >> 1
         self.number, self._device = update, device
         self._host = torch.Generator().manual_seed(mixed)
-        on_host = device.type == "cpu"
-        self._there = self._host if on_host else torch.Generator(device).manual_seed(mixed)
+        self._there = self._host if device.type == "cpu" else torch.Generator(device).manual_seed(mixed)
 
     def below(self, limit: int, count: int) -> Tensor:
         """`count` whole numbers 0 <= n < limit, int64 on the CPU."""

@@ -1,7 +1,6 @@
 """Which part of the networks the U-Net stage trains: all of it, its temporal layers, or low-rank adapters."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -117,8 +116,11 @@ def add_lora(networks: Networks, recipe: LoraRecipe, seed: int) -> None:
     """Put adapters beside the U-Net's layers, in place; the networks compute what they did before."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        for parent, name, layer in list(_adaptable(networks.unet)):
-            setattr(parent, name, LowRankLinear(layer, recipe.rank, alpha_of(recipe)))
+        for parent in list(networks.unet.modules()):
+            for name in _LAYERS.get(type(parent), ()):
+                layer = getattr(parent, name)
+                assert isinstance(layer, nn.Linear), f"{name} is no linear layer"
+                setattr(parent, name, LowRankLinear(layer, recipe.rank, alpha_of(recipe)))
 
 
 def merge_lora(networks: Networks) -> None:
@@ -149,14 +151,6 @@ def is_adapted(name: str, recipe: LoraRecipe) -> bool:
     """Whether training with adapters changes the parameter of that name."""
     if name.startswith("unet.") and name.endswith((UP, DOWN)):
         return True
-    if name.startswith(("camera.", "unet.embed_camera.")):
+    if name.startswith(_CAMERA):
         return recipe.camera
     return recipe.stem and name.startswith("unet.stem.")
-
-
-def _adaptable(unet: nn.Module) -> Iterator[tuple[nn.Module, str, nn.Linear]]:
-    for parent in unet.modules():
-        for name in _LAYERS.get(type(parent), ()):
-            layer = getattr(parent, name)
-            assert isinstance(layer, nn.Linear), f"{name} is no linear layer"
-            yield parent, name, layer

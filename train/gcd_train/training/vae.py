@@ -169,16 +169,13 @@ def normalise_latents(encoder: Encoder, decoder: TemporalDecoder, mean: Tensor, 
     """
     quant, stem, channels = encoder.quant, decoder.stem, mean.shape[0]
     assert quant is not None, "a shared encoder has a quant convolution"
-    assert quant.bias is not None
-    assert stem.bias is not None
     quant.weight[:channels] /= std[:, None, None, None]
-    quant.bias[:channels] = (quant.bias[:channels] - mean) / std
-    quant.bias[channels:] -= 2 * std.log()  # log-variance
-    stem.bias += torch.einsum("oiyx,i->o", stem.weight, mean)
+    _bias(quant)[:channels].sub_(mean).div_(std)
+    _bias(quant)[channels:].sub_(2 * std.log())  # log-variance
+    _bias(stem).add_(torch.einsum("oiyx,i->o", stem.weight, mean))
     stem.weight *= std[:, None, None]
     if decoder.linear is not None:
-        assert decoder.linear.bias is not None
-        decoder.linear.bias += decoder.linear.weight[:, :, 0, 0] @ mean
+        _bias(decoder.linear).add_(decoder.linear.weight[:, :, 0, 0] @ mean)
         decoder.linear.weight *= std[:, None, None]
 
 

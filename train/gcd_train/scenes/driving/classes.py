@@ -87,8 +87,6 @@ ONTOLOGY = (
 Ids and names are those of the public ParallelDomain SDK. The colours of people and vehicles are the ones by which the
 paper's training finds these classes; all others are ours.
 """
-
-
 _COARSE = {item.label: item.coarse for item in ONTOLOGY}
 
 

@@ -7,11 +7,9 @@ behind the car, 10 frames per second.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gcd_model.geometry import (
     DRIVING_GOAL_POSITION,
@@ -33,6 +31,7 @@ from gcd_train.scenes.description import (
     Scene,
     mixed,
     pick_by_share,
+    rigid,
     towards,
     upright,
 )
@@ -141,7 +140,7 @@ def random_world(seed: int, frames: int) -> tuple[Scene, list[RoadUser]]:
     users, bodies = _users(crowd.users)
     parts += users
     if weather.kind == "night":
-        parts += _beams(asphalt, body=1)
+        parts += _beams(asphalt)
     scene = Scene(
         parts=tuple(parts),
         sheets=tuple(sheets),
@@ -201,13 +200,6 @@ def vehicle_from_camera() -> dict[str, Doubles]:
     return poses
 
 
-def rigid(rows: NDArray[Any]) -> Doubles:
-    """x, y, z, yaw [T, 4] as rigid transforms [T, 4, 4]."""
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = upright(rows)
-    return poses
-
-
 def _turned(position: Point, azimuth_deg: float, down_deg: float) -> Doubles:
     azimuth, down = np.radians(azimuth_deg), np.radians(down_deg)
     ahead = (np.cos(azimuth) * np.cos(down), np.sin(azimuth) * np.cos(down), -np.sin(down))
@@ -219,15 +211,15 @@ def looking(eye: Sequence[float] | Doubles, target: Sequence[float] | Doubles) -
     return look_at(*(torch.tensor(point, dtype=torch.float64) for point in (eye, target))).numpy()
 
 
-def _beams(asphalt: Colour, body: int) -> list[Part]:
-    """The light of headlights on the road ahead of a vehicle, as very flat bodies that ride with it."""
+def _beams(asphalt: Colour) -> list[Part]:
+    """The light of the ego's headlights on the road ahead, as very flat bodies that ride with it."""
     parts: list[Part] = []
     for step in range(_BEAM_STEPS):
         share = (step + 1) / _BEAM_STEPS
         size = (34.0 - 20.0 * share, 6.5 - 4.0 * share, 0.001)
         colour = mixed(asphalt, 0.6 * share, (0.72, 0.7, 0.62))
         centre = (1.4 + size[0] / 2, 0.0, PATCH_M + 0.0006 * step)
-        parts.append(block(centre, size, colour, Label.ROAD, shape="ball").of(instance=0, body=body))
+        parts.append(block(centre, size, colour, Label.ROAD, shape="ball").of(instance=0, body=1))
     return parts
 
 

@@ -94,16 +94,13 @@ def random_thing(random: _Random, *, side_m: float, dynamic: bool) -> Thing:
     parts = KINDS[name](random, random_paint(random, side_m), random_paint(random, side_m))
     low, high = bounds(parts)
     scale, move = side_m / float((high - low).max()), -(low + high) / 2
-
-    def scaled(part: Part) -> Part:
-        return replace(
-            part, centre=_point(scale * (np.array(part.centre) + move)), size=_point(scale * np.array(part.size))
-        )
-
     density = random.lognormal(math.log(120.0), 0.5)  # kg/m3: hollow toys to solid wood
     return Thing(
         name=name,
-        parts=tuple(map(scaled, parts)),
+        parts=tuple(
+            replace(part, centre=_point(scale * (part.centre + move)), size=_point(scale * np.array(part.size)))
+            for part in parts
+        ),
         size=_point(scale * (high - low)),
         mass_kg=density * _FILLED * _MEAN_SIDE_M * side_m**2,
         friction=random.uniform(0.5, 0.9),

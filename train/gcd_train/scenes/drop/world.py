@@ -91,10 +91,8 @@ def simulate(things: Sequence[Thing], random: np.random.Generator, *, frames: in
     """
     mujoco, model = load_mujoco(), _compiled(things)
     data = mujoco.MjData(model)
-    q, v = (
-        data.qpos.reshape(-1, 7),
-        data.qvel.reshape(-1, 6),
-    )  # what MuJoCo works on: places and attitudes; speeds, spins
+    # what MuJoCo works on: places and attitudes; speeds, spins
+    q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
     for i, thing in enumerate(things):  # far outside, alone, where it disturbs nothing
         q[i] = (500.0 + 20.0 * i, 500.0, thing.size[2] / 2 + 0.01, *np.eye(4)[0])
 
@@ -296,11 +294,7 @@ _FLOORS = {
 _BACKDROPS: dict[str, tuple[float, Pattern, tuple[str, ...]]] = {
     "hills": (0.3, Pattern.HILLS, ("grass", "sand", "concrete", "asphalt", "pale planks")),
     "houses": (0.25, Pattern.HOUSES, ("concrete", "asphalt", "checker", "grass", "terrazzo")),
-    "hall": (
-        0.25,
-        Pattern.HALL,
-        ("planks", "pale planks", "checker", "terrazzo", "marble", "carpet", "dotted rug"),
-    ),
+    "hall": (0.25, Pattern.HALL, ("planks", "pale planks", "checker", "terrazzo", "marble", "carpet", "dotted rug")),
     "studio": (0.2, Pattern.STUDIO, ("planks", "marble", "carpet", "dotted rug", "concrete", "checker", "sand")),
 }
 """What stands around: how often, how it is painted, and the floors that suit it."""

@@ -179,7 +179,7 @@ def _finger(side: str, sign: int, shell: str) -> str:
 
 
 def build_model(setting: Setting) -> Any:
-    """Everything as one MjModel; body `thing_3` is number 3 of the things. Raises RenderError without MuJoCo."""
+    """All as one MjModel: body 1 is the first of the clutter, `thing_3` thing 3. Raises RenderError without MuJoCo."""
     floor = f'<geom class="still" type="plane" size="5 5 0.1" pos="0 0 {FLOOR_M}"/>'  # what falls off the table lands
     still = floor + "\n".join(_geom(part, "still") for part in setting.table)
     still += "\n".join(_body(placed, None) for placed in setting.clutter)

@@ -27,18 +27,18 @@ from gcd_train.scenes.description import (
     Tracks,
     moved,
     pick,
+    rigid,
     rotations,
     shaded,
     square,
     towards,
-    upright,
     with_world,
     yawed,
 )
 from gcd_train.scenes.drop.world import HFOV_DEG, orbit_cameras
 from gcd_train.scenes.tabletop.arm import BASE, arm_links, build_model, random_setting
 from gcd_train.scenes.tabletop.simulation import Motion, Simulation
-from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Placed, Setting, TableThing, TabletopClass
+from gcd_train.scenes.tabletop.things import FLATS, FLOOR_M, WOODS, Setting, TabletopClass
 
 UNITS_A_METRE = 10.0
 TABLE_EXTENT = Extent(near_m=0.2, far_m=150.0, shadow_radius_m=12.0, shadow_depth_m=40.0, shadow_pixels=2048)
@@ -48,8 +48,6 @@ _TABLE_Z_M = -0.12
 """Height of the table's surface in the world: arm and things are then in the middle of the pictures."""
 _WALL, _WALL_TOP = 36.0, 19.0  # units
 _WALLS: tuple[Colour, ...] = ((0.85, 0.83, 0.78), (0.68, 0.74, 0.76), (0.78, 0.70, 0.62), (0.60, 0.64, 0.58))
-
-
 _TABLE_FROM_BASE = np.eye(4)
 _TABLE_FROM_BASE[:3, 3] = BASE
 _EYE, _RIGHT = np.array([-0.11, 0.0, -0.17]), np.array([0.0, 1.0, 0.0])
@@ -140,39 +138,31 @@ def _counted(
 ) -> tuple[list[Part], list[SceneObject]]:
     """The table's parts; those of things, links and clutter, and what metadata tells of them, in scene units.
 
-    Their instances are their numbers from 1 on. Clutter stands on the table's body.
+    Their instances are their numbers from 1 on. Clutter is drawn as parts of the table's body.
     """
     parts = [piece.of(instance=0, body=_TABLE) for part in setting.table for piece in drawn(part)]
     objects: list[SceneObject] = []
-    tracks = _in_world(motion.tracks, setting.clutter, world_from_table)
-    rows: list[tuple[TableThing, int, TabletopClass, int, Placed | None]] = []
-    for index, each in enumerate(setting.things):
-        body = model.body(f"thing_{index}").id
-        rows.append((each.thing, body, TabletopClass.OBJECT, body, None))
-    rows += [(link, body, label, body, None) for link, body, label in arm_links(model)]
-    bodies = motion.tracks.positions.shape[1]
-    rows += [(each.thing, 0, TabletopClass.CLUTTER, bodies + k, each) for k, each in enumerate(setting.clutter)]
-    for instance, (thing, body, label, track, stands) in enumerate(rows, start=1):
-        pieces = [piece.of(instance=instance, body=_TABLE + body) for part in thing.parts for piece in drawn(part)]
+    tracks, turn = motion.tracks, world_from_table[:3, :3]
+    tracks = Tracks(
+        positions=UNITS_A_METRE * moved(world_from_table, tracks.positions),
+        quaternions=yawed(tracks.quaternions, math.atan2(turn[1, 0], turn[0, 0])),
+        velocities=UNITS_A_METRE * (tracks.velocities @ turn.T),
+        angular_velocities=tracks.angular_velocities @ turn.T,
+    )
+    rows = [
+        (each.thing, model.body(f"thing_{i}").id, TabletopClass.OBJECT, None) for i, each in enumerate(setting.things)
+    ]
+    rows += [(*link, None) for link in arm_links(model)]
+    rows += [(each.thing, body, TabletopClass.CLUTTER, each) for body, each in enumerate(setting.clutter, start=1)]
+    for instance, (thing, track, label, stands) in enumerate(rows, start=1):
+        body = _TABLE + track if stands is None else _TABLE
+        pieces = [piece.of(instance=instance, body=body) for part in thing.parts for piece in drawn(part)]
         if stands is not None:
             pieces = [piece.placed(*_scaled(stands.place), stands.yaw) for piece in pieces]
         parts += pieces
         sized = replace(thing, size=_scaled(thing.size), middle=_scaled(thing.middle))
-        objects.append(SceneObject.of(sized, tracks, track, instance=instance, body=_TABLE + body, label=label))
+        objects.append(SceneObject.of(sized, tracks, track, instance=instance, body=body, label=label))
     return parts, objects
-
-
-def _in_world(moving: Tracks, clutter: tuple[Placed, ...], world_from_table: Doubles) -> Tracks:
-    """The tracks of all bodies and, after them, of the clutter, from the table's frame to the world's, scene units."""
-    turn, still = world_from_table[:3, :3], np.zeros((len(moving.positions), len(clutter), 3))
-    places = still + np.stack([moved(world_from_table, np.array(each.place)) for each in clutter])
-    turned = still[..., :1] + np.stack([yawed(np.eye(4)[0], each.yaw) for each in clutter])
-    return Tracks(
-        positions=UNITS_A_METRE * np.concatenate([moved(world_from_table, moving.positions), places], 1),
-        quaternions=yawed(np.concatenate([moving.quaternions, turned], 1), math.atan2(turn[1, 0], turn[0, 0])),
-        velocities=UNITS_A_METRE * np.concatenate([moving.velocities @ turn.T, still], 1),
-        angular_velocities=np.concatenate([moving.angular_velocities @ turn.T, still], 1),
-    )
 
 
 def drawn(part: Part) -> Iterator[Part]:
@@ -192,9 +182,7 @@ def drawn(part: Part) -> Iterator[Part]:
 
 def _table_pose(yaw: float) -> Doubles:
     """world_from_table [4, 4]: turned about the vertical, metres."""
-    pose = np.eye(4)
-    pose[:3] = upright(np.array([0.0, 0.0, _TABLE_Z_M, yaw]))
-    return pose
+    return rigid(np.array([[0.0, 0.0, _TABLE_Z_M, yaw]]))[0]
 
 
 def upright_base() -> Doubles:

@@ -100,9 +100,8 @@ class Simulation:
         self._controls = [model.actuator(name).id for name in (*JOINTS, *FINGERS)]
         self._bodies = [model.body(f"thing_{index}").id for index in range(len(things))]
         self._site = model.site("tool").id
-        self._joints, self._opening = np.asarray(HOME), 1.0
-        self._rows: list[tuple[Doubles, ...]] = []
-        self._names: list[str] = []
+        self._joints, self._opening, self._clock = np.asarray(HOME), 1.0, 0.0  # seconds since the first frame
+        self._rows: list[tuple[Any, ...]] = []
         # of the thing in the hand: its index, its place there and its height at first, and what became of it
         self._held, self._offset, self._low, self._lifted, self._slip = -1, np.zeros(3), 0.0, math.nan, 0.0
         self._grasps: list[Grasp] = []
@@ -118,18 +117,14 @@ class Simulation:
         self._command(self._joints)
         mujoco.mj_step(self._model, data, round(_SETTLE_S / STEP_S))
         first = round(skipped_s / _TICK_S)
-        clock = -first * _TICK_S
-        last = None
+        self._clock = -first * _TICK_S
         for tick, step in enumerate(self._followed()):
-            if step is not last:
-                self._begin(step, clock)
-                last = step
             if tick >= first and (tick - first) % _TICKS_A_FRAME == 0:
                 self._keep(step)
-            if len(self._names) == frames:
+            if len(self._rows) == frames:
                 break
             mujoco.mj_step(self._model, data, _STEPS_A_TICK)
-            clock += _TICK_S
+            self._clock += _TICK_S
             if self._held >= 0:
                 self._slip = max(self._slip, float(np.linalg.norm(self._in_hand() - self._offset)))
         self._end_grasp()
@@ -137,12 +132,12 @@ class Simulation:
         kinds = (faults.mjWARN_BADQPOS, faults.mjWARN_BADQVEL, faults.mjWARN_BADQACC)
         if any(data.warning[int(kind)].number for kind in kinds):
             raise RenderError("the physics of this tabletop scene became unstable; leave its seed out")
-        positions, quaternions, rates, tool, state, action = (np.stack(rows) for rows in zip(*self._rows, strict=True))
+        *rows, names = zip(*self._rows, strict=True)
+        positions, quaternions, rates, tool, state, action = map(np.stack, rows)
         tracks = Tracks(
             positions=positions, quaternions=quaternions, velocities=rates[..., 3:], angular_velocities=rates[..., :3]
         )
-        kept = tuple(self._names), tuple(self._grasps), tuple(self._tasks)
-        return Motion(tracks, tool, state, action, *kept)
+        return Motion(tracks, tool, state, action, names, tuple(self._grasps), tuple(self._tasks))
 
     def _followed(self) -> Iterator[Step]:
         """The step in force at every tick, for ever; the actuators have their targets when it is yielded."""
@@ -151,6 +146,7 @@ class Simulation:
         here, yaw = _polar(place), math.atan2(*self._data.site_xmat[self._site][[3, 0]].tolist())
         while True:
             for step in self._next_task(place):
+                self._begin(step)
                 goal, turn = _polar(step.place), yaw + (step.yaw - yaw + math.pi) % (2 * math.pi) - math.pi
                 opening = self._opening
                 ticks = max(1, math.ceil(max(0.22, math.dist(step.place, place) / self._speed) / _TICK_S))
@@ -201,19 +197,19 @@ class Simulation:
         tool = np.eye(4)
         tool[:3, :3], tool[:3, 3] = data.site_xmat[self._site].reshape(3, 3), data.site_xpos[self._site]
         action = np.concatenate([self._joints, data.ctrl[self._controls[len(JOINTS) :]]])
-        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, data.qpos[self._at].copy(), action))
-        self._names.append(step.name)
+        state = data.qpos[self._at].copy()
+        self._rows.append((data.xpos.copy(), data.xquat.copy(), rates, tool, state, action, step.name))
 
     # whether what was grasped follows the hand
 
-    def _begin(self, step: Step, clock: float) -> None:
+    def _begin(self, step: Step) -> None:
         """A step begins: at the lift the fingers have closed, at the opening the grasp ends."""
         if step.name == "lift":
             self._held, self._slip, self._lifted = step.thing, 0.0, math.nan
             self._offset, self._low = self._in_hand(), self._pose(step.thing)[0][2]
         if step.name == "carry":
             self._lifted = self._pose(self._held)[0][2] - self._low
-        if step.name in ("lift", "push") and clock > -0.3:
+        if step.name in ("lift", "push") and self._clock > -0.3:
             self._tasks.append((step.name, step.thing))
         if step.name == "open":
             self._end_grasp()

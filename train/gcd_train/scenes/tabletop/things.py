@@ -5,7 +5,6 @@ alone, as MuJoCo has it.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -257,9 +256,7 @@ def _bridge(random: _Random, widest: float) -> TableThing:
     return _loose("bridge", parts, (long, wide, high), long * wide * 0.05, grip_z=high / 2 - 0.018)
 
 
-_MAKERS: tuple[Callable[[_Random, float], TableThing], ...] = (
-    *(_block, _block, _can, _bottle, _mug, _ball, _bar, _bridge),
-)
+_MAKERS = (_block, _block, _can, _bottle, _mug, _ball, _bar, _bridge)
 
 
 def _part(shape: str, size: Point, paint: Paint, centre: Point = (0.0, 0.0, 0.0)) -> Part:
