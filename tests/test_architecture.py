@@ -27,7 +27,7 @@ MOST = [
     ("gcd_node", 68, 15_444),
     ("tests/node", 43, 12_350),
     ("train/gcd_train", 116, 27_271),
-    ("tests/train", 72, 14_903),
+    ("tests/train", 72, 14_902),
 ]
 """Files and lines of what is being made smaller: put the new numbers here when they have fallen. They rise for what is
 new alone: lately canonical views, grids, a fleet behind Ray Serve, and novel views in LeRobot sets and ROS 2 bags."""

@@ -154,14 +154,14 @@ def two_machines(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]
         "PYTHONPATH", os.pathsep.join(["", *(str(Path(each).resolve()) for each in (".", "model", "client"))])
     )
     monkeypatch.setenv("RAY_agent_register_timeout_ms", "120000")
+    monkeypatch.setenv("RAY_TMPDIR", str(folder))  # it notes its address there, in a folder that must exist
+    (folder / "ray").mkdir(parents=True)
 
     def machine(**more: Any) -> dict[str, Any]:
         """Ports are given: a raylet waits 15 s at most for those that its agents find, too short on a busy machine."""
-        ports = [
-            f"{name}_port"
-            for name in ("metrics_agent", "runtime_env_agent", "metrics_export", "dashboard_agent_listen")
-        ]
-        return {"num_cpus": 1, "object_store_memory": 100 << 20, **dict(zip(ports, free_ports(4), strict=True)), **more}
+        names = ("metrics_agent", "runtime_env_agent", "metrics_export", "dashboard_agent_listen")
+        ports = {f"{name}_port": port for name, port in zip(names, free_ports(4), strict=True)}
+        return {"num_cpus": 1, "object_store_memory": 100 << 20, **ports, **more}
 
     cluster = Cluster(initialize_head=True, head_node_args=machine(include_dashboard=False, temp_dir=str(folder)))
     try:

@@ -277,6 +277,8 @@ def test_clips_without_a_record_count_and_frames_that_equal_the_target_are_told(
     assert "equal the target" not in "".join(table.notes)
     table = main_tables(measured(records("a"), [record("b", "scn00001.sample_00", psnr_db=100.0)]))[0]
     assert "Frames that equal the target count as 100 dB: some of b do." in table.notes
+    table = main_tables(measured([two("a")[0], two("a", draws=2)[1]]))[0]
+    assert "a has 1 to 2 draws of a clip." in table.notes
 
 
 def test_a_method_measured_with_lpips_in_one_run_and_frames_that_were_moved_stay_one_method() -> None:

@@ -26,7 +26,7 @@ from gcd_train.data.kubric4d import Kubric4D
 from gcd_train.data.lerobot import LeRobotPairs
 from gcd_train.data.lerobot_augment import Augmentation, AugmentOptions
 from gcd_train.data.lerobot_export import TabletopExport, export_tabletop
-from gcd_train.data.splits import SWEPT_FRAMES, write_sweep
+from gcd_train.data.splits import write_sweep
 from gcd_train.errors import DataError
 from gcd_train.files import only_writer, remove_leftovers
 from gcd_train.parallel import Outcome, map_items, one_thread_each
@@ -186,11 +186,7 @@ def sweep(
     `gcd-train evaluate --controls FILE` measures them, `gcd-train figure angles` draws them.
     """
     with errors_shown():
-        data = Kubric4D(scenes)
-        names = data.scenes[:limit]
-        for name in names:
-            if (there := data.frames(name)) < SWEPT_FRAMES:
-                raise DataError(f"{name} has {there} frames, a sweep wants {SWEPT_FRAMES}; leave it out")
+        names = Kubric4D(scenes).scenes[:limit]
         count = write_sweep(out, names, step_deg=step_deg, seed=seed)
     say(f"wrote {out}: {count} clips of each of {len(names)} scenes")
 

@@ -55,7 +55,7 @@ def evaluate_command(
         for line in notes:
             say(line)
         with RunKeeper(out).in_use(run_note(clips, methods, asked, command_line())):
-            if isinstance(clips, SceneSet):
+            if isinstance(clips, SceneSet) and asked.controls is None:
                 write_controls(out / "controls.json", clips.listed())
             work = ClipWork(
                 folder=out.resolve(),
@@ -90,7 +90,7 @@ def report_command(
     runs: Annotated[list[Path], typer.Argument(help="Folders that `gcd-train evaluate` wrote.", metavar="RUN...")],
     out: Annotated[Path, typer.Option(help="Folder for report.md, tables/, plots/ and gallery/.")],
     lead: Annotated[
-        list[str] | None, typer.Option(help="Method to compare with all others; by default every model.")
+        list[str] | None, typer.Option(help="Method to compare with all others; by default models, or saved frames.")
     ] = None,
     clips: Annotated[int, typer.Option(min=0, help="Clips in the gallery.")] = 4,
     plots: Annotated[bool, typer.Option(help="Draw plots; needs matplotlib.")] = True,

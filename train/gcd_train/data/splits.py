@@ -222,8 +222,6 @@ def _camera(numbers: tuple[float, float, float] | None) -> Spherical | None:
 
 
 _SWEPT_ELEVATION_DEG, _SWEPT_RADIUS_M = 10.0, 15.0
-SWEPT_FRAMES = 27
-"""Frames that a scene of a sweep has at least: 14, every second one."""
 
 
 def write_sweep(path: Path, scenes: Sequence[str], *, step_deg: float, seed: int = 0) -> int:
@@ -253,7 +251,7 @@ def write_sweep(path: Path, scenes: Sequence[str], *, step_deg: float, seed: int
 
 
 def write_controls(path: Path, controls: Controls) -> None:
-    """What `read_controls` reads. Raises OSError."""
+    """What `read_controls` reads. Raises RunError."""
 
     def numbers(camera: Spherical | None) -> tuple[float, float, float] | None:
         return None if camera is None else (camera.azimuth_deg, camera.elevation_deg, camera.radius_m)

@@ -119,6 +119,7 @@ def _told(of: EvaluatedSet, key: str) -> list[Strip]:
 
 
 ANGLE_STEP_DEG = 15.0
+_MOST_ANGLES = 20  # so many different ones are shown as they are
 _BY_VIEWS = re.compile(r"(hexplane|4dgs)[ _-]?(\d+)", re.IGNORECASE)
 _LABELS = {"hexplane": "HexPlane", "4dgs": "4D-GS"}
 
@@ -159,10 +160,11 @@ def error_by_angle(of: EvaluatedSet) -> Plot:
     for method in methods:
         records = [each for each in method.records if each.key in common]
         turned = {each.key: abs(each.change[0]) for each in records if each.change is not None}
-        drawn, groups = any(abs(angle - round(angle)) > 0.01 for angle in turned.values()), dict[float, list[str]]()
-        for key, angle in turned.items():  # as it is listed or, where it was drawn, in the middle of its step
+        distinct, groups = len({round(angle, 1) for angle in turned.values()}), dict[float, list[str]]()
+        many = distinct > _MOST_ANGLES or (of.scenes > 1 and 2 * distinct > len(turned))
+        for key, angle in turned.items():  # as it is or, where many or nearly all differ, in the middle of its step
             middle = (min(angle, 179.999) // ANGLE_STEP_DEG + 0.5) * ANGLE_STEP_DEG
-            groups.setdefault(middle if drawn else float(round(angle)), []).append(key)
+            groups.setdefault(middle if many else round(angle, 1), []).append(key)
         points = [
             Point(x=x, y=method.sums("last", keys=keys).interval("psnr_db"), clips=len(keys))
             for x, keys in sorted(groups.items())
@@ -225,10 +227,10 @@ def draw(plot: Plot, out: Path) -> None:
         yerr, mark = np.nan_to_num(bounds).clip(0.0).T, _MARKS[number % len(_MARKS)]
         style: dict[str, Any] = {"marker": mark, "color": colour, "markersize": 4, "linewidth": 1.2}
         axes.errorbar(x, y, yerr=yerr, capsize=2, elinewidth=0.7, label=name, **style)
-    heights, title = [point.y.value for curve in plot.curves.values() for point in curve], plot.title
-    shown = [height for height in heights if height < EQUAL_DB - 1e-3]
-    if 0 < len(shown) < len(heights):  # beside 100 dB all others would lie on one line
-        axes.set_ylim(min(shown) - 2.0, max(shown) + 2.0)
+    heights, title = [point.y for curve in plot.curves.values() for point in curve], plot.title
+    shown = [each for y in heights if y.value < EQUAL_DB - 1e-3 for each in (y.value, y.low, y.high) if not isnan(each)]
+    if shown and any(y.value > EQUAL_DB - 1e-3 for y in heights):  # or all others would lie on one line
+        axes.set_ylim(min(shown) - 1.0, max(shown) + 1.0)
         title = f"{title} (equal frames, {EQUAL_DB:g} dB, lie above)"
     axes.set_title(title, fontsize=10, loc="left")
     places = sorted({point.x for curve in plot.curves.values() for point in curve if not isnan(point.x)})

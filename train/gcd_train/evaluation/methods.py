@@ -55,7 +55,7 @@ class EvaluateOptions(ClipOptions):
     guidance: Annotated[tuple[float, float] | None, Option(help="Of first and last frame; as shipped.")] = None
     solver: Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")] = None
     baselines: Annotated[bool, Option(help="Also measure what has to be beaten.")] = True
-    methods: Annotated[list[str] | None, Option(help="These baselines, with commas between.")] = None
+    methods: Annotated[list[str] | None, Option(help="Baselines, with commas between; the usual ones.")] = None
     svd: Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")] = None
     zeronvs: Annotated[str | None, Option(help="Weights for zeronvs: zeronvs.ckpt.")] = None
     zeronvs_scale: Annotated[
@@ -126,8 +126,9 @@ def planned(options: EvaluateOptions) -> tuple[EvaluationSet, tuple[Predictor, .
             raise RecipeError(
                 f"each method needs a name of its own, got {first} twice; rename the frames of --predictions"
             )
-    saved = (each for each in methods if isinstance(each, SavedFrames))
-    notes += tuple(line for each in saved for line in each.oddities(clips.keys))
+    for each in methods:
+        if isinstance(each, SavedFrames) and (names := each.beside(clips.keys)):
+            notes += (f"{each.folder} holds frames that are of no clip of the set: {len(names)}, first {names[0]}",)
     return clips, tuple(methods), notes
 
 

@@ -85,7 +85,7 @@ class ClipOptions:
     trajectories: Annotated[int | None, Option(min=1, help="Scenes: clips of each; as the protocol by default.")] = None
     frame_start: Annotated[int | None, Option(min=0, help="Scenes: first frame of every clip.")] = None
     frame_skip: Annotated[int | None, Option(min=1, help="Scenes: frames from one of the clip to the next.")] = None
-    angles: Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: reach of drawn goals; max90.")] = None
+    angles: Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: drawn goals; by default max90.")] = None
     path: Annotated[Literal["gradual", "direct"] | None, Option(help="Scenes: as the weights by default.")] = None
     modality: Annotated[Literal["rgb", "semantic"] | None, Option(help="Scenes: as the weights by default.")] = None
     exact: Annotated[bool, Option("--exact", help="Our scenes: targets from geometry instead of points.")] = False

@@ -2,9 +2,7 @@
 
 import hashlib
 import re
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -220,7 +218,7 @@ def resized(pictures: Tensor, height: int, width: int, *, low: float = 0.0) -> T
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 _VIDEO = ".mp4"
 _SAMPLE = re.compile(r"sample_(\d+)")
-_RELEASED = re.compile(r"(.+)_pred_s(\d+)")
+_RELEASED = re.compile(r".+_(pred_s\d+|gal|io|error|uncert|visocc)")  # what the paper's script writes
 
 
 def find_draws(folder: Path, key: str) -> list[Path]:
@@ -232,8 +230,8 @@ def find_draws(folder: Path, key: str) -> list[Path]:
         KEY/frames                                               of AnyView's script
         PREFIX_pred_s0, ... , in `extra` or in the folder itself  of the paper's test script
 
-    where PREFIX names the scene and, from the second on, the trajectory: `..._c02_scn02900_fs...` is that of the key
-    `scn02900.sample_02`. Where pictures and a video are of one name, the pictures count.
+    where PREFIX names the scene and, from the second on, the trajectory: `..._c02_scn02900`, also with `_fs...` behind
+    it, is that of the key `scn02900.sample_02`. Where pictures and a video are of one name, the pictures count.
 
     Raises: DataError naming the clip if there is nothing, a draw is missing, or the clip lies there several times.
     """
@@ -255,22 +253,17 @@ def find_draws(folder: Path, key: str) -> list[Path]:
 
 
 def _released(folder: Path, key: str) -> list[Path]:
-    """Outputs of the paper's script for the clip of this name."""
+    """Outputs of the paper's script for the clip of this name; without a number they are the first trajectory's."""
+    scene, _, sample = key.partition(".")
+    wanted = re.search(r"\d+$", sample)
+    names = re.compile(rf"(.*?(?:_c(\d+))?_{re.escape(scene)}(?:_fs.*)?)_pred_s(\d+)")
     by_prefix: dict[str, dict[int, Path]] = {}
-    for path, named in _draws_in(folder, _RELEASED):
-        if _shows(named[1], key):
-            by_prefix.setdefault(named[1], {})[int(named[2])] = path
+    for path, named in _draws_in(folder, names):
+        if int(named[2] or 0) == (int(wanted[0]) if wanted else 0) and _is_draw(path):
+            by_prefix.setdefault(named[1], {})[int(named[3])] = path
     if len(by_prefix) > 1:
         raise DataError(f"{folder} holds clip {key} several times: {', '.join(sorted(by_prefix))}; keep one")
     return [draw for draws in by_prefix.values() for draw in _numbered(draws, folder)]
-
-
-def _shows(prefix: str, key: str) -> bool:
-    """Whether the paper's script names this clip so; without a number it is the scene's first trajectory."""
-    scene, _, sample = key.partition(".")
-    head, of_scene, _ = prefix.partition(f"_{scene}_fs")
-    number, wanted = re.search(r"_c(\d+)$", head), re.search(r"\d+$", sample)
-    return bool(of_scene) and int(number[1] if number else 0) == int(wanted[0] if wanted else 0)
 
 
 def _numbered(draws: Mapping[int, Path], place: Path) -> list[Path]:
@@ -286,11 +279,10 @@ def _numbered(draws: Mapping[int, Path], place: Path) -> list[Path]:
 
 def _draws_in(folder: Path, names: re.Pattern[str]) -> Iterator[tuple[Path, re.Match[str]]]:
     """What a folder holds under such names, folders after videos, so that of one name they count, empty ones too."""
-    each = sorted(folder.iterdir(), key=lambda path: (path.is_dir(), path.name)) if folder.is_dir() else []
-    for path in each:
-        named = names.fullmatch(path.stem if path.suffix == _VIDEO else path.name)
-        if named and (path.is_dir() or _is_draw(path)):
-            yield path, named
+    each = folder.iterdir() if folder.is_dir() else ()
+    found = [(path, names.fullmatch(path.stem if path.suffix == _VIDEO else path.name)) for path in each]
+    named = [(path, name) for path, name in found if name and (path.is_dir() or _is_draw(path))]
+    yield from sorted(named, key=lambda each: (each[0].is_dir(), each[0].name))
 
 
 def _is_draw(path: Path) -> bool:
@@ -323,7 +315,8 @@ class SavedFrames:
         """
         digest = hashlib.sha256()
         try:
-            for path in sorted(each for each in self.folder.rglob("*") if each.suffix.lower() in (*_PICTURES, _VIDEO)):
+            named = (each for each in self.folder.rglob("*") if each.suffix.lower() in (*_PICTURES, _VIDEO))
+            for path in sorted(each for each in named if each.is_file()):
                 with path.open("rb") as file:
                     content = hashlib.file_digest(file, "sha256").hexdigest()
                 digest.update(f"{path.relative_to(self.folder)} {content}\n".encode())
@@ -332,23 +325,16 @@ class SavedFrames:
         more = {"privileged": "yes"} if self.privileged else {}
         return {FRAMES_IN: str(self.folder), "digest": digest.hexdigest()[:12], **more}
 
-    def oddities(self, keys: Collection[str]) -> Iterator[str]:
-        """What a person may not know of the folder, line by line, given the clips of the set."""
-        outside, draws, extra = set[str](), Counter[int](), self.folder / "extra"
-        for path in (*self.folder.iterdir(), *(extra.iterdir() if extra.is_dir() else ())):
-            name = path.stem if path.suffix == _VIDEO else path.name
-            if (released := _RELEASED.fullmatch(name)) is not None:
-                outside |= set() if any(_shows(released[1], key) for key in keys) else {name}
-            elif name not in keys and (any(map(_is_draw, (path, path / "frames"))) or any(_draws_in(path, _SAMPLE))):
-                outside.add(name)
-        if outside:
-            yield f"{self.folder} holds frames that are of no clip of the set: {len(outside)}, first {min(outside)}"
-        for key in keys:
-            with suppress(DataError):  # told when it is measured
-                draws[len(find_draws(self.folder, key))] += 1
-        if len(draws) > 1:
-            told = ", ".join(f"{number} of {clips} clips" for number, clips in sorted(draws.items()))
-            yield f"{self.folder} does not hold as many draws of every clip: {told}"
+    def beside(self, keys: Collection[str]) -> list[str]:
+        """Names of clips that lie in the folder and are not among these; outputs of the paper's script aside."""
+        named = {path.stem if path.suffix == _VIDEO else path.name: path for path in self.folder.iterdir()}
+        return sorted(
+            name
+            for name, path in named.items()
+            if name not in keys
+            and not _RELEASED.fullmatch(name)
+            and (any(map(_is_draw, (path, path / "frames"))) or any(_draws_in(path, _SAMPLE)))
+        )
 
     def predict(self, clip: SourceClip) -> Prediction:
         """See Predictor; each sample that was saved is a draw.

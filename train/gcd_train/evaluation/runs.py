@@ -11,7 +11,18 @@ import numpy as np
 from gcd_train.errors import RunError
 from gcd_train.evaluation.metrics import EQUAL_DB
 from gcd_train.evaluation.statistics import FRAMES_OF, ClipTable, Span, Sums
-from gcd_train.evaluation.store import COMPARABLE, FRAMES_IN, LPIPS, REGIONS, Box, ClipRecord, Region, Run, RunNote
+from gcd_train.evaluation.store import (
+    COMPARABLE,
+    FRAMES_IN,
+    LPIPS,
+    REGIONS,
+    Box,
+    ClipRecord,
+    Region,
+    Run,
+    RunNote,
+    folder_name,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +161,10 @@ def gather(runs: Sequence[Run]) -> tuple[EvaluatedSet, ...]:
                 classes=len(run.note.classes),
             )
             other = found.get(name, method)
-            found[name] = max(other, method, key=lambda each: len(each.records))
+            more = max(other, method, key=lambda each: len(each.records))
+            views = Path("views", folder_name(name))  # those of one run
+            kept = (each.folder for each in (more, other, method) if (each.folder / views).is_dir())
+            found[name] = replace(more, folder=next(kept, more.folder))
             # frames from elsewhere are known by their content, and LPIPS may have been left out of one of the two
             left_out = {FRAMES_IN} if LPIPS in other.details and LPIPS in method.details else {FRAMES_IN, LPIPS}
             keys = (other.details.keys() | method.details.keys()) - left_out

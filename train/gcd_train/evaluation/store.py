@@ -235,7 +235,8 @@ def _joined(folder: Path, found: RunNote, new: RunNote) -> RunNote:
             f"{folder} holds records of another evaluation: {'; '.join(told)}. Choose another --out, or delete what is "
             f"to be measured anew: {folder / 'records'}/METHOD, or all"
         )
-    return msgspec.structs.replace(found, methods={**found.methods, **new.methods})
+    methods = {**found.methods, **new.methods}
+    return msgspec.structs.replace(found, methods=methods, clips=new.clips, splits=new.splits)
 
 
 def _short(value: object) -> str:

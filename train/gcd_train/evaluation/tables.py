@@ -246,6 +246,8 @@ def _notes(of: EvaluatedSet, columns: Sequence[Column], frames: Span) -> tuple[s
         notes.append(_CROPPED.format(crop[2], crop[3], of.note.width, of.note.height, daggers))
     for name, details in ((each.name, each.details) for each in of.methods if FRAMES_IN in each.details):
         notes.append(_ELSEWHERE.format(name, details[FRAMES_IN], details.get("digest", "unknown")))
+    for name, draws in ((each.name, sorted({record.draws for record in each.records})) for each in of.methods):
+        notes += [f"{name} has {draws[0]} to {draws[-1]} draws of a clip."] if len(draws) > 1 else []
     copied = [each.name for each in of.methods if each.details.get("baseline") in FROM_EXACT_CLASSES]
     if copied and any(isinstance(column.figure, int) or column.figure == "miou_common" for column in columns):
         notes.append(_COPIED.format(" and ".join(copied)))

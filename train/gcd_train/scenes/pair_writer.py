@@ -69,7 +69,7 @@ def _missing_shards(out: Path, seeds: range, size: int) -> list[range]:
             raise DataError(f"{path} is no shard of this program; take it out of the folder")
         first, count = (int(number) for number in named.groups())
         there.update(range(first, first + count))
-    for leftover in out.glob("*.partial"):
+    for leftover in out.glob("*shard-*.partial"):
         if time.time() - leftover.stat().st_mtime > _ABANDONED_S:
             leftover.unlink()
     shards: list[range] = []
