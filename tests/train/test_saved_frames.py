@@ -109,11 +109,11 @@ def test_clips_that_lie_there_beside_those_of_the_set_are_named(tmp_path: Path) 
     assert SavedFrames(name="other", folder=tmp_path).beside([KEY]) == ["anyview", "more", "most"]
 
 
-def test_a_draw_that_is_empty_is_refused(tmp_path: Path) -> None:
-    for sample in (0, 1):
-        save(tmp_path / KEY / f"sample_{sample}")
-    (tmp_path / KEY / "sample_2").mkdir()
-    with pytest.raises(DataError, match="sample_2 holds no frames"):
+@pytest.mark.parametrize("place", [f"{KEY}/sample_", "t_c02_scn02900_pred_s"])
+def test_a_draw_that_is_empty_is_refused(tmp_path: Path, place: str) -> None:
+    save(tmp_path / f"{place}0")
+    (tmp_path / f"{place}1").mkdir()
+    with pytest.raises(DataError, match=f"{place}1 holds no frames"):
         predicted(tmp_path)
 
 

@@ -257,8 +257,7 @@ def write_controls(path: Path, controls: Controls) -> None:
         return None if camera is None else (camera.azimuth_deg, camera.elevation_deg, camera.radius_m)
 
     def entry(each: Control) -> _Entry:
-        where = numbers(each.start), numbers(each.goal)
-        return _Entry(each.frame_start, each.frame_skip, spherical_start=where[0], spherical_end=where[1])
+        return _Entry(each.frame_start, each.frame_skip, None, numbers(each.start), numbers(each.goal))
 
     listed = {scene: {each.name: entry(each) for each in samples} for scene, samples in controls.items()}
     write_whole(path, msgspec.json.format(msgspec.json.encode(listed)))

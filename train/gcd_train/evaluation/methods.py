@@ -51,11 +51,11 @@ class EvaluateOptions(ClipOptions):
 
     weights: Annotated[list[str] | None, Option(help="package:NAME or a path; without, baselines alone.")] = None
     steps: Annotated[list[int] | None, Option(min=1, help="Also with so many steps; may be repeated.")] = None
-    samples: Annotated[int | None, Option(min=1, help="Draws of each view; as the protocol, of pairs 1.")] = None
-    guidance: Annotated[tuple[float, float] | None, Option(help="Of first and last frame; as shipped.")] = None
+    samples: Annotated[int | None, Option(min=1, help="Draws of each view; else the protocol's, 1 of pairs.")] = None
+    guidance: Annotated[tuple[float, float] | None, Option(help="Of first and last frame; else as shipped.")] = None
     solver: Annotated[SolverName | None, Option(help="Euler steps as published, or of second order.")] = None
     baselines: Annotated[bool, Option(help="Also measure what has to be beaten.")] = True
-    methods: Annotated[list[str] | None, Option(help="Baselines, with commas between; the usual ones.")] = None
+    methods: Annotated[list[str] | None, Option(help="Baselines, commas between; by default the usual.")] = None
     svd: Annotated[str | None, Option(help="Weights for vanilla_svd: svd.safetensors.")] = None
     zeronvs: Annotated[str | None, Option(help="Weights for zeronvs: zeronvs.ckpt.")] = None
     zeronvs_scale: Annotated[

@@ -82,12 +82,12 @@ class ClipOptions:
     split: Annotated[str | None, Option(help="Only scenes of a split: a name as driving-test, or FILE:test.")] = None
     listed: Annotated[Path | None, Option("--list", help="Scenes: only those of a list, one a line.")] = None
     limit: Annotated[int | None, Option(min=1, help="Only the first so many scenes, or episodes of a split.")] = None
-    trajectories: Annotated[int | None, Option(min=1, help="Scenes: clips of each; as the protocol by default.")] = None
+    trajectories: Annotated[int | None, Option(min=1, help="Scenes: clips of each; by default the protocol's.")] = None
     frame_start: Annotated[int | None, Option(min=0, help="Scenes: first frame of every clip.")] = None
     frame_skip: Annotated[int | None, Option(min=1, help="Scenes: frames from one of the clip to the next.")] = None
-    angles: Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: drawn goals; by default max90.")] = None
+    angles: Annotated[Literal["max90", "max180"] | None, Option(help="Scenes: reach of goals; else max90.")] = None
     path: Annotated[Literal["gradual", "direct"] | None, Option(help="Scenes: as the weights by default.")] = None
-    modality: Annotated[Literal["rgb", "semantic"] | None, Option(help="Scenes: as the weights by default.")] = None
+    modality: Annotated[Literal["rgb", "semantic"] | None, Option(help="Scenes: targets; else as the weights.")] = None
     exact: Annotated[bool, Option("--exact", help="Our scenes: targets from geometry instead of points.")] = False
     camera: Annotated[
         list[str] | None,

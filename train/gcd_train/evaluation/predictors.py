@@ -259,8 +259,9 @@ def _released(folder: Path, key: str) -> list[Path]:
     names = re.compile(rf"(.*?(?:_c(\d+))?_{re.escape(scene)}(?:_fs.*)?)_pred_s(\d+)")
     by_prefix: dict[str, dict[int, Path]] = {}
     for path, named in _draws_in(folder, names):
-        if int(named[2] or 0) == (int(wanted[0]) if wanted else 0) and _is_draw(path):
+        if int(named[2] or 0) == (int(wanted[0]) if wanted else 0):
             by_prefix.setdefault(named[1], {})[int(named[3])] = path
+    by_prefix = {prefix: draws for prefix, draws in by_prefix.items() if any(map(_is_draw, draws.values()))}
     if len(by_prefix) > 1:
         raise DataError(f"{folder} holds clip {key} several times: {', '.join(sorted(by_prefix))}; keep one")
     return [draw for draws in by_prefix.values() for draw in _numbered(draws, folder)]
